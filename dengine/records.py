@@ -8,7 +8,7 @@ what a cell returned.
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from numbers import Integral, Real
 from typing import Any
@@ -99,24 +99,28 @@ FITS = ("strict", "cut", "pad", "resample")  # exported files give the position
 class TraceSpec:
     """What the traces of an engine look like.
 
+    A rate or a unit that nobody stated is unknown. Times are then shown in samples and values
+    without a unit, and force limits in seconds are refused.
+
     Parameters
     ----------
     samples : int
         Samples per channel.
-    rate_hz : float, default 500
-        Sampling rate in hertz.
+    rate_hz : float, optional
+        Sampling rate in hertz. None: unknown.
     channels : int, default 1
         Number of channels. A trace of one channel may have the shape `(samples,)`.
-    unit : str or tuple of str, default "N"
+    unit : str or tuple of str, optional
         Unit of the samples, shown to people and used by `limit`: one for all channels, or one for
-        each, as ("kN", "mm") or "kN, mm".
+        each, as ("kN", "mm") or "kN, mm"; "" for a channel of an unknown unit. None: unknown.
     limit : float, optional
         Range of the sensor, in `unit`: a sample at or beyond ±limit is saturated. None: not
         checked.
     fit : {"strict", "cut", "pad", "resample"}, default "strict"
         What happens to a trace of another length, see `traces.fit_length`. strict: TraceError. cut:
         a longer one loses its end. pad: like cut, and a shorter one repeats its last sample.
-        resample: linear interpolation. A trace that cannot be fitted becomes NaN and is verified.
+        resample: linear interpolation. Half to twice the length can be padded or resampled; any
+        other length is a TraceError.
     columns : tuple of str, default ()
         Names of the channels, by which the columns of a DataFrame are selected.
 
@@ -127,9 +131,9 @@ class TraceSpec:
     """
 
     samples: int
-    rate_hz: float = 500.0
+    rate_hz: float | None = None
     channels: int = 1
-    unit: str | tuple[str, ...] = "N"
+    unit: str | tuple[str, ...] | None = None
     limit: float | None = None
     fit: str = "strict"
     columns: tuple[str, ...] = ()
@@ -140,20 +144,22 @@ class TraceSpec:
         ):
             columns = (self.columns,) if isinstance(self.columns, str) else tuple(self.columns)
         object.__setattr__(self, "columns", columns)
-        rated = is_number(self.rate_hz) and 0 < self.rate_hz < float("inf")
+        rate = self.rate_hz
+        rated = rate is None or (is_number(rate) and 0 < rate < float("inf"))
         valid = is_whole(self.samples, 1, MOST) and is_whole(self.channels, 1, MOST) and rated
         shape = (self.samples, self.channels, self.rate_hz)
         expect(valid, "a trace of at least 1 sample and 1 channel at a rate above 0 Hz", shape)
-        several = isinstance(self.unit, tuple | list)
-        units: Any = tuple(self.unit) if several else (self.unit,)
+        unit: Any = "" if self.unit is None else self.unit
+        several = isinstance(unit, tuple | list)
+        units: Any = tuple(unit) if several else (unit,)
         texts = all(isinstance(text, str) for text in (*units, *self.columns))
         expect(texts, "unit and columns of text", (self.unit, self.columns))
         one_each = not several or len(units) == self.channels
         expect(one_each, f"{self.channels} units, one a channel", self.unit)
-        if not several:
-            units = tuple(text.strip() for text in units[0].split(","))
-        if len(units) == self.channels:
-            object.__setattr__(self, "unit", units if len(set(units)) > 1 else units[0])
+        units = tuple(text.strip() for text in (units if several else units[0].split(",")))
+        if len(units) == self.channels or units == ("",):
+            unit = units if len(set(units)) > 1 else units[0] or None
+            object.__setattr__(self, "unit", unit)
         limited = self.limit is None or (is_number(self.limit) and self.limit > 0)
         expect(limited, "a limit above 0 in the trace's unit, or None", self.limit)
         expect(self.fit in FITS, f"fit to be one of {', '.join(FITS)}", self.fit)
@@ -162,8 +168,29 @@ class TraceSpec:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """The unit of each channel, a tuple of `channels` texts."""
-        return (self.unit,) * self.channels if isinstance(self.unit, str) else self.unit
+        """The unit of each channel, a tuple of `channels` texts; "" for an unknown unit."""
+        return self.unit if isinstance(self.unit, tuple) else (self.unit or "",) * self.channels
+
+    def time_text(self, sample: int) -> str:
+        """Return the time from the first sample to another, "0.060 s" or "30 samples"."""
+        return f"{sample} samples" if self.rate_hz is None else f"{sample / self.rate_hz:.3f} s"
+
+    def value_text(self, value: float, channel: int) -> str:
+        """Return a value of a channel with its unit, if that is known, "200 N" or "200"."""
+        return f"{value:g} {self.units[channel]}".rstrip()
+
+    def completed(self, other: "TraceSpec | None") -> "TraceSpec":
+        """Return a copy with the rate, units and columns of another contract of the same shape,
+        each where this contract has none. For none, or another shape, return it unchanged.
+        """
+        if other is None or (self.samples, self.channels) != (other.samples, other.channels):
+            return self
+        return replace(
+            self,
+            rate_hz=other.rate_hz if self.rate_hz is None else self.rate_hz,
+            unit=tuple(a or b for a, b in zip(self.units, other.units, strict=True)),
+            columns=self.columns or other.columns,
+        )
 
 
 def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
@@ -245,6 +272,15 @@ class Decision:
         0 if the part was accepted or rejected: its label, if one comes, was not asked for.
         """
         return self.propensity if self.action is Action.VERIFY else 0.0
+
+
+TRAINED = "accepted"  # begins the reason of a version that was trained and answers
+REPEATS = "traces nearly repeat another"  # in a note of a retrain's reason
+REPEATS_MEANING = (
+    "If parts come twice, under two numbers or none, a label counts as two independent trials, and "
+    "too many parts are certain: give a part the same number each time it comes. A process may "
+    "also repeat that well with distinct parts; decisions stay as they are."
+)
 
 
 @dataclass(frozen=True, slots=True)

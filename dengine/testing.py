@@ -12,7 +12,8 @@ clause `labels_of_a_fold_move_nothing_in_its_space`. `toy_traces` makes the trac
 and of examples.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,9 +26,10 @@ from sklearn.base import BaseEstimator, clone
 from .cells.replay import ReplayCell
 from .datasets import Dataset
 from .decision.policy import Policy
-from .decision.scripting import script
+from .decision.scripting import reason_of, script
 from .engine.engine import DataEngine
 from .folds import content_fold
+from .model import ModelPrediction
 from .recipe import Recipe
 from .reducers.base import Floats, Ints, Reducer, StopRule, as_reducer, uses_labels
 
@@ -221,9 +223,24 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
     trained = _train_clone(reducer)
     module = trained.module()
     if module is not None:
-        with torch.inference_mode():
+        with torch.inference_mode(), runs_as_torchscript():
             Z = script(module.eval())(torch.from_numpy(QUERIES)).numpy()
         np.testing.assert_allclose(Z, trained.embed(QUERIES), rtol=1e-4, atol=1e-4)
+
+
+def a_version_answers_as_it_was_trained(reducer: Any) -> None:
+    """Assert what an engine requires of a version: restored and compiled, it embeds as it does.
+
+    Two models are trained on test traces, the second with other labels. So the compiled module of
+    the second is a copy of the first, with other tensors. `reducer` may be unfitted and stays
+    unchanged.
+    """
+    X, y = toy_traces()
+    for labels in (y, 1 - y):
+        model = ModelPrediction(clone(reducer), folds=FOLDS).fit(X, labels)
+        with runs_as_torchscript():
+            defect = model.defect() or next(filter(None, model.check_answers()), "")
+        assert not defect, defect
 
 
 def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
@@ -270,6 +287,7 @@ REDUCER_CHECKS: tuple[Callable[[Any], None], ...] = (
     any_length_and_several_channels_work,
     a_trace_with_a_nan_is_refused,
     its_module_compiles_and_embeds_as_it_does,
+    a_version_answers_as_it_was_trained,
     its_state_restores_it_bit_for_bit,
     an_engine_resumes_with_identical_decisions,
 )
@@ -295,6 +313,16 @@ def check_reducer(reducer: Any) -> None:
         except AssertionError as error:
             message = f"{type(reducer).__name__} breaks {check.__name__!r}: {error}"
             raise AssertionError(message) from error
+
+
+@contextmanager
+def runs_as_torchscript() -> Iterator[None]:
+    """Raise AssertionError in place of an error of TorchScript."""
+    try:
+        yield
+    except torch.jit.Error as error:
+        message = f"TorchScript compiles its module and cannot run it: {reason_of(error)}"
+        raise AssertionError(message) from error
 
 
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:

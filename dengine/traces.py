@@ -16,7 +16,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 
-from .errors import DataError, TraceError, expect, listed
+from .errors import DataError, SettingError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .limits import ForceLimits
 from .records import FITS, REASONS, Reason, TraceSpec
@@ -44,7 +44,7 @@ CONSTANT = REASONS.index(Reason.CONSTANT)
 SATURATED = REASONS.index(Reason.SATURATED)
 TOO_LARGE = REASONS.index(Reason.TOO_LARGE)
 LARGEST = 1e18  # of a sample; in float32 the squares of larger ones overflow, or their sum does
-MIN_SAMPLES = 10  # of a first trace: 20 ms at 500 Hz
+MIN_SAMPLES = 10  # of a first trace
 
 
 def as_trace(trace: Any, trace_spec: TraceSpec | None) -> NDArray[np.float32]:
@@ -152,7 +152,7 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     ----------
     x : Tensor of float32, shape (..., T)
     samples : int
-        The length to return.
+        The length to return; `can_fit_length` must be True.
     fit : int
         Position in `FITS` of "cut", "pad" or "resample". The first two keep each sample's time from
         the start: both drop what is too much at the end, and pad repeats the last sample. resample
@@ -161,17 +161,10 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     Returns
     -------
     Tensor of float32, shape (..., samples)
-        If `can_fit_length` is False, the trace is cut or padded with NaN, and at least its last
-        sample is NaN, so that `TraceGate` finds it.
     """
-    length = x.size(-1)
-    last = length - 1
-    can_fit = can_fit_length(length, samples, fit)
-    if fit != 3 or not can_fit:
-        result = x.index_select(-1, torch.arange(samples).clamp(max=last))
-        if not can_fit:
-            result[..., min(length, samples - 1) :].fill_(float("nan"))
-        return result
+    last = x.size(-1) - 1
+    if fit != 3:
+        return x.index_select(-1, torch.arange(samples).clamp(max=last))
     position = torch.arange(samples, dtype=torch.float64) * (last / max(samples - 1, 1))
     left = position.floor().to(torch.int64).clamp(max=last)
     low = x.index_select(-1, left).to(torch.float64)
@@ -269,8 +262,8 @@ def _as_real(values: ArrayLike) -> NDArray[np.float32]:
 def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.float32]:
     """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
-    Traces of that length are returned as they are; others are fitted as `trace_spec.fit` says, or
-    raise TraceError if that is "strict". Another number of channels raises TraceError.
+    Traces of that length are returned as they are; others are fitted as `trace_spec.fit` says.
+    Raises TraceError for a length that cannot be fitted so, and for another number of channels.
     """
     channels, samples = x.shape[-2:]
     if channels != trace_spec.channels:
@@ -281,10 +274,17 @@ def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.flo
     if samples == trace_spec.samples:
         return x
     if trace_spec.fit == "strict":
-        form = f"{trace_spec.rate_hz:g} Hz x {trace_spec.samples / trace_spec.rate_hz:g} s"
+        form = f"{trace_spec.samples} samples"
+        if (rate := trace_spec.rate_hz) is not None:
+            form = f"{rate:g} Hz x {trace_spec.samples / rate:g} s"
         new = f"TraceSpec(samples={trace_spec.samples}, fit='pad')"
         do = f"resample the trace to {form}, or start a new store with {new}"
         raise TraceError(f"Expected {trace_spec.samples} samples, got {samples}; {do}.")
+    if not can_fit_length(samples, trace_spec.samples, FITS.index(trace_spec.fit)):
+        n = trace_spec.samples
+        wanted = f"at least {n}" if trace_spec.fit == "cut" else f"{-(-n // 2)} to {2 * n}"
+        do = f"{trace_spec.fit} fits no other length: record a whole insertion, and nothing else"
+        raise TraceError(f"Expected {wanted} samples, got {samples}; {do}.")
     tensor = torch.from_numpy(np.array(x, order="C"))
     return np.asarray(fit_length(tensor, trace_spec.samples, FITS.index(trace_spec.fit)))
 
@@ -404,6 +404,18 @@ class TraceGate(nn.Module):
         return reason, int(torch.dot(steps, self.weights).item())
 
 
+def check_rate(windows: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> None:
+    """Raise SettingError if a force limit is in seconds and the rate of the traces is unknown.
+
+    It is unknown without a contract, too: the first trace does not tell its rate.
+    """
+    in_seconds = [window for window in windows if window.along is None]
+    if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
+        why = f"because force limits are in seconds ({listed(in_seconds)})"
+        do = "start the engine with TraceSpec(samples=..., rate_hz=...) first"
+        raise SettingError(f"Expected the rate of the traces, {why}, got an unknown one; {do}.")
+
+
 class ForceLimitsGate(nn.Module):
     """Finds whether a trace leaves the operator's limits.
 
@@ -419,7 +431,7 @@ class ForceLimitsGate(nn.Module):
     ------
     SettingError
         If no trace can keep a limit: its channel does not exist, or no sample is in its stretch of
-        time.
+        time; and for a limit in seconds while the rate is unknown.
     """
 
     limits: Tensor
@@ -429,11 +441,14 @@ class ForceLimitsGate(nn.Module):
 
     def __init__(self, windows: Sequence[ForceLimits], trace_spec: TraceSpec) -> None:
         super().__init__()
-        time = torch.tensor([[i / trace_spec.rate_hz for i in range(trace_spec.samples)]])
+        check_rate(windows, trace_spec)
+        rate = trace_spec.rate_hz or 1.0  # if it is unknown, no limit reads the times
+        time = torch.tensor([[i / rate for i in range(trace_spec.samples)]])
         rows: dict[Any, int] = {None: trace_spec.channels}  # time is the row behind the channels
         rows |= {i: i for i in range(trace_spec.channels)}
         rows |= {name: i for i, name in enumerate(trace_spec.columns)}
-        shape = f"{trace_spec.channels} x {trace_spec.samples} samples at {trace_spec.rate_hz:g} Hz"
+        shape = f"{trace_spec.channels} x {trace_spec.samples} samples"
+        shape += f" at {rate:g} Hz" if trace_spec.rate_hz else ""
         wanted = f"a window on some of {shape} {listed(trace_spec.columns)}".rstrip()
         for window in windows:
             start, end = torch.tensor([window.start, window.end])
@@ -507,7 +522,7 @@ def _spec_advice(trace: Any) -> str:
 def infer_trace_spec(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, bool]:
     """Infer the `TraceSpec` of all traces from the first one: its shape and column names.
 
-    All else, such as the rate, has the defaults of `TraceSpec`.
+    All else has the defaults of `TraceSpec`; rate and unit are unknown.
 
     Parameters
     ----------

@@ -89,8 +89,8 @@ class DishonestReducer(ConvReducer):
     For comparison only: it shows what honest counting costs.
     """
 
-    def _build(self, channels: int, samples: int, average: int) -> None:
-        super()._build(channels, samples, average)
+    def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
+        super()._build(channels, samples, average, seed)
         self.rocket_ = DishonestRocket(**self.rocket_.get_params())
         self.rocket_.build(channels, samples, average)
 

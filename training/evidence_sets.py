@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from dengine import Dataset, load_dataset
+from dengine.cells.simulation.conditions import RATE_HZ
 
 N_PARTS = 1000  # of a generated set
 N_SAMPLES = 400  # of a generated trace
@@ -156,4 +157,4 @@ def _load_recorded(name: str, screw_driving: Path | None) -> Dataset:
     data = load_dataset("insertion")
     if name == "insertion":
         return data
-    return data.cut(round(SHORT_SECONDS * data.spec.rate_hz))
+    return data.cut(round(SHORT_SECONDS * RATE_HZ))

@@ -76,7 +76,7 @@ def draw_causes(data: Dataset, path: Path) -> None:
     """Draw `N_DRAWN` traces of each cause, in panels of one scale, and save the picture."""
     figure = Figure(figsize=(13, 5.5), layout="constrained")
     panels = figure.subplots(2, 4, sharex=True, sharey=True).flat
-    time_s = np.arange(data.X.shape[1]) / data.spec.rate_hz
+    time_s = np.arange(data.X.shape[1]) / RATE_HZ
     for axes, cause in zip(panels, CAUSES, strict=True):
         rows = np.flatnonzero(data.cause == cause)
         axes.plot(time_s, data.X[rows[:N_DRAWN]].T, linewidth=0.5, alpha=0.7)

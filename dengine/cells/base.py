@@ -16,7 +16,11 @@ METHODS = ("insert", "verify", "proceed", "reject")
 
 @runtime_checkable
 class Cell(Protocol):
-    """A robot cell. After each `insert` the engine calls exactly one of the other three, once."""
+    """A robot cell. After each `insert` the engine calls exactly one of the other three, once.
+
+    A cell may have an attribute `part`, the number of the newest part, and an attribute `spec`, the
+    `TraceSpec` of its traces.
+    """
 
     def insert(self) -> NDArray[np.floating]:
         """Pick a part and insert it; return the recorded trace, (T,) or (channels, T)."""

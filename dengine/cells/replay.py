@@ -26,12 +26,19 @@ class ReplayCell:
     confirm : bool, default False
         Whether an accepted good part is confirmed. False: only stops become known, as on most
         lines.
+
+    Attributes
+    ----------
+    data : Dataset
+    spec : TraceSpec
+        Of the traces, as far as the data set tells.
     """
 
     def __init__(
         self, dataset: Any, order: NDArray[np.integer] | None = None, confirm: bool = False
     ) -> None:
         self.data = load_dataset(dataset)
+        self.spec = self.data.spec
         self.order = np.arange(len(self.data)) if order is None else np.asarray(order)
         self.confirm = confirm
         self.position = -1

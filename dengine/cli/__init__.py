@@ -30,7 +30,9 @@ from .store import (
     forget,
     import_labels,
     policy,
+    release,
     report,
+    restore,
     retrain,
     rollback,
     verify,
@@ -102,6 +104,7 @@ def main() -> None:
 
 for command in (
     *(data, replay, compare, costs, train, run, serve, simulate, status, history, explain, verify),
-    *(report, correct, forget, rollback, policy, retrain, backup, export, import_labels),
+    *(report, correct, forget, rollback, release, policy, retrain, backup, restore, export),
+    import_labels,
 ):
     main.add_command(command)

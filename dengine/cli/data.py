@@ -104,6 +104,7 @@ def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
     from ..datasets.checks import tolerance_note
     from ..decision.policy import Policy
     from ..model.neighbours import MANY_REPEATS
+    from ..records import REPEATS, REPEATS_MEANING
 
     rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
     rows += [] if survey.rate_hz else [("rate", "unknown")]
@@ -120,10 +121,7 @@ def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
             "cannot be seen."
         )
     if survey.near_repeats > MANY_REPEATS:
-        yield (
-            "Many traces nearly repeat another part's. If parts come twice, give their numbers "
-            "(--set part.column=NAME)."
-        )
+        yield f"{survey.near_repeats} {REPEATS}. {REPEATS_MEANING}"
     yield tolerance_note(dataset, Policy().lower_bound)
 
 

@@ -281,8 +281,8 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
 def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
     """Yield table rows of where the trace leaves the envelope, at most 5, the farthest first.
 
-    Each has the channel's name, begin and end in seconds, and how far above or below, in widths of
-    the band. There are none without an envelope.
+    Each has the channel's name, begin and end, and how far above or below, in widths of the band.
+    There are none without an envelope.
     """
     spec = explanation.spec
     names = spec.columns or [f"channel {i + 1}" for i in range(spec.channels)]
@@ -292,7 +292,7 @@ def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
         side = "above" if excess.above else "below"
         yield (
             names[excess.channel],
-            f"{excess.from_s:.3f} s",
-            f"{excess.to_s:.3f} s",
+            spec.time_text(excess.first),
+            spec.time_text(excess.last),
             f"{excess.widths:.1f} {side}",
         )

@@ -575,10 +575,16 @@ def data_options(
     return bundle_options("source", _data_choice, {"data": data} | DATA | more)
 
 
-def recorder_settings(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of the options in `TRACE` that a robot's recorder takes, under its names."""
+def recorder_settings(options: Mapping[str, Any]) -> tuple[dict[str, Any], TraceSpec]:
+    """Return those of the options in `TRACE` that a robot's recorder takes, under its names, and
+    the contract of what it records.
+    """
+    from ..cells.ur.recorder import spec_of_recording
+
     names = {"samples": "samples", "rate_hz": "rate_hz", "channel": "channels"}
-    return {name: options[option] for option, name in names.items() if option in options}
+    settings = {name: options[option] for option, name in names.items() if option in options}
+    form = {name: options[name] for name in ("unit", "fit") if name in options}
+    return settings, replace(spec_of_recording(**settings), **form)
 
 
 def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 from zlib import crc32
 
@@ -37,17 +36,18 @@ if TYPE_CHECKING:
     from ..engine.engine import DataEngine
     from ..experiments.replay import Replay
     from ..records import TraceSpec
-    from ..store.sql import SqlStore
 
 STRETCHES = 6  # rows of the table
 
 
 class CellToDrive(NamedTuple):
-    """A cell, its name for people, and the contract of its traces, if it is known beforehand."""
+    """The contract of a cell's traces, and a function that makes the cell for an engine.
 
-    cell: Cell
-    name: str
-    trace_spec: TraceSpec | None
+    The function returns the cell and its name for people.
+    """
+
+    trace_spec: TraceSpec
+    make: Callable[[DataEngine], tuple[Cell, str]]
 
 
 class DrivenRun(NamedTuple):
@@ -123,23 +123,24 @@ def run(
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")
-    from ..engine.engine import DataEngine, core_of
+    from ..engine.engine import DataEngine
+    from ..engine.settings import agreed_trace_spec
+    from ..store.opening import opening
 
-    opened = DataEngine.open_or_create(
-        store, seed, recipe=choice.load_if_given(), allow_import=allow_import
-    )
+    recipe = choice.load_if_given()
+    to_drive = CELLS[kind](cycles=cycles, check_seconds=check_seconds, **cell_settings)
+    with opening(store) as opened_store:
+        opened = DataEngine.open_or_create(
+            opened_store,
+            seed,
+            recipe=recipe,
+            trace=agreed_trace_spec(opened_store, to_drive.trace_spec),
+            allow_import=allow_import,
+        )
     with ExitStack() as stack, opened as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name, trace_spec = CELLS[kind](
-            store=engine.store,
-            seed=engine.seed,
-            cycles=cycles,
-            check_seconds=check_seconds,
-            **cell_settings,
-        )
-        if trace_spec is not None:
-            core_of(engine).set_trace_spec(trace_spec)
+        cell, name = to_drive.make(engine)
         stack.callback(getattr(cell, "close", lambda: None))
         driven = _drive(engine, cell, cycles, name)
         record: dict[str, Any] = {
@@ -211,16 +212,10 @@ def _safe_mode_line(change: Mapping[str, Any]) -> str:
     return f"After cycle {change['cycle']}: {event}."
 
 
-def _make_simulated_cell(
-    store: SqlStore,
-    seed: int,
-    scenario: str,
-    cycles: int,
-    check_seconds: float,
-    source: DataChoice,
-    **others: Any,
+def _simulated_cell(
+    scenario: str, cycles: int, check_seconds: float, source: DataChoice, **others: Any
 ) -> CellToDrive:
-    """Return the simulated cell, its name, and the traces' contract, if options gave one.
+    """Return what makes the simulated cell.
 
     Its seed, which grows with the decisions in the store and differs between the cells of a
     product, gives parts that the store has not seen. A verification takes `check_seconds` of
@@ -229,30 +224,28 @@ def _make_simulated_cell(
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
 
-    # Another seed for a resumed run: the same parts again would be counted twice.
-    seed += store.status()["decisions"]
-    if store.product is not None:
-        # The cells of one product have one seed, but each makes other parts.
-        seed += crc32(store.cell_id.encode())
-    parameters = CellParameters(verify_s=check_seconds)
-    cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=parameters)
-    name = f"simulated cell, {scenario}"
-    return CellToDrive(cell, name, options.trace_spec_from({**source.options, **source.live}))
+    def make(engine: DataEngine) -> tuple[Cell, str]:
+        store = engine.store
+        # Another seed for a resumed run: the same parts again would be counted twice.
+        seed = engine.seed + store.status()["decisions"]
+        if store.product is not None:
+            # The cells of one product have one seed, but each makes other parts.
+            seed += crc32(store.cell_id.encode())
+        parameters = CellParameters(verify_s=check_seconds)
+        cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=parameters)
+        return cell, f"simulated cell, {scenario}"
+
+    stated = options.trace_spec_from({**source.options, **source.live})
+    spec = SimulatedCell.spec if stated is None else stated.completed(SimulatedCell.spec)
+    return CellToDrive(spec, make)
 
 
-def _make_replay_cell(
-    store: SqlStore, source: DataChoice, cycles: int, **others: Any
-) -> CellToDrive:
-    """Return a cell that plays a recording from the part after the last one that was played before.
+def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
+    """Return what makes a cell that plays a recording from the part after the last one that was
+    played before.
 
     Played before are parts whose trace has a label of this cell in the store, and its newest
-    accepted part without a report. The cell's name and the contract of the recording are returned
-    beside it.
-
-    Raises
-    ------
-    SettingError
-        Fewer parts than `cycles` are left.
+    accepted part without a report. SettingError is raised where fewer parts than `cycles` are left.
     """
     import numpy as np
 
@@ -260,30 +253,37 @@ def _make_replay_cell(
     from ..folds import content_hash
 
     dataset = source.load()
-    # By the content of the traces: the store's own hash is one number for a part that comes twice.
-    hashes = content_hash(store.labelled(cell_only=True).traces)
-    for id_ in store.unreported_accepts()[-1:]:
-        newest = store.get_decision(id_)
-        if newest is not None:
-            hashes = np.append(hashes, content_hash(newest.trace[None]))
-    played = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
-    first = int(played[-1]) + 1 if len(played) else 0
-    n_left = len(dataset) - first
-    advice = f"{first} of {len(dataset)} parts were played before"
-    expect(cycles <= n_left, f"at most {n_left} cycles", cycles, advice)
-    cell = ReplayCell(dataset, np.arange(first, len(dataset)))
-    return CellToDrive(cell, f"recording {dataset.name} from part {first + 1}", dataset.spec)
+
+    def make(engine: DataEngine) -> tuple[Cell, str]:
+        store = engine.store
+        # By the content of the traces: the store's own hash is one number for a part that comes
+        # twice.
+        hashes = content_hash(store.labelled(cell_only=True).traces)
+        for id_ in store.unreported_accepts()[-1:]:
+            newest = store.get_decision(id_)
+            if newest is not None:
+                hashes = np.append(hashes, content_hash(newest.trace[None]))
+        played = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
+        first = int(played[-1]) + 1 if len(played) else 0
+        n_left = len(dataset) - first
+        advice = f"{first} of {len(dataset)} parts were played before"
+        expect(cycles <= n_left, f"at most {n_left} cycles", cycles, advice)
+        cell = ReplayCell(dataset, np.arange(first, len(dataset)))
+        return cell, f"recording {dataset.name} from part {first + 1}"
+
+    return CellToDrive(dataset.spec, make)
 
 
-def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
-    """Connect to a Universal Robots controller; return its cell, name and contract of traces.
+def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
+    """Return what connects to a Universal Robots controller and makes its cell.
 
     Raises
     ------
     SettingError
         No host, a port that is no number, or an option that the recorder does not take.
     CellError
-        The controller cannot be reached, or its program is not ready in time.
+        When the cell is made: the controller cannot be reached, or its program is not ready in
+        time.
     """
     from ..cells.ur.cell import UrCell
 
@@ -292,12 +292,12 @@ def _make_robot_cell(source: DataChoice, host: str | None, **others: Any) -> Cel
             "Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none."
         )
     stated = {**source.options, **source.live}
-    settings = options.recorder_settings(stated)
+    settings, spec = options.recorder_settings(stated)
     settings |= options.drop_none(trigger=stated.get("trigger"))
     name, port = host_and_port(host)
-    cell = UrCell(name, port=port, **settings)
-    form = {key: stated[key] for key in ("unit", "fit") if key in stated}
-    return CellToDrive(cell, f"robot at {host}", replace(cell.recorder.spec, **form))
+    return CellToDrive(
+        spec, lambda engine: (UrCell(name, port=port, **settings), f"robot at {host}")
+    )
 
 
 def host_and_port(address: str) -> tuple[str, int]:
@@ -316,9 +316,9 @@ def host_and_port(address: str) -> tuple[str, int]:
 
 
 CELLS: dict[str, Callable[..., CellToDrive]] = {
-    "simulated": _make_simulated_cell,
-    "replay": _make_replay_cell,
-    "ur": _make_robot_cell,
+    "simulated": _simulated_cell,
+    "replay": _replay_cell,
+    "ur": _robot_cell,
 }
 CAPTION = (
     "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts "

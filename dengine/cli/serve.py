@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from ..engine.engine import DataEngine
+    from ..records import TraceSpec
 
 MODULES = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml")
 # A decision of the demonstration may wait this many seconds: no robot waits for it.
@@ -114,8 +115,8 @@ def serve(
     store that is forgotten, with a deadline of 5 s or more. Without --token-file, programs on the
     same machine need no token. Other machines reach it only with --host, which needs --token-file,
     and should have --cert and --key. --samples, --rate-hz, --unit, --channels and --fit are the
-    contract of traces; without them a new store takes the form of its first trace, or with --robot
-    1000 samples.
+    contract of traces; without them a new store takes the form of its first trace, whose rate and
+    unit are unknown, or with --robot 1000 samples at 500 Hz.
     """
     options.require_modules("the server", "serve", *MODULES)
     if settings["opcua"]:
@@ -127,6 +128,11 @@ def serve(
     from ..serve.server import serve as serve_cell
 
     recipe = choice.load_if_given()
+    trace: TraceSpec | None = None
+    if robot:
+        host, port = host_and_port(robot)
+        recording, trace = options.recorder_settings(trace_options)
+        settings["recorder"] = partial(RtdeRecorder, host, trigger, port=port, **recording)
     with ExitStack() as stack:
         if demo:
             if store is not None and Path(store).exists():
@@ -135,6 +141,7 @@ def serve(
                     f"another file."
                 )
             data = load_dataset("insertion", samples=trace_options.get("samples"))
+            trace = data.spec
             settings["beside"] = [partial(playing, data=data, speed=speed, seed=seed or 0)]
             settings["deadline"] = max(settings["deadline"], DEMO_DEADLINE)
             recipe = recipe or Recipe.load("conv").with_policy(**POLICY)
@@ -145,20 +152,13 @@ def serve(
             raise click.UsageError(
                 "Expected --store FILE|URL, where everything is kept, or --demo, to try it out."
             )
-        if robot:
-            host, port = host_and_port(robot)
-            recorder_settings = options.recorder_settings(trace_options)
-            settings["recorder"] = partial(
-                RtdeRecorder, host, trigger, port=port, **recorder_settings
-            )
-            trace_options = {"samples": 1000} | trace_options
         make_engine = partial(
             _open_engine,
             store,
             seed,
             shadow,
             recipe=recipe,
-            trace=options.trace_spec_from(trace_options),
+            trace=trace or options.trace_spec_from(trace_options),
             allow_import=allow_import,
         )
         serve_cell(make_engine, store, click.echo, **settings)

@@ -124,6 +124,9 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     trace_text = "none yet: the first trace sets it"
     if report.trace is not None:
         trace_text = format_value("", report.trace)
+        for name in ("rate_hz", "unit"):
+            if getattr(report.trace, name) is None:
+                trace_text += f", {heading(name)} unknown"
     rows.append(("trace", trace_text))
     rows.append(("accepted", report.certificate.sentence))
     rows.append(("rejected", report.certificate.sentence_on_rejects))

@@ -1,8 +1,9 @@
 """The verbs that change, check or copy a store by hand: `report`, `correct`, `forget`, `rollback`,
-`policy`, `retrain`, `verify`, `backup` and `import-labels`.
+`release`, `policy`, `retrain`, `verify`, `backup`, `restore` and `import-labels`.
 
 Those up to `retrain` change a store's engine, or show its policy; `verify` checks the store's
-history, `backup` copies it, and `import-labels` takes the labels of an exported cell.
+history, `backup` copies it, `restore` puts a copy in place, and `import-labels` takes the labels of
+an exported cell.
 """
 
 from __future__ import annotations
@@ -162,9 +163,17 @@ def forget(
 def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
     """Use an earlier model version again, as a new version.
 
-    Labels that came since are among its references, and corrections count.
+    Labels that came since are among its references, and corrections count. It is pinned: no
+    automatic retrain replaces it, until `dengine release` or `dengine retrain`.
     """
     _change_and_print(store, author, allow_import, lambda engine: engine.rollback(version, author))
+
+
+@verb("dengine release engine.db")
+@store_options
+def release(store: str, author: str, allow_import: bool) -> None:
+    """Let retrains replace a pinned version again."""
+    _change_and_print(store, author, allow_import, lambda engine: engine.release(author))
 
 
 @verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
@@ -206,8 +215,8 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels as they count.
 
-    An event records it. A candidate that fails its gate is dropped, the previous version stays in
-    use, and the exit code is 1.
+    An event records it. The new version replaces a pinned one, too. A candidate that fails its gate
+    is dropped, the previous version stays in use, and the exit code is 1.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -241,22 +250,40 @@ _EXPECT = (
 )
 
 
+_ACKNOWLEDGE = "End the alarms about lost data. They stay in the event log."
+
+
 @verb("dengine verify engine.db")
 @click.argument("store", metavar="STORE")
 @click.option("--cell", metavar="ID", help=_CELL)
 @click.option("--expect", metavar="DIGEST", help=_EXPECT)
+@click.option("--acknowledge", is_flag=True, help=_ACKNOWLEDGE)
+@author_option
 @click.pass_context
-def verify(context: click.Context, store: str, cell: str | None, expect: str | None) -> None:
+def verify(
+    context: click.Context,
+    store: str,
+    cell: str | None,
+    expect: str | None,
+    acknowledge: bool,
+    author: str,
+) -> None:
     """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger with its rows. What was
-    changed, is missing or was never chained is listed, with exit code 1. Nothing is written, and
-    engines may run meanwhile.
+    changed, is missing or was never chained is listed, with exit code 1, and so is data that was
+    lost. Nothing is written but for --acknowledge, and engines may run meanwhile.
     """
+    from ..store.sql import SqlStore
     from ..store.verification import verify_history
 
     with progress_bar("rows", None) as advance:
         report = verify_history(store, cell, expect, advance)
+        for item in report.cells if acknowledge else ():
+            with SqlStore(store, item.cell_id) as opened:
+                opened.acknowledge_losses(author)
+        if acknowledge:
+            report = verify_history(store, cell, expect, advance)
     record = {"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}
     print_result(record, *_verification_lines(report))
     if not report.ok:
@@ -321,6 +348,32 @@ def backup(store: str, out: Path) -> None:
     ]
     lines.append(f"Check it: dengine verify {out}")
     print_result({"store": store, "out": out} | asdict(report), *lines)
+
+
+@verb("dengine restore backup.db --store restored.db")
+@click.argument("copy", metavar="COPY")
+@click.option(
+    "--store",
+    metavar="FILE",
+    required=True,
+    type=options.FILE,
+    help="Where the engine looks for its store; a file that does not exist yet.",
+)
+def restore(copy: str, store: Path) -> None:
+    """Put a backup in the place of a store.
+
+    COPY is what `dengine backup` wrote, on this or another machine. It is checked first. Beside the
+    store each cell gets a journal that knows its newest entry; one that is there stays, and the
+    first engine takes from it what the copy lacks.
+    """
+    from ..store.backup import restore_store
+
+    cells = restore_store(copy, store)
+    print_result(
+        {"copy": copy, "store": store, "cells": cells},
+        f"{store}: cells {', '.join(cell.cell_id for cell in cells)}, as they were written.",
+        f"Check it: dengine verify {store}",
+    )
 
 
 _ANY_MODEL = "Accept a journal of a model that is not recorded as an export of this store."

@@ -126,9 +126,9 @@ class Dataset:
         """
         return TraceSpec(
             self.X.shape[-1],
-            rate_hz=self.rate_hz or 500.0,
+            self.rate_hz,
             channels=1 if self.X.ndim == 2 else self.X.shape[1],
-            unit=self.unit or "units",
+            unit=self.unit,
             limit=self.limit,
             fit=self.fit,
             columns=self.channels,

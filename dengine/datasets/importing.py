@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..engine.decide import as_part, verify_decision
-from ..engine.engine import DataEngine, core_of
+from ..engine.engine import DataEngine
+from ..engine.settings import agreed_trace_spec
 from ..errors import StoreError, TraceError
 from ..folds import content_hash, trace_hash
 from ..recipe import Recipe
@@ -86,10 +87,10 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
         actual = f"{data.name} was to {data_spec.samples} by {data_spec.fit}"
         do = f"load it with samples={trace_spec.samples}, fit={trace_spec.fit!r}"
         raise TraceError(f"Expected {wanted}, {actual}; {do}, or what is known would count again.")
-    is_other_rate = not math.isclose(trace_spec.rate_hz, data_spec.rate_hz, rel_tol=RATE_TOLERANCE)
-    if data.rate_hz is not None and is_other_rate:
-        actual = f"{data.name} has {data_spec.rate_hz:g} Hz"
-        raise TraceError(f"Expected traces at {trace_spec.rate_hz:g} Hz, {actual}; resample it.")
+    rate = trace_spec.rate_hz or data.rate_hz
+    if rate and data.rate_hz and not math.isclose(rate, data.rate_hz, rel_tol=RATE_TOLERANCE):
+        actual = f"{data.name} has {data.rate_hz:g} Hz"
+        raise TraceError(f"Expected traces at {rate:g} Hz, {actual}; resample it.")
     if data.channels and trace_spec.columns and data.channels != trace_spec.columns:
         wanted = ", ".join(trace_spec.columns)
         raise TraceError(f"Expected the channels {wanted}, got {', '.join(data.channels)}.")
@@ -166,11 +167,13 @@ def import_labelled(
     if own_reader(dataset) is None:
         description = in_form_of(store, description_of(dataset, None))
     data = load_dataset(dataset, description)
-    engine = DataEngine.open_or_create(
-        store, seed, wait=LONG_WAIT, recipe=recipe, allow_import=allow_import
-    )
+    with opening(store, wait=LONG_WAIT) as opened:
+        agreed = agreed_trace_spec(opened, data.spec)
+        engine = DataEngine.open_or_create(
+            opened, seed, recipe=recipe, trace=agreed, allow_import=allow_import
+        )
     try:
-        trace_spec = core_of(engine).set_trace_spec(data.spec)
+        trace_spec = engine.trace or data.spec
         check_agreement(data, trace_spec)
         traces = as_traces(data.X, trace_spec)
         decisions = _verifying_decisions(traces, data)

@@ -240,7 +240,7 @@ def _read_store(path: Path) -> Dataset:
         part=labelled.hashes.astype(np.str_) if has_repeats else None,
         name=path.stem,
         rate_hz=spec.rate_hz,
-        unit=spec.unit or "",
+        unit=spec.unit if isinstance(spec.unit, str) else ", ".join(spec.unit or ()),
         channels=tuple(spec.columns),
         limit=spec.limit,
         fit=spec.fit,

@@ -1,22 +1,25 @@
-"""Compile modules to TorchScript (`script`), and copy stored arrays back into modules (`restore`,
+"""Compile modules to TorchScript (`script`), find all tensors of a module (`tensor_attributes`,
+`plain_tensors`), and copy stored values back into modules (`restore`, `restore_plain_tensors`,
 `arrays_with_prefix`). The reducers, the model, the store's history and the export use these
 helpers.
 """
 
 import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from ..errors import StoreError
 from .code import remember_code
 
 _SCRIPTING = threading.Lock()
+# Attributes in which torch keeps parameters, submodules and hooks; scripting adds the last.
+INTERNAL = {*vars(nn.Module()), "__overloads__"} - {"training"}
 
 
 def script(module: nn.Module) -> Any:
@@ -47,6 +50,68 @@ def script(module: nn.Module) -> Any:
         scripted = torch.jit.script(module)
     remember_code(module)
     return scripted
+
+
+def reason_of(error: Exception) -> str:
+    """Return the type of an error and the line of its message that says what is wrong.
+
+    That is the first line, and of an error inside TorchScript, which begins with a trace, the last.
+    """
+    lines = str(error).strip().splitlines() or [""]
+    return f"{type(error).__name__}: {lines[-isinstance(error, torch.jit.Error)]}"
+
+
+def tensor_attributes(module: nn.Module) -> Iterator[tuple[str, Any]]:
+    """Yield every attribute that holds tensors, of a module and its submodules, as (name, value).
+
+    These are parameters, buffers, and plain attributes: tensors, and lists, tuples and dicts with
+    tensors in them. What is shared comes under each of its names.
+    """
+    for path, submodule in module.named_modules(remove_duplicate=False):
+        prefix = f"{path}." if path else ""
+        for name, parameter in submodule.named_parameters(recurse=False, remove_duplicate=False):
+            yield prefix + name, parameter
+        for name, buffer in submodule.named_buffers(recurse=False, remove_duplicate=False):
+            yield prefix + name, buffer
+        for name, value in list(vars(submodule).items()):
+            if name not in INTERNAL and next(tensors_in(name, value), None) is not None:
+                yield prefix + name, value
+
+
+def tensors_in(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
+    """Yield each tensor in a value as (name, tensor); those of a list are "NAME.0" and so on."""
+    if isinstance(value, Tensor):
+        yield name, value
+    elif isinstance(value, list | tuple | dict):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, item in items:
+            yield from tensors_in(f"{name}.{key}", item)
+
+
+def plain_tensors(module: nn.Module) -> dict[str, Tensor]:
+    """Return the tensors of a module that `module.state_dict()` leaves out, by name.
+
+    These are buffers that are not persistent, and plain attributes, see `tensor_attributes`.
+    """
+    tensors: dict[str, Tensor] = {}
+    known = {id(tensor) for tensor in module.state_dict(keep_vars=True).values()}
+    for attribute, value in tensor_attributes(module):
+        tensors |= {
+            n: tensor for n, tensor in tensors_in(attribute, value) if id(tensor) not in known
+        }
+    return tensors
+
+
+@torch.no_grad()
+def restore_plain_tensors(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Copy tensors, in place, into those of `plain_tensors(module)` with their name and shape.
+
+    What the module has already is not written, since an expanded tensor cannot be written to.
+    """
+    for name, target in plain_tensors(module).items():
+        source = tensors.get(name, target)
+        if source.shape == target.shape and not torch.equal(source, target):
+            target.copy_(source)
 
 
 def arrays_with_prefix(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

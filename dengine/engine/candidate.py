@@ -1,25 +1,29 @@
 """`Candidate`: a newly trained version of the model, from the end of its training until it answers.
 `learner.Learner` makes one after each training, and takes it through the steps in between.
 
-Meanwhile the previous version goes on answering. The candidate takes in the labels that came since
-its training began, is stored, and then replaces the previous version; or it is dropped. This
+Meanwhile the previous version goes on answering. The candidate decides on some training traces, by
+which its compiled module is compared with what was trained. Then it takes in the labels that came
+since its training began, is stored, and replaces the previous version; or it is dropped. This
 happens either all at once or in short steps between cycles.
 """
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
 
+from ..decision.scripting import reason_of
 from ..model.base import EngineModel
 from ..records import RetrainReport
 from .guard import GuardedModel
 from .trainer import Trained, TrainedOn, TrainingWindow
 
+log = logging.getLogger("dengine")
 PATIENCE = (
     20  # steps that a candidate waits for the labels' numbers before it asks the store for them
 )
@@ -41,9 +45,9 @@ class Candidate:
     Attributes
     ----------
     model : EngineModel or None
-        None where the training was dropped: then only the report is stored.
+        None where the version is dropped: then only the report is stored.
     report : RetrainReport
-    trained_on : TrainedOn or None
+    trained_on : TrainedOn
         Set by `complete_report`.
     storing : Future or None
         The commit of the version, once it has begun; it returns the version's number in the store.
@@ -56,17 +60,40 @@ class Candidate:
         self.report = RetrainReport(
             version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason
         )
-        self.trained_on: TrainedOn | None = None
+        self.trained_on = TrainedOn()
         self.storing: Future[int] | None = None
         self._clock = clock
         self._seq = trained.seq
         self._learned_to = int(trained.seq[-1]) if len(trained.seq) else 0
         self._patience = PATIENCE
         self._store_until = np.inf  # by `time.monotonic`
-        if self.model is not None:
-            GuardedModel(self.model).prepare(previous)
+        self._checks = _check_answers(self.model, previous)
         # Of work on it; the cell's own work in between is not counted.
         self._seconds = clock() - trained.begin
+
+    def check(self, seconds: float = np.inf) -> bool:
+        """Make the model ready to answer, and compare its answers with what was trained.
+
+        It stops between two steps once `seconds` have passed by the clock; the time counts as work.
+        Returns True when all is compared, and always where there is no model. A model that must not
+        answer, or raises, is dropped: the report says why.
+        """
+        begin = self._clock()
+        defect = ""
+        is_done = False
+        try:
+            while not defect and not is_done and self._clock() - begin < seconds:
+                step = next(self._checks, None)
+                is_done = step is None
+                defect = step or ""
+        except Exception as error:  # no exception inside a model reaches the cell
+            log.exception("the model that was trained cannot answer")
+            defect = reason_of(error)
+        if defect:
+            self.model = None
+            self.report = replace(self.report, reason=f"dropped: {defect}")
+        self._seconds += self._clock() - begin
+        return is_done or self.model is None
 
     def catch_up(self, window: TrainingWindow, seconds: float = np.inf) -> bool:
         """Make references of the window's labels that came since the training, oldest first.
@@ -131,3 +158,11 @@ class Candidate:
         The two differ where a peer's version was stored first.
         """
         self.report = replace(self.report, version=version or self.report.version)
+
+
+def _check_answers(model: EngineModel | None, previous: EngineModel) -> Iterator[str]:
+    """Prepare a model to answer after the previous one, then yield from its `check_answers`."""
+    if model is not None:
+        model.prepare(previous)
+        yield ""
+        yield from model.check_answers()

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
 from ..history.status import Status, retrain_fault
-from ..model.base import EngineModel, Exportable
+from ..model.base import N_EXAMPLES, EngineModel, Exportable
 from ..records import Action, Decision, Reason, RetrainReport, TraceSpec, as_id, as_success
 from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
@@ -370,22 +370,27 @@ class EngineCore:
     def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
         """Set the trace contract (shape, rate and unit of all traces) and return the one in force.
 
-        One that is set already stays and is returned. Where the cell shares a product with others,
-        a contract that these have set is taken in place of `spec`, unless it cannot be read.
-        `inferred` says that `spec` comes from a first trace. The settings are saved in the store;
-        where that fails, they are saved with a later trace. Raises SettingError where the force
-        limits do not fit the contract.
+        One that is set already stays, completed by what `spec` states and it does not. Where the
+        cell shares a product with others, a contract that these have set is taken in place of
+        `spec`, unless it cannot be read. `inferred` says that `spec` comes from a first trace. The
+        settings are saved in the store; where that fails, they are saved with a later trace. Raises
+        SettingError where the force limits do not fit the contract, and StoreError for an engine
+        that is closed, only reads, or is in use by another thread.
         """
-        if self.settings.now.trace is not None:
-            return self.settings.now.trace
-        try:
-            if self.store.product is not None:
-                spec = self.outbox.call_store(lambda: read_peers_trace_spec(self.store)) or spec
-        except StoreError:  # the cell's own first trace stands
-            log.exception("the product's contract of traces cannot be had")
-        settings = replace(self.settings.now, trace=spec, inferred=inferred)
-        self.settings.change(settings)
-        self.settings.save()
+        self.outbox.check_usable()
+        with self.exclusive:
+            present = self.settings.now
+            agreed = present.trace
+            try:
+                if agreed is None and self.store.product is not None:
+                    agreed = self.outbox.call_store(lambda: read_peers_trace_spec(self.store))
+            except StoreError:  # the cell's own first trace stands
+                log.exception("the product's contract of traces cannot be had")
+            spec = spec if agreed is None else agreed.completed(spec)
+            if spec != present.trace:
+                inferred = inferred or present.inferred
+                self.settings.change(replace(present, trace=spec, inferred=inferred))
+                self.settings.save()
         return spec
 
     def _check_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
@@ -520,8 +525,8 @@ class EngineCore:
         """Finish or give up a retrain under way within `CLOSE_SECONDS`, write everything, close the
         store.
 
-        A second call does nothing. Raises NotTakenError, and closes nothing, where the journal
-        cannot be written, and StoreError while another thread uses the engine.
+        A second call does nothing. What the journal cannot take is given up. Raises StoreError
+        while another thread uses the engine.
         """
         with self.exclusive:
             if self.outbox.is_usable:
@@ -549,6 +554,7 @@ class EngineCore:
             windows=policy.limits,
             model_version=self.live.version,
             recipe=settings.recipe.to_toml(),
+            examples=self.live.window.snapshot().traces[-N_EXAMPLES:],
             note=self.outbox.record_event,
         )
 

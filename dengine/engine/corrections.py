@@ -1,5 +1,5 @@
-"""`Corrections`: with it people correct a label, forget labels, go back to an earlier version, or
-set another policy. The methods of `DataEngine` that do this call it.
+"""`Corrections`: with it people correct a label, forget labels, go back to an earlier version and
+release it, or set another policy. The methods of `DataEngine` that do this call it.
 
     engine.correct(decision.id, success=False, author="kim")
     engine.rollback(3)
@@ -27,6 +27,7 @@ from ..store.records import (
     nothing_to_correct,
     unknown_decision,
 )
+from ..traces import check_rate
 from .core import EngineCore
 from .settings import BASELINE_SETTINGS, EvidenceWindow
 
@@ -41,12 +42,12 @@ LABEL_TEXTS = {True: "success", False: "failure"}
 
 @dataclass(frozen=True, slots=True)
 class Changed:
-    """What `correct`, `forget`, `rollback` or `set_policy` did.
+    """What `correct`, `forget`, `rollback`, `release` or `set_policy` did.
 
     Attributes
     ----------
     kind : str
-        "correct", "forget", "rollback", "policy" or "shadow".
+        "correct", "forget", "rollback", "release", "policy" or "shadow".
     text : str
         A sentence for people.
     event : int or None
@@ -64,8 +65,10 @@ class Changed:
 class Corrections:
     """Carries out corrections in the store and in what the engine has learned.
 
-    Every verb first finishes what is under way: a retrain, labels on their way to the store, news
-    of peers. So it blocks, and raises StoreError where the store does not answer.
+    Every verb first finishes what is under way: labels on their way to the store, news of peers. So
+    it blocks for the store, and raises StoreError where that does not answer. A training that is
+    under way in an executor is discarded, and another one begins afterwards, except after a
+    rollback.
 
     Parameters
     ----------
@@ -117,11 +120,12 @@ class Corrections:
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
         """Leave labels out of all that is learned and counted, from the next decision on.
 
-        `correct` brings one back. Traces, and labels as they were reported, stay in the store; the
-        version that was trained with them goes on until the next retrain, but a baseline is
-        retrained before this returns. A guarantee assumes that the choice of what is forgotten does
-        not depend on the label. The certificate counts a forgotten outcome of a certain decision as
-        wrong, so that forgetting earns nothing.
+        `correct` brings one back. Traces, and labels as they were reported, stay in the store, and
+        so do the versions that were trained with them. The one that answers goes on until the next
+        retrain, which starts from weights that never saw these labels; it is released if it was
+        pinned. A baseline is retrained before this returns. A guarantee assumes that the choice of
+        what is forgotten does not depend on the label. The certificate counts a forgotten outcome
+        of a certain decision as wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -157,21 +161,64 @@ class Corrections:
         text = f"{_labels_are(list(labels))} forgotten" + (f": {reason}" if reason else "")
         changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
         data = {"decisions": changes, "reason": reason}
-        return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
+        live = self._core.live
+        is_released = live.pinned > 0 and any(
+            live.trained_on.has_seen(stored.label_seq)
+            for stored in decisions
+            if stored.label_seq and stored.success is not None and not stored.quarantined
+        )
+        if is_released:
+            text += f"; version {live.version}, which learned from this, is pinned no more"
+        change = Change("forget", text, data, author, tuple(labels), None)
+        return self._change_labels(change, is_released)
+
+    def release(self, author: str = "") -> Changed:
+        """Let retrains replace a version again that `rollback` pinned.
+
+        The same model goes on, stored as a new version. Labels that came meanwhile count for the
+        next retrain.
+
+        Parameters
+        ----------
+        author : str
+            For the record.
+
+        Returns
+        -------
+        Changed
+            Its `event` is None where no version was pinned.
+
+        Raises
+        ------
+        StoreError
+            Where the store does not answer.
+        """
+        self._bring_up_to_date()
+        live = self._core.live
+        if not live.pinned:
+            return self._as_unchanged("release", "No version is pinned")
+        text = f"version {live.version} is pinned no more: the next retrain may replace it"
+        data = {"was": live.version, "now": live.next_version}
+        event = Change("release", text, data, author)
+        self._core.learner.release(event)
+        return self._finish_change(event)
 
     def rollback(self, version: int, author: str = "") -> Changed:
-        """Let an earlier version answer again, stored as a new version with a new number.
+        """Let an earlier version answer again, stored as a new version with a new number, and pin
+        it.
 
         Labels that came since, up to the training window's size, are among its references,
-        corrections count, and the rule in force goes on. The next retrain starts from this version.
-        A reducer that is stored by its traces (umap-learn), and a baseline, are fitted again: the
-        first on the traces that it was fitted on, the second on the same traces with the labels as
-        they count now.
+        corrections count, and the rule in force goes on. No automatic retrain replaces a pinned
+        version, until `release`, a retrain that somebody asks for, or `forget` of a label that it
+        was trained with. Labels are stored and counted, and become its references, meanwhile. A
+        retrain after that starts from this version. A reducer that is stored by its traces
+        (umap-learn), and a baseline, are fitted again: the first on the traces that it was fitted
+        on, the second on the same traces with the labels as they count now.
 
         Parameters
         ----------
         version : int
-            The version that answers now changes nothing.
+            The version that answers now is pinned. One that is pinned already changes nothing.
         author : str
             For the record.
 
@@ -194,10 +241,11 @@ class Corrections:
             )
         self._bring_up_to_date()
         before = self._core.live.version
-        if version == before and version > 0:
-            return self._as_unchanged("rollback", f"Version {version} answers already")
+        pinned = self._core.live.pinned
+        if pinned and version in (before, pinned):
+            return self._as_unchanged("rollback", f"Version {version} is pinned already")
         new = self._core.live.next_version
-        text = f"version {version} answers again, as version {new} after {before}"
+        text = f"version {version} answers again, as version {new} after {before}, and is pinned"
         data = {"to": int(version), "was": before, "now": new}
         event = Change("rollback", text, data, author)
         self._core.learner.roll_back(int(version), event)
@@ -237,15 +285,17 @@ class Corrections:
         Raises
         ------
         SettingError
-            For what is no policy, for force limits that the traces cannot hold, for a guarantee
-            whose class cannot be imported or made, and, of a model that was handed in, for anything
-            but audit_rate, stops, label_within, windows and shadow.
+            For what is no policy, for force limits that the traces cannot hold, or in seconds at an
+            unknown rate, for a guarantee whose class cannot be imported or made, and, of a model
+            that was handed in, for anything but audit_rate, stops, label_within, windows and
+            shadow.
         StoreError
             Where the store does not answer.
         """
         example = "for example Policy(alpha=0.05, lower_bound=0.95)"
         expect(isinstance(policy, Policy), "a Policy", policy, example)
         present = self._core.settings.now
+        check_rate(policy.windows, present.trace)
         old_values = present.recipe.policy.to_values()
         new_values = policy.to_values()
         changes = {name: value for name, value in new_values.items() if value != old_values[name]}
@@ -309,14 +359,18 @@ class Corrections:
             decisions.append(stored)
         return decisions
 
-    def _change_labels(self, change: Change) -> Changed:
+    def _change_labels(self, change: Change, is_released: bool = False) -> Changed:
         """Store a change of labels, and apply it to references, training window and rule.
 
-        A model that cannot change its references is retrained. A safe mode that began or ended is
-        announced. Returns what was done, with the number of the change's event. Raises StoreError
-        where the store does not answer.
+        With `is_released` it also ends the pin of the version that answers. A model that cannot
+        change its references is retrained. A safe mode that began or ended is announced. Returns
+        what was done, with the number of the change's event. Raises StoreError where the store does
+        not answer.
         """
-        self._store.apply_change(change)
+        if is_released:
+            self._core.learner.release(change)
+        else:
+            self._store.apply_change(change)
         for id_ in change.decisions:
             self._core.outbox.evict_decision(id_)
         self._core.learner.apply_corrections()

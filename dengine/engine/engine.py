@@ -19,7 +19,7 @@ import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import NotTakenError, StoreError
+from ..errors import NotTakenError, StoreError, expect
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
 from ..model.base import EngineModel, Model
@@ -50,10 +50,12 @@ from ..representation import to_html
 from ..store.opening import LONG_WAIT, opening
 from ..store.outbox import Outbox
 from ..store.records import StoredDecision
+from ..traces import check_rate
 from .core import EngineCore
 from .corrections import Changed, Corrections
 from .settings import (
     EngineSettings,
+    agreed_trace_spec,
     check_model_settings,
     choose_recipe,
     fill_from_peers,
@@ -133,7 +135,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     policy : Policy, optional
         The error level alpha, the lower bound, and what else the user decides.
     trace : TraceSpec, optional
-        The contract of traces; None: the first sound trace sets it.
+        The contract of traces; None: the first sound trace sets it, and does not tell rate and
+        unit.
     radius, folds, retrain_every, budget : optional
         As in `Recipe`; None: the recipe decides, or the reducer.
     store : str, path or SqlStore, optional
@@ -169,7 +172,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     Raises
     ------
     SettingError
-        For settings that are out of range or contradict each other.
+        For settings that are out of range or contradict each other, and for force limits in
+        seconds while the rate of the traces is unknown.
     StoreError
         For a used store.
     """
@@ -208,6 +212,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         settings = EngineSettings(choose_recipe(reducer, recipe, given), seed, trace=trace)
         # Before a store is made: a wrong setting leaves none behind.
         settings, template = settings.with_template(model)
+        n_traces = template.min_traces
+        window = f"a window of at least {n_traces} labelled traces, on which it trains first"
+        expect(settings.recipe.window >= n_traces, window, settings.recipe.window)
         with opening(store) as opened:
             if settings.trace is None:
                 settings = replace(settings, trace=read_peers_trace_spec(opened))
@@ -237,8 +244,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         The options are executor, replaying, clock, on_safe_mode and reading. It sets `store`,
         `seed`, and `resumed` to False. From now on the store is closed when the engine is
-        garbage-collected.
+        garbage-collected. Raises SettingError for force limits in seconds at an unknown rate.
         """
+        check_rate(settings.recipe.policy.windows, settings.trace)
         self.store = store
         self.seed = settings.seed
         self.resumed = False
@@ -264,6 +272,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         *,
         reducer: Any = None,
         model: Model | None = None,
+        trace: TraceSpec | None = None,
         wait: float | None = None,
         allow_import: bool | Collection[str] = False,
         **options: Any,
@@ -275,6 +284,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         url : str, path or SqlStore
         reducer, model : object, optional
             The same object again, where the engine had one of yours that the store cannot name.
+        trace : TraceSpec, optional
+            The stored contract of traces, to state its rate, units or columns where they are
+            unknown.
         wait : float, optional
             Seconds that a call waits for the database, as `SqlStore` takes it.
         allow_import : bool or collection of str
@@ -294,19 +306,22 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             Where the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            Where an object is missing or another than before, or a model is not needed.
+            Where an object is missing or another than before, a model is not needed, or `trace`
+            contradicts the stored contract.
         ImportRefusedError
             A SettingError, where a class would have to be imported that is not allowed.
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True, wait=wait) as store:
             name = str(url) if isinstance(url, str | os.PathLike) else "the store"
-            settings = EngineSettings.from_store(
-                store.settings(), name, reducer, model, allow_import
-            )
+            stored = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
+            settings = replace(stored, trace=agreed_trace_spec(store, trace))
+            settings.check_request({"trace": trace})
             engine._start(*settings.with_template(model), store, **options)
             with engine._closed_on_failure():
                 engine._core.resume()
+                if settings.trace != stored.trace and not options.get("reading"):
+                    engine._core.settings.save()
         engine.resumed = True
         return engine
 
@@ -361,6 +376,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 )
             names = ("model", "executor", "replaying", "clock", "on_safe_mode")
             options = {name: settings.pop(name) for name in names if name in settings}
+            options["trace"] = settings.get("trace")
             recipe = settings.get("recipe")
             reducer = settings.get("reducer")
             if reducer is None and isinstance(recipe, Recipe):
@@ -373,8 +389,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. A second call does nothing. Raises StoreError where
-        the journal did not take everything; close again when the disk is well.
+        A retrain that takes longer is dropped. A second call does nothing. What the disk does not
+        take is given up, and an error is logged; no report on it was acknowledged. Raises
+        StoreError while another thread uses the engine.
         """
         self._core.close()
 
@@ -464,9 +481,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         In each cycle the cell inserts a part, the engine decides, and the cell verifies it, lets it
         go on or rejects it; a known outcome is reported, and retrains happen between cycles. When
-        the iteration ends, also by an error of the cell, everything known is written. Python's
-        garbage collector works between decisions, and only on objects that are newer than the first
-        cycle (`gc.freeze`).
+        the iteration ends, also by an error of the cell, everything known is written. What the
+        engine does not know of its traces is taken from a `TraceSpec` in the cell's attribute
+        `spec`, if there is one. Python's garbage collector works between decisions, and only on
+        objects that are newer than the first cycle (`gc.freeze`).
 
         Parameters
         ----------
@@ -482,7 +500,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            Before the first part, for a cell that lacks one of its four methods.
+            Before the first part, for a cell that lacks one of its four methods, or whose `spec`
+            cannot hold the force limits.
         """
         check_cell(cell)
         return self._run(cell, cycles)
@@ -495,6 +514,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         NotTakenError where the disk does not take everything in time.
         """
         self._core.wait_until_warm()
+        spec = getattr(cell, "spec", None)
+        if isinstance(spec, TraceSpec):
+            self._core.set_trace_spec(spec)
         with ExitStack() as ending:
             ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
             ending.enter_context(frozen_objects())
@@ -538,7 +560,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     # Learning
 
     def retrain(self) -> RetrainReport:
-        """Retrain now, in this thread, and return the report.
+        """Retrain now, in this thread, and return the report; the new version is not pinned.
 
         It first waits for the imports that began with the engine, some two seconds after its start.
         A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
@@ -558,8 +580,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._corrections.forget(*decision_ids, author=author, reason=reason)
 
     def rollback(self, version: int, author: str = "") -> Changed:
-        """Let an earlier version answer again, as a new version; see `Corrections.rollback`."""
+        """Let an earlier version answer again until `release`; see `Corrections.rollback`."""
         return self._corrections.rollback(version, author)
+
+    def release(self, author: str = "") -> Changed:
+        """Let retrains replace a pinned version again; see `Corrections.release`."""
+        return self._corrections.release(author)
 
     # Policy
 
@@ -629,8 +655,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """Flush, and return how the engine is doing; arguments and errors as of
         `history.status.status`.
+
+        Where the disk does not take everything, `store_fault` says why, and the counts lack it.
         """
-        self.flush()
+        with suppress(NotTakenError):
+            self.flush()
         return self._core.complete_status(status(self.store, last, watching))
 
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:

@@ -28,12 +28,12 @@ from ..store.records import Change, StoredDecision, without_rule
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import MOST, ROUNDS, Peers
-from .guard import GuardedModel
+from .guard import GuardedModel, logged_failure
 from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
-from .resume import add_labels_since, refit
+from .resume import add_labels_since, find_clean_start, refit
 from .settings import EvidenceWindow
-from .trainer import HUNG, Clock, Retrainer, Trained, TrainedOn, TrainingWindow
+from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
 log = logging.getLogger("dengine")
 STEP = 0.0005  # seconds of catching up in one step: a label or two
@@ -88,6 +88,11 @@ class Learner:
         self._report: RetrainReport | None = None  # of the newest retrain, until it is taken
         self._was_accepted = True  # the last retrain
         self._precomputed: Future[None] | None = None  # what the next retrain begins with
+        self._is_requested = False  # a training is to begin as soon as it can
+        self._by_hand = False  # a person asked for the newest training, so that it ends a pin
+        # What the next training starts from, and the answering version and correction that it is
+        # for.
+        self._start: tuple[tuple[int, int], EngineModel, str] | None = None
 
     def resume(self, label_within: int, policy_since: int) -> None:
         """Restore window, version, rule and counts from the store, bit for bit, when an engine
@@ -108,30 +113,22 @@ class Learner:
         self.live.resume(version, newest_version, label_within, policy_since)
         if self.live.answering is not None or len(labelled.seq) >= IMPORTED:
             self.precompute()
-        self.labels.resume(self._counts_from)
+        self.labels.resume(self.live.trained_on.counts_from)
         if self._peers is not None:
             self._peers.resume()
-
-    @property
-    def _counts_from(self) -> int:
-        """Number of the newest label that the next retrain does not wait for.
-
-        0 before the first retrain.
-        """
-        trained_on = self.live.trained_on
-        return 0 if trained_on is None else trained_on.counts_from
 
     def precompute(self) -> None:
         """Start a thread that computes what the next retrain begins with; do not wait for it.
 
-        The result is kept in the newest model. While an earlier one has not been waited for,
-        nothing is started. There must be labels.
+        The result is kept in the model that the next training starts from. While an earlier one has
+        not been waited for, nothing is started. There must be labels.
         """
         if self._precomputed is not None:
             return
         labelled = self._window.snapshot()
+        start = self._choose_start()
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
-        model = GuardedModel(self.live.newest)
+        model = GuardedModel(start)
         self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
         pool.shutdown(wait=False)
 
@@ -161,9 +158,9 @@ class Learner:
         for.
 
         The remedy, a rebuild of the rule and perhaps a correction, is left to a later call while
-        the store lacks records or has a fault. A correction first finishes a retrain under way, or
-        gives it up after `HUNG` seconds, and retrains a model that cannot change its references.
-        Where the store fails meanwhile, that is logged, and a later call tries again.
+        the store lacks records or has a fault. A correction first ends a retrain under way, as
+        `end_training` does, and retrains a model that cannot change its references. Where the store
+        fails meanwhile, that is logged, and a later call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -176,7 +173,7 @@ class Learner:
             return
         try:
             if remedy is Remedy.CORRECT:
-                self.collect(HUNG)  # what is being trained does not have the correction
+                self.end_training()  # what is being trained does not have the correction
                 self.apply_corrections()
             else:
                 self.live.rebuild_rule()
@@ -203,20 +200,21 @@ class Learner:
 
     # A retrain
 
-    def retrain(self) -> RetrainReport:
+    def retrain(self, by_hand: bool = True) -> RetrainReport:
         """Train a version in this thread, let it answer, and return the report.
 
-        A retrain under way in the executor is finished first, or given up after `HUNG` seconds;
-        then news of peers is taken in. A version that fails or cannot be stored is dropped, and the
-        report says so. A version that is stored, while labels that came since cannot be, answers at
-        a later call; its report is returned all the same. Raises StoreError where the labels before
-        it cannot be stored.
+        With `by_hand` a person asked for it, so that it may replace a pinned version.
+
+        A retrain under way in the executor is ended first, and news of peers is taken in. A version
+        that fails or cannot be stored is dropped, and the report says so. A version that is stored,
+        while labels that came since cannot be, answers at a later call; its report is returned all
+        the same. Raises StoreError where the labels before it cannot be stored.
         """
-        self.collect(HUNG)
+        self.end_training()
         self.store_labels()
         begin = self._clock()
-        self._begin_retrain()
-        trained = self._retrainer.train(self.live.newest, begin)
+        self._begin_retrain(by_hand)
+        trained = self._retrainer.train(self._choose_start(), begin)
         candidate = self._as_candidate_of(trained)
         self._candidate = candidate
         self._report = None
@@ -224,48 +222,56 @@ class Learner:
         # A version that is stored may still wait for labels that came since.
         return self._report or candidate.report
 
-    def start_retrain(self) -> RetrainReport | None:
-        """Begin to train in the executor and return None.
+    def start_retrain(self, by_hand: bool = True) -> RetrainReport | None:
+        """Begin to train in the executor and return None; `by_hand` is as for `retrain`.
 
         A training under way comes a step further, and a new one begins only if that ended it.
-        Before a new one, labels are stored, and news of peers is taken in. Without an executor that
-        takes work, retrain in this thread and return the report. Raises StoreError where the labels
-        before it cannot be stored.
+        Before a new one, labels are stored, and news of peers is taken in. While the executor works
+        on a training that was discarded, or what a retrain begins with is computed, it begins
+        later, by `retrain_if_due`. Without an executor that takes work, retrain in this thread and
+        return the report. Raises StoreError where the labels before it cannot be stored.
         """
         self.collect()
-        if self.is_busy:
+        if self._is_at_work:
             return None
         if self._retrainer.executor is not None:
-            self.store_labels()
-            self._begin_retrain()
-            if self._retrainer.start(self.live.newest):
+            precomputed = self._precomputed
+            is_preparing = precomputed is not None and not precomputed.done()
+            if is_preparing or self._retrainer.is_occupied:
+                self._is_requested = True
+                self._by_hand = by_hand
                 return None
-        return self.retrain()
+            self.store_labels()
+            self._begin_retrain(by_hand)
+            if self._retrainer.start(self._choose_start()):
+                return None
+        return self.retrain(by_hand)
 
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
-        There must be as many labels as the model's `min_traces`. News of peers is taken in first,
-        so another version may answer even if none is trained here. With `once` a version that lacks
-        steps is not trained on until the report of its last retrain was taken. Returns the report
-        of a retrain in this thread; else None: none is due, the store is away, a training or its
-        preparation is under way, or it was begun in the executor.
+        There must be as many labels as the model's `min_traces`, unless it was asked for and could
+        not begin then. News of peers is taken in first, so another version may answer even if none
+        is trained here. A pinned version stays, unless a person asked for the retrain. With `once`
+        a version that lacks steps is not trained on until the report of its last retrain was taken.
+        Returns the report of a retrain in this thread; else None: none is due, the store is away, a
+        training or its preparation is under way, or it was begun in the executor.
         """
         is_due = self._is_due_after_news(recipe.retrain_every)
+        by_hand = self._is_requested and self._by_hand
+        if self.live.pinned and not by_hand:
+            self._is_requested = False
+            return None
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
         n_labels = max(self.labels.new_labels, len(self._window))
         has_enough = n_labels >= self.live.newest.min_traces
-        if not (is_due and has_enough) and not lacks_steps:
+        if not (is_due and has_enough) and not lacks_steps and not self._is_requested:
             return None
         try:
             self.store_labels()
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
-        precomputed = self._precomputed
-        is_preparing = precomputed is not None and not precomputed.done()
-        if self._outbox.fault or (self._retrainer.executor is not None and is_preparing):
-            return None
-        return self.start_retrain()
+        return None if self._outbox.fault else self.start_retrain(by_hand)
 
     @property
     def _lacks_steps(self) -> bool:
@@ -287,9 +293,29 @@ class Learner:
         return self._candidate is not None
 
     @property
-    def is_busy(self) -> bool:
+    def _is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is being swapped in."""
         return self._retrainer.future is not None or self.is_swapping
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a retrain is under way, or waits until it can begin."""
+        return self._is_at_work or self._is_requested
+
+    def end_training(self) -> None:
+        """End what is under way without waiting for a training, before a change that it lacks.
+
+        A version that is trained answers, or is dropped. A training that is not done is discarded,
+        and another begins as soon as it can, after the change.
+        """
+        self.collect(to_the_end=True)
+        self._discard_training()
+
+    def _discard_training(self) -> None:
+        """Discard a training that is under way in the executor, and ask for another one."""
+        if self._retrainer.discard():
+            log.info("a training was discarded for a change; another one begins")
+            self._is_requested = True
 
     def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
         """Take a training's outcome from the executor, and bring its version closer to answering.
@@ -298,10 +324,9 @@ class Learner:
         swap it in. With `to_the_end`, with `wait` above 0, and always where cells share a product,
         it does all steps of a training that is done, and blocks for the store. `wait` is also how
         many seconds to wait for a training that is not done; then that is given up, as is one that
-        takes longer than `HUNG` seconds. Nothing happens while one is not done, or where there is
-        none.
+        hangs. Nothing happens while one is not done, or where there is none.
         """
-        if self._retrainer.future is None and self._candidate is None:
+        if not self._is_at_work:
             return
         # Versions and corrections of peers must not come in between two steps.
         to_the_end = to_the_end or wait > 0.0 or self._peers is not None
@@ -315,7 +340,25 @@ class Learner:
         """Return the outcome of a training as a candidate that takes over the answering model's
         rule.
         """
+        note = self._start[2] if self._start is not None else ""
+        if note and trained.model is not None:
+            trained = replace(trained, reason=f"{trained.reason}; {note}")
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
+
+    def _choose_start(self) -> EngineModel:
+        """Return the model that the next training starts from, as `find_clean_start` does.
+
+        It is searched for once for an answering version and the corrections that it has. Where the
+        store fails meanwhile, that is logged, and the training starts from initial weights.
+        """
+        live = self.live
+        key = (live.version, live.corrected_to)
+        if self._start is None or self._start[0] != key:
+            start = live.template, "from initial weights"
+            with logged_failure("weights before the forgotten labels cannot be searched for"):
+                start = find_clean_start(self._store, live.template, live.newest, live.trained_on)
+            self._start = key, *start
+        return self._start[1]
 
     def wait_until_precomputed(self) -> None:
         """Wait until what the next retrain needs of the stored labels' traces is computed.
@@ -326,16 +369,19 @@ class Learner:
             self._precomputed.result()
             self._precomputed = None
 
-    def _begin_retrain(self) -> None:
+    def _begin_retrain(self, by_hand: bool) -> None:
         """Prepare for a training: wait for what is computed in advance, take in the peers' news if
         the store answers, and count new labels from zero.
         """
         self.wait_until_precomputed()
         self._take_in_all_news()
         self.labels.begin_retrain()
+        self._is_requested = False
+        self._by_hand = by_hand
 
     def _advance(self, to_the_end: bool) -> None:
-        """Bring the candidate further: catch up on labels, store it, catch up again, swap it in.
+        """Bring the candidate further: check it, catch up on labels, store it, catch up again, swap
+        it in.
 
         It takes one step, or all steps with `to_the_end`; without a candidate none. A candidate
         that cannot be stored is dropped. One that is stored waits for a later call where the newest
@@ -371,11 +417,15 @@ class Learner:
         `PATIENCE` steps did not bring. Raises StoreError where it cannot be stored.
         """
         if candidate.storing is None:
+            if not candidate.check(np.inf if to_the_end else STEP):
+                return False
             if not candidate.catch_up(self._window, np.inf if to_the_end else STEP):
                 return False
             if self._waits_for_labels(candidate, to_the_end):
                 return False
             self.store_labels()
+            if self._peers is not None and not self._by_hand and self._peers.has_pinned():
+                raise StoreError("a peer rolled back to an earlier version meanwhile")
             candidate.catch_up(self._window)
             candidate.begin_storing(self._begin_storing(candidate), self._outbox.limit)
         if candidate.storing is None or (not to_the_end and candidate.may_go_on_storing()):
@@ -395,7 +445,7 @@ class Learner:
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
         state = None
-        if candidate.model is not None and candidate.trained_on is not None:
+        if candidate.model is not None:
             state = self._state_of(candidate.model, candidate.trained_on)
         return self._outbox.submit(lambda: self._store.put_version(report, newest_seq, state))
 
@@ -423,6 +473,7 @@ class Learner:
         self._was_accepted = candidate.model is not None
         self._note_outcome(candidate.report)
         if candidate.model is not None:
+            self._start = None  # lets go of the previous model
             # An update of the rule may have failed since the candidate took it over.
             GuardedModel(candidate.model).prepare(self.live.newest)
             self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
@@ -507,6 +558,7 @@ class Learner:
             peers.take_over(version)
         peers.take_in(news)
         if news.correction > self.live.corrected_to:
+            self._discard_training()  # it does not have the corrections
             try:
                 self.apply_corrections(may_retrain=False)
             except StoreError as error:  # asked for again with the next news
@@ -519,13 +571,13 @@ class Learner:
     # What people put right
 
     def bring_up_to_date(self) -> None:
-        """Finish what is under way before a person's change: a retrain, labels, news of peers.
+        """Finish what is under way before a person's change: labels and news of peers.
 
-        A retrain that takes longer than `HUNG` seconds is given up; of the news at most `ROUNDS`
-        times `MOST` labels are taken in. Raises StoreError where the store is away, or where labels
+        A training is ended, as `end_training` does; of the news at most `ROUNDS` times `MOST`
+        labels are taken in. Raises StoreError where the store is away, or where labels
         of peers before one of this cell's are missing.
         """
-        self.collect(HUNG)
+        self.end_training()
         self.store_labels()
         self._take_in_all_news()
         if self._peers is not None and (self._peers.is_lost or self._has_gaps):
@@ -541,21 +593,55 @@ class Learner:
     def apply_corrections(self, may_retrain: bool = True) -> None:
         """Apply the store's newest corrections to window, references, count of new labels and rule.
 
-        A model that cannot change a reference is retrained, if `may_retrain`: only the cell that
-        corrected does so. Raises StoreError where the store is away.
+        A model that cannot change a reference is retrained, or a pinned one fitted again, if
+        `may_retrain`: only the cell that corrected does so. Where labels were forgotten, what the
+        next training starts from is prepared in a thread. Raises StoreError where the store is
+        away.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         last = self.labels.last_to_read
         self._window.refill(self._store.labelled(self._window.capacity, last=last))
         is_done = self.live.apply_corrections()
-        self.labels.recount(self._counts_from)
+        self.labels.recount(self.live.trained_on.counts_from)
         self.live.rebuild_rule()
-        if may_retrain and not is_done:
-            self.retrain()
+        self._prepare_start()
+        if is_done or not may_retrain:
+            return
+        if self.live.pinned:
+            version = self.live.version
+            text = f"version {version} is fitted again, to labels as they count now"
+            was_requested = self._is_requested
+            self.roll_back(version, Change("rollback", text))
+            self._is_requested = was_requested
+        else:
+            self.retrain(by_hand=False)
+
+    def _prepare_start(self) -> None:
+        """Compute in advance for the next training, where it does not start from what answers.
+
+        Where that is in this thread, wait for it now, so that the retrain keeps its budget.
+        """
+        if self._choose_start() is self.live.newest or not len(self._window):
+            return
+        if self._precomputed is not None and self._precomputed.done():
+            self._precomputed = None  # it was for another model
+        self.precompute()
+        if self._retrainer.executor is None:
+            self.wait_until_precomputed()
+
+    def release(self, event: Change) -> None:
+        """Let retrains replace a pinned version again, and store that as a new version, with
+        `event`.
+
+        Raises StoreError where it cannot be stored: then nothing changes.
+        """
+        trained_on = replace(self.live.trained_on, pinned=0)
+        reason = "released, the same model"
+        self._store_and_swap_in(event, self.live.newest, trained_on, reason, 0.0)
 
     def roll_back(self, number: int, event: Change) -> None:
-        """Let the earlier version `number` answer again, as a new version, and store it with
-        `event`.
+        """Let the earlier version `number` answer again, as a new version, pin it, and store it
+        with `event`.
 
         Later labels, up to the window's capacity, become its references, and the present rule goes
         on. Afterwards news of peers is taken in, and new labels count from zero. Raises StoreError
@@ -580,10 +666,13 @@ class Learner:
         model.set_state(state)
         GuardedModel(model).prepare(self.live.newest)
         add_labels_since(model, self._store, version, self._window)
-        trained_on = replace(trained_on, counts_from=self._window.newest_seq)
+        trained_on = replace(trained_on, counts_from=self._window.newest_seq, pinned=number)
         reason = f"rolled back to version {number}"
         self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
-        self._begin_retrain()
+        self._is_requested = False  # also by hand: it was before
+        self._take_in_all_news()
+        self.labels.begin_retrain()
+        self._prepare_start()
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
         """Go on under another policy, as a new version of the same model, and store it with
@@ -599,7 +688,7 @@ class Learner:
         model = live.answering
         if policy is not None:
             template, model = live.with_policy(policy, evidence)
-        if model is None or live.trained_on is None:
+        if model is None:
             self._store.apply_change(event)
         else:
             self._store_and_swap_in(

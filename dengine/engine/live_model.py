@@ -51,7 +51,7 @@ class LiveModel:
         Number of the answering version, from 1; 0 before the first retrain.
     newest_version : int
         Largest number that a version ever had; after damage an earlier version may answer.
-    trained_on : TrainedOn or None
+    trained_on : TrainedOn
         Labels that the answering version was trained on.
     corrected_to : int
         Number of the newest correction that the references have.
@@ -75,7 +75,7 @@ class LiveModel:
         self.answering: EngineModel | None = None
         self.version = 0
         self.newest_version = 0
-        self.trained_on: TrainedOn | None = None
+        self.trained_on = TrainedOn()
         self.corrected_to = 0
         self.overdue: set[str] = set()
         self.overdue_to = 0
@@ -88,6 +88,11 @@ class LiveModel:
     def newest(self) -> EngineModel:
         """The answering model, or the template before the first retrain."""
         return self.answering or self.template
+
+    @property
+    def pinned(self) -> int:
+        """Number of the version that a rollback pinned, and that answers; 0: none."""
+        return self.trained_on.pinned
 
     @property
     def next_version(self) -> int:
@@ -151,7 +156,7 @@ class LiveModel:
         else:
             self._rebuild_rule_of(model, self._read_outcomes)
 
-    def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn | None) -> None:
+    def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
         """Let a model answer from now on, as the version of this number; nothing is stored.
 
         The caller hands the rule in force over to it (`GuardedModel.prepare`), before or after.

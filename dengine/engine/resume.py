@@ -1,19 +1,21 @@
 """Functions that restore a stored version bit for bit: its model, later labels and corrections.
-`live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a
-rollback, and `fleet.Peers` when another cell's version is taken over.
+`live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a rollback
+and after labels were forgotten, and `fleet.Peers` when another cell's version is taken over.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import StoreError
 from ..model.base import EngineModel
-from ..store.records import Correction, ModelVersion
+from ..store.records import Correction, ModelVersion, without_rule
 from .guard import GuardedModel
 from .trainer import TrainedOn, TrainingWindow
 
@@ -65,6 +67,41 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
         return False
     model.train(data.traces[kept], data.labels[kept], data.hashes[kept], numbers=data.seq[kept])
     return True
+
+
+def find_clean_start(
+    store: SqlStore, template: EngineModel, newest: EngineModel, trained_on: TrainedOn
+) -> tuple[EngineModel, str]:
+    """Return a model to train on from that never saw a label which is forgotten now, and a note.
+
+    That is `newest`, whose weights learned from `trained_on`, unless it saw one. Then it is the
+    newest version that is stored and did not, without its rule, and else `template`, with initial
+    weights; the note says so. A model that begins anew with each training stays. Raises StoreError
+    where the store cannot be read.
+    """
+    corrections = {correction.seq: correction for correction in store.corrections()}
+
+    def is_clean(trained_on: TrainedOn) -> bool:
+        """Whether it has seen no forgotten label; a training after one was forgotten has not."""
+        return not any(
+            correction.success is None
+            and correction.number > trained_on.corrected_to
+            and trained_on.has_seen(correction.seq)
+            for correction in corrections.values()
+        )
+
+    if is_clean(trained_on) or not newest.keeps_references:
+        return newest, ""
+    for number in [stored.report.version for stored in store.versions() if stored.kept][::-1]:
+        with suppress(StoreError):  # of a damaged version
+            version = store.load_version(number)
+            model = template.successor()
+            if model.needs_refit(version.state):
+                return newest, ""
+            if is_clean(TrainedOn.from_state(version.state)):
+                model.set_state(without_rule(version.state))
+                return model, f"from version {number}, which never saw the forgotten labels"
+    return template, "from initial weights, which never saw the forgotten labels"
 
 
 def newest_reference(version: ModelVersion) -> int:

@@ -218,9 +218,9 @@ class EngineSettings:
         `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. All
         settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
         the program leaves out, because an operator sets both. Nor is a reducer that is an object,
-        with its parameters, nor a trace contract where none is set. Beside a baseline only
-        `LOOP_SETTINGS`, which have an effect on any model, are compared. An unknown name is an
-        error, too.
+        with its parameters, nor a trace contract where none is set, nor what a trace contract
+        leaves unknown. Beside a baseline only `LOOP_SETTINGS`, which have an effect on any model,
+        are compared. An unknown name is an error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -235,6 +235,8 @@ class EngineSettings:
             )
         requested = {} if recipe is None else flat_settings(choose_recipe(reducer, recipe, {}))
         requested |= given
+        if isinstance(given.get("trace"), TraceSpec):
+            requested["trace"] = given["trace"].completed(self.trace)
         if policy is not None:
             requested |= policy.to_values()
         if reducer is not None:
@@ -365,6 +367,15 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
     """
     specs = map(stored_trace_spec, store.peers_settings().values())
     return next(filter(None, specs), None)
+
+
+def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec | None:
+    """Return the trace contract of a store, completed by a stated one.
+
+    It is the store's own, else the peers', else the stated one.
+    """
+    agreed = stored_trace_spec(store.settings()) or read_peers_trace_spec(store)
+    return stated if agreed is None else agreed.completed(stated)
 
 
 def fill_from_peers(

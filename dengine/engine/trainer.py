@@ -12,19 +12,22 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import BrokenExecutor, Executor, Future
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..decision.scripting import reason_of
 from ..errors import DengineError, SettingError
 from ..model.base import EngineModel
+from ..records import TRAINED
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
 
 log = logging.getLogger("dengine")
-HUNG = 60.0  # seconds after which work in the executor is given up
+HUNG = 60.0  # seconds after which a training in the executor is given up
+LONGEST_START = 600.0  # seconds after which an executor that cannot work yet is given up
 # Share of the budget after which no step begins. It is smaller, down to the second, where the work
 # after the steps takes longer. A model that lacks a few steps decides a little less often.
 STEPS = 0.7
@@ -132,7 +135,7 @@ class TrainingWindow:
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """The labels that a version was trained on.
+    """The labels that a version was trained on; by default none, before the first version.
 
     Attributes
     ----------
@@ -142,14 +145,25 @@ class TrainedOn:
         Number of the newest correction that they had.
     counts_from : int
         Number of the newest label that the next retrain does not wait for.
+    pinned : int
+        Number of the earlier version that answers again by a rollback, and that no automatic
+        retrain replaces; 0: the version is not pinned.
     """
 
-    seq: NDArray[np.int64]
-    corrected_to: int
-    counts_from: int
+    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    corrected_to: int = 0
+    counts_from: int = 0
+    pinned: int = 0
+
+    def has_seen(self, seq: int) -> bool:
+        """Return whether the weights may have learned from the label of this number.
+
+        They have if it is among these labels, or older than all of them: an earlier version had it.
+        """
+        return bool(len(self.seq)) and (seq < self.seq[0] or seq in self.seq)
 
     def to_state(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays "trained_on", "trained_as" and "counts_from", for the store.
+        """Return the arrays "trained_on", "trained_as", "counts_from" and "pinned", for the store.
 
         `from_state` reads them.
         """
@@ -157,12 +171,14 @@ class TrainedOn:
             "trained_on": self.seq,
             "trained_as": np.array(self.corrected_to),
             "counts_from": np.array(self.counts_from),
+            "pinned": np.array(self.pinned),
         }
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]]) -> Self:
         """Return the record that `to_state` turned into arrays."""
-        return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]))
+        pinned = int(state.get("pinned", 0))
+        return cls(state["trained_on"], int(state["trained_as"]), int(state["counts_from"]), pinned)
 
 
 @dataclass(frozen=True)
@@ -222,6 +238,22 @@ class Trained:
     seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
+@runtime_checkable
+class RestartableExecutor(Protocol):
+    """An executor that takes seconds to start, and can be started again.
+
+    Attributes
+    ----------
+    ready : Future
+        Done when it can work; it fails if that will never be.
+    """
+
+    ready: Future[None]
+
+    def restart(self) -> None:
+        """End what it works on, and start it anew without waiting for it."""
+
+
 class Retrainer:
     """Trains successors of a model on the window, in the calling thread or in an executor.
 
@@ -230,8 +262,8 @@ class Retrainer:
     window : TrainingWindow
     limits : Limits
     executor : concurrent.futures.Executor or None
-        Set to None when it died, hangs or takes no more work: then retrains are in the calling
-        thread.
+        A `RestartableExecutor` that died or hangs is started again; until it is ready, retrains are
+        in the calling thread. Another is set to None when it died or takes no more work.
     clock : callable
         Seconds, of any origin; it must pickle for a process executor.
 
@@ -253,7 +285,10 @@ class Retrainer:
         self.executor = executor
         self.clock = clock
         self.future: Future[Trained] | None = None
-        self._began = 0.0  # when the training in the executor began, by `time.monotonic`
+        self._left: Future[Trained] | None = None  # nobody wants it, and it may still be at work
+        self._is_restarted = False  # the executor
+        self._submitted = 0.0  # when the training was handed to the executor, by `time.monotonic`
+        self._began = 0.0  # when the executor could begin with it
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
         self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
 
@@ -277,64 +312,116 @@ class Retrainer:
         now.
 
         `collect` returns the outcome; no other training may be under way. Returns False, and begins
-        nothing, without an executor and where it takes no more work; such an executor is given up.
+        nothing, without an executor that takes work.
         """
-        if self.executor is None:
+        executor = self.executor
+        if executor is None or self._left is not None:
+            return False
+        is_starting = isinstance(executor, RestartableExecutor) and not executor.ready.done()
+        if is_starting and self._is_restarted:
             return False
         data = self.window.snapshot()
-        if not self._began:
+        if not self._submitted:
             log.info("the first retrain begins, on %d labels", len(data.seq))
         arguments = (current.successor(), data, self._limits(), self.clock)
         try:
-            self.future = self.executor.submit(train_candidate, *arguments)
-        except (
-            RuntimeError
-        ) as error:  # the executor is the caller's, so it cannot be made anew here
-            log.error(
-                "the executor takes no more work, retrains are in line from now on: %s", error
-            )
-            self.executor = None
-        self._began = time.monotonic()
+            self.future = executor.submit(train_candidate, *arguments)
+        except RuntimeError as error:
+            log.error("the executor takes no work, the retrain is in line: %s", error)
+            self._replace_executor()
+        self._submitted = self._began = time.monotonic()
         self._seq = data.seq
         return self.future is not None
+
+    def discard(self) -> bool:
+        """Give up the training under way, without waiting; return whether there was one."""
+        future = self.future
+        self.future = None
+        if future is not None and not future.cancel():
+            self._left = future
+        return future is not None
+
+    @property
+    def is_occupied(self) -> bool:
+        """Whether the executor still works on a training that was discarded.
+
+        One that hangs is given up, and does not count any more.
+        """
+        left = self._left
+        if left is None or left.done():
+            self._left = None
+            return False
+        is_hung = self._count_seconds_left() <= 0.0
+        if is_hung and isinstance(self.executor, RestartableExecutor):
+            self._replace_executor()
+        return not is_hung
+
+    def _count_seconds_left(self) -> float:
+        """Return how many seconds the executor's training has left, before it counts as hung.
+
+        They count from when the executor could begin; a process may import for a long time.
+        """
+        now = time.monotonic()
+        executor = self.executor
+        if isinstance(executor, RestartableExecutor) and not executor.ready.done():
+            self._began = now
+            return self._submitted + LONGEST_START - now
+        return self._began + HUNG - now
 
     def collect(self, wait: float = 0.0) -> Trained | None:
         """Return the outcome of the training in the executor, once.
 
         Returns None where there is none or it is not done. With `wait` above 0 it blocks for at
-        most so many seconds; a training that is not done then is given up, and so is one that takes
-        longer than `HUNG`: the outcome has no model and says why. After that, and after the
-        executor died, the executor is used no more.
+        most so many seconds; a training that is not done then is given up, and so is one that
+        hangs, or whose executor died: the outcome has no model and says why.
         """
         future = self.future
-        left = self._began + HUNG - time.monotonic()
+        left = self._count_seconds_left()
         if future is None or not (future.done() or wait > 0.0 or left <= 0.0):
             return None
-        self.future = None
         try:
             trained = future.result(timeout=max(0.0, min(wait, left)))
         except Exception as error:  # the failure is recorded, and the old version goes on answering
             trained = Trained(None, self._give_up(future, error), seq=self._seq)
+        self.future = None
         self._last_seconds.append(trained.last_seconds)
         return replace(trained, begin=self.clock() - trained.seconds)
 
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
-        An executor that died or did not finish in time is used no more: its training is cancelled
-        if it has not begun, and later retrains run in the calling thread.
+        An executor that died, or in which a training hangs, is replaced.
         """
-        training_raised = future.done() and not isinstance(error, BrokenExecutor)
+        is_broken = isinstance(error, BrokenExecutor)
+        training_raised = future.done() and not is_broken
         log.error("a retrain in the executor failed: %s", error, exc_info=training_raised)
         if training_raised:
-            return _dropped(error)
-        self.executor = None
-        future.cancel()
+            return f"dropped: {reason_of(error)}"
         failure = f"{type(error).__name__}: {error}"
-        if isinstance(error, TimeoutError):
+        if not is_broken:
+            self.discard()
             seconds = time.monotonic() - self._began
             failure = f"not done after {seconds:.0f} s in the executor."
-        return f"dropped: RuntimeError: {failure} Retrains are in line from now on."
+        if is_broken or self._count_seconds_left() <= 0.0:
+            self._replace_executor()
+        return f"dropped: RuntimeError: {failure}"
+
+    def _replace_executor(self) -> None:
+        """Start the executor again, or where that cannot be done do without it.
+
+        An executor that cannot be started again is used again once it is done with what it does.
+        """
+        executor = self.executor
+        if isinstance(executor, RestartableExecutor):
+            self._left = None
+            self._is_restarted = True
+            try:
+                executor.restart()
+            except OSError:
+                log.exception("retrains are in line until their process can be started again")
+        elif self._left is None:
+            self.executor = None
+            log.error("retrains are in line from now on")
 
 
 def train_candidate(
@@ -362,20 +449,12 @@ def train_candidate(
             reason = f"dropped: {defect}"
         else:
             model = successor
-            remarks = ("accepted", report.note, LATE if stop.late else "")
+            remarks = (TRAINED, report.note, LATE if stop.late else "")
             reason = "; ".join(filter(None, remarks))
     except DengineError as error:
         reason = f"dropped: {error}"
     except Exception as error:  # no exception inside a model reaches the cell
-        reason = _dropped(error)
+        reason = f"dropped: {reason_of(error)}"
     end = clock()
     last_seconds = 0.0 if stop.last_step is None else end - stop.last_step
     return Trained(model, reason, n_steps, end - begin, last_seconds, seq=data.seq)
-
-
-def _dropped(error: Exception) -> str:
-    """Return the reason of a training that raised: "dropped: ", the error's type and its first
-    line.
-    """
-    lines = str(error).splitlines() or [""]
-    return f"dropped: {type(error).__name__}: {lines[0]}"

@@ -599,6 +599,11 @@ def _draw_policies(
             top.scatter(tick, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
 
 
+def _with_unit(name: str, unit: str) -> str:
+    """Return the label of an axis: a channel's name, and its unit in brackets if it is known."""
+    return f"{name} [{unit}]" if unit else name
+
+
 def explained_picture(explanation: Explanation) -> Figure:
     """Draw why a decision came out as it did; return the figure.
 
@@ -629,8 +634,8 @@ def explained_picture(explanation: Explanation) -> Figure:
         name = "trace" if spec.channels == 1 else f"channel {channel + 1}"
         if spec.columns:
             name = spec.columns[channel]
-        finish(axes, legend=0 if i else 3, ylabel=f"{name} [{spec.units[channel]}]")
-    panels[-1].set(xlabel="time [s]")
+        finish(axes, legend=0 if i else 3, ylabel=_with_unit(name, spec.units[channel]))
+    panels[-1].set(xlabel="time [s]" if spec.rate_hz else "sample")
     left, right = below.subplots(1, 2, width_ratios=(1.15, 1.0))
     _draw_distances(left, explanation)
     _draw_bound(right, explanation.bound)
@@ -643,7 +648,8 @@ def _draw_trace(axes: Axes, explanation: Explanation, channel: int) -> None:
     Stretches in which it clearly leaves the envelope are shaded. Without an envelope only the
     traces are drawn.
     """
-    x = np.arange(explanation.trace.shape[1]) / explanation.spec.rate_hz
+    rate = explanation.spec.rate_hz or 1.0  # the axis is in samples if it is unknown
+    x = np.arange(explanation.trace.shape[1]) / rate
     envelope = explanation.envelope
     if envelope is not None:
         low = envelope.low[channel]
@@ -671,11 +677,10 @@ def _draw_trace(axes: Axes, explanation: Explanation, channel: int) -> None:
         for excess in envelope.excesses
         if excess.channel == channel and excess.widths >= CLEAR
     ]
-    half = 0.5 / explanation.spec.rate_hz
     mark: Style = {"color": ORANGE, "alpha": 0.3, "linewidth": 0, "zorder": 0}
     for i, excess in enumerate(excesses):
         label = "outside the band" if i == 0 else "_"
-        axes.axvspan(excess.from_s - half, excess.to_s + half, label=label, **mark)
+        axes.axvspan((excess.first - 0.5) / rate, (excess.last + 0.5) / rate, label=label, **mark)
 
 
 def _draw_distances(axes: Axes, explanation: Explanation) -> None:
@@ -754,7 +759,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     names = data.channels
     if not names:
         names = tuple(f"channel {i + 1}" if n_channels > 1 else "trace" for i in range(n_channels))
-    labels = [f"{name} [{unit}]" for name, unit in zip(names, data.spec.units, strict=True)]
+    labels = list(map(_with_unit, names, data.spec.units))
     above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
     time = np.arange(X.shape[2]) / (data.rate_hz or 1.0)
     x_label = "time [s]" if data.rate_hz else "sample"

@@ -23,9 +23,9 @@ from ..cells.base import Cell
 from ..cells.replay import ReplayCell
 from ..datasets import load_dataset
 from ..engine.engine import DataEngine
-from ..errors import DataError, SettingError, expect
+from ..errors import SettingError, expect
 from ..recipe import RECIPES, Recipe
-from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport
+from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec
 from ..reducers.base import Reducer
 from ..representation import to_html
 from .baselines import BASELINES, make_baseline
@@ -114,7 +114,7 @@ class Contender:
         """Return a copy with another alpha, lower_bound, interval, guarantee or stops."""
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
-    def engine(self, seed: int) -> DataEngine:
+    def engine(self, seed: int, trace: TraceSpec | None = None) -> DataEngine:
         """Return a new engine in memory, with the baseline as its model if there is one.
 
         It counts steps and not seconds in a retrain, so that the same seed repeats exactly. Raises
@@ -123,7 +123,7 @@ class Contender:
         model = None
         if self.baseline is not None:
             model = make_baseline(self.baseline, self.recipe.policy, seed, **self.params)
-        return DataEngine(recipe=self.recipe, model=model, seed=seed, replaying=True)
+        return DataEngine(recipe=self.recipe, model=model, trace=trace, seed=seed, replaying=True)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -529,10 +529,8 @@ def replay(
     Raises
     ------
     SettingError
-        A number of cycles that the data set does not have, or alpha or lower_bound beside an
-        engine.
-    DataError
-        The policy has windows in seconds, and the rate of the data set is unknown.
+        A number of cycles that the data set does not have, alpha or lower_bound beside an engine,
+        or a policy with windows in seconds for a data set of an unknown rate.
     """
     changes = {"alpha": alpha, "lower_bound": lower_bound}
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -551,12 +549,7 @@ def replay(
     if shuffle:
         order = np.random.default_rng(seed).permutation(len(data))
     order = order[:n_cycles]
-    engine: DataEngine = recipe if contender is None else contender.engine(seed)
-    has_times = any(window.along is None for window in engine.policy.windows)
-    if data.rate_hz is None and has_times:
-        raise DataError(
-            f"Expected the rate of {data.name}, because windows are in seconds; give rate_hz=..."
-        )
+    engine: DataEngine = recipe if contender is None else contender.engine(seed, data.spec)
 
     def report(cycle: Cycle) -> None:
         if on_cycle is not None:

@@ -36,10 +36,12 @@ from ..decision.decider import DecisionConditions
 from ..decision.intervals import SCALAR_BOUNDS
 from ..decision.members import SAFE_MODES
 from ..decision.policy import RULES
+from ..decision.scripting import reason_of
 from ..engine.engine import DataEngine, core_of
 from ..errors import ExportError, instead
 from ..files import UNREADABLE, check_output, read_key, write_output
 from ..model.base import Exportable
+from ..model.neighbours import compare_points
 from ..records import Action, Reason, TraceSpec
 from .decision import FIELDS, DecisionModule
 
@@ -126,8 +128,9 @@ def prepare_export(
     ------
     ExportError
         For a baseline, before the first training, for a rule, an interval or a reducer that
-        TorchScript cannot compile, for code that was changed after it was compiled, if the rule is
-        stale, because an update of it failed, and if the store was changed from outside.
+        TorchScript cannot compile or run, if the compiled decision embeds a trace elsewhere than
+        the reducer does, for code that was changed after it was compiled, if the rule is stale,
+        because an update of it failed, and if the store was changed from outside.
     OutputError
         If `path`, its checksum or its signature must not be written; this is checked first.
     """
@@ -160,7 +163,15 @@ def prepare_export(
         )
     conditions = DecisionConditions(source.trace, source.windows, source.audit_rate, source.seed)
     shape = (model.n_spaces, model.index.dim)
-    decider = model.build_decider(conditions)
+    examples = source.examples
+    points = model.scaled_points(examples) if len(examples) else examples
+    try:
+        decider = model.build_decider(conditions)
+        defect = next(filter(None, compare_points(decider, examples, points)), "")
+    except (RuntimeError, torch.jit.Error) as error:
+        defect = f"it does not run as TorchScript, {reason_of(error)}"
+    if defect:
+        raise ExportError(f"{model.name} cannot be exported: {defect}.")
     return source, DecisionModule(source.trace, decider, shape, source.stops_all)
 
 

@@ -31,9 +31,9 @@ from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
 from ..errors import DataError, StoreError, instead
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec, stored_trace_spec
+from ..records import FITS, Action, Decision, Reason, TraceSpec, stored_trace_spec
 from ..store.opening import opening
-from ..traces import as_trace
+from ..traces import as_trace, can_fit_length
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
@@ -266,14 +266,13 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
 def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
     """Return samples, channel after channel, as a trace of the contract, float32 (C, T).
 
-    Another number of samples is fitted as `spec.fit` says; where it is too short or too long for
-    that, the trace ends in NaN (see `fit_length`). Raises DataError, naming `where`, for words that
-    are no numbers ("nan" and "inf" are), for another number of them than "strict" asks, for none,
-    and for one that is no multiple of the channels.
+    Another number of samples is fitted as `spec.fit` says. Raises DataError, naming `where`, for
+    words that are no numbers ("nan" and "inf" are), for a number of them that cannot be fitted, and
+    for one that is no multiple of the channels.
     """
     n = spec.channels * spec.samples
-    can_fit = spec.fit != "strict" and len(words) > 0 and len(words) % spec.channels == 0
-    is_valid = len(words) == n or can_fit
+    samples, rest = divmod(len(words), spec.channels)
+    is_valid = rest == 0 and can_fit_length(samples, spec.samples, FITS.index(spec.fit))
     do = "it is damaged, or of another cell"
     expect_data(is_valid, f"{n} samples in {where}", len(words), do)
     problem = f"The samples in {where} are no row of numbers"

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from ..decision.decider import Decider
 from ..records import FITS, REASONS, Reason, TraceSpec
-from ..traces import fit_length
+from ..traces import can_fit_length, fit_length
 
 # action, reason, lower, upper, n_success, n_failure, embedding
 DecisionFields = tuple[int, int, float, float, int, int, Tensor]
@@ -330,12 +330,11 @@ class DecisionModule(nn.Module):
     def as_trace(self, trace: Tensor) -> Tensor:
         """Return the trace as (C, T) float32 with the number of samples of the contract.
 
-        Another number of samples is fitted as the contract's `fit` says; where it is too short or
-        too long for that, the trace ends in NaN. Raises ValueError, compiled torch.jit.Error, for
-        another shape, and for another number of samples if `fit` is "strict".
+        Another number of samples is fitted as the contract's `fit` says. Raises ValueError,
+        compiled torch.jit.Error, for one that cannot be fitted so, and for another shape.
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
-        fits = x.size(-1) == self.samples or (self.fit != 0 and x.numel() > 0)
+        fits = x.numel() > 0 and can_fit_length(x.size(-1), self.samples, self.fit)
         if x.dim() != 2 or x.size(0) != self.channels or not fits:
             wanted = f"{self.channels} x {self.samples} samples"
             raise ValueError(f"Expected one trace of {wanted}, got shape {trace.size()}.")

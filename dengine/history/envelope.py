@@ -22,19 +22,23 @@ class Excess:
     ----------
     channel : int
         From 0.
-    from_s, to_s : float
-        Times of its first and last sample, in seconds.
+    from_s, to_s : float or None
+        Times of its first and last sample, in seconds; None if the rate is unknown.
     above : bool
         Whether it lies above the band.
     widths : float
         Largest distance from the band, in widths of the band there.
+    first, last : int
+        Its first and last sample, from 0.
     """
 
     channel: int
-    from_s: float
-    to_s: float
+    from_s: float | None
+    to_s: float | None
     above: bool
     widths: float
+    first: int
+    last: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +72,7 @@ class Envelope:
 
 
 def envelope_of(
-    successes: NDArray[np.float32], trace: NDArray[np.float32], rate_hz: float
+    successes: NDArray[np.float32], trace: NDArray[np.float32], rate_hz: float | None
 ) -> Envelope | None:
     """Compute the envelope of successes, and where a trace leaves it.
 
@@ -79,8 +83,8 @@ def envelope_of(
     successes : array of float32, shape (n, C, T)
     trace : array of float32, shape (C, T)
         Its NaN and infinite samples are left out.
-    rate_hz : float
-        Sampling rate.
+    rate_hz : float or None
+        Sampling rate; None: unknown.
 
     Returns
     -------
@@ -109,7 +113,7 @@ def envelope_of(
     )
 
 
-def _find_excesses(excess: NDArray[np.float64], rate_hz: float) -> Iterator[Excess]:
+def _find_excesses(excess: NDArray[np.float64], rate_hz: float | None) -> Iterator[Excess]:
     """Yield the pieces of the excess (C, T) that are above 0, or below 0, throughout.
 
     They come channel by channel, in the order of time. The excess is in widths of the band:
@@ -123,4 +127,6 @@ def _find_excesses(excess: NDArray[np.float64], rate_hz: float) -> Iterator[Exce
             if side[first]:
                 widths = float(np.abs(row[first:end]).max())
                 above = bool(side[first] > 0)
-                yield Excess(channel, first / rate_hz, (end - 1) / rate_hz, above, widths)
+                last = end - 1
+                from_s, to_s = (rate_hz and sample / rate_hz for sample in (first, last))
+                yield Excess(channel, from_s, to_s, above, widths, first, last)

@@ -225,8 +225,8 @@ def _explain_saturated(
 ) -> str:
     """Return the rest of the sentence on a saturated trace.
 
-    It has the number of samples that touch the sensor's range, and the time in seconds and the
-    channel of the first.
+    It has the number of samples that touch the sensor's range, and the time and the channel of the
+    first.
     """
     spec = circumstances.spec
     touching: NDArray[Any] = np.zeros((0, 2))
@@ -235,11 +235,9 @@ def _explain_saturated(
     if not len(touching):
         return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
-    first = f"first after {sample / spec.rate_hz:.3f} s (channel {channel + 1})"
-    return (
-        f": {len(touching)} samples touch the sensor's range of {spec.limit:g} "
-        f"{spec.units[channel]}, {first}."
-    )
+    first = f"first after {spec.time_text(sample)} (channel {channel + 1})"
+    limit = "" if spec.limit is None else spec.value_text(spec.limit, channel)
+    return f": {len(touching)} samples touch the sensor's range of {limit}, {first}."
 
 
 def _explain_not_finite(
@@ -274,13 +272,16 @@ WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]]
     Reason.AUDIT: _explain_audit,
     Reason.NOT_FINITE: _explain_not_finite,
     Reason.CONSTANT: lambda decision, trace, circumstances: (
-        f": every sample is {trace.flat[0]:g} {circumstances.spec.units[0]}: a dead sensor."
+        f": every sample is {circumstances.spec.value_text(float(trace.flat[0]), 0)}: a dead "
+        "sensor."
     ),
     Reason.SATURATED: _explain_saturated,
     Reason.TOO_LARGE: lambda decision, trace, circumstances: (
-        f": a sample of {np.abs(trace).max():g} "
-        f"{circumstances.spec.units[np.abs(trace).max(axis=1).argmax()]}; beyond "
-        f"{LARGEST:g} nothing can be computed from it."
+        ": a sample of "
+        + circumstances.spec.value_text(
+            float(np.abs(trace).max()), int(np.abs(trace).max(axis=1).argmax())
+        )
+        + f"; beyond {LARGEST:g} nothing can be computed from it."
     ),
     Reason.MODEL_ERROR: lambda *_: ": the model raised an error; see the log of that time.",
     Reason.NOVEL: lambda decision, trace, circumstances: (

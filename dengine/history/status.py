@@ -22,15 +22,27 @@ from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
 from ..errors import StoreError, expect
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec, stored_trace_spec
+from ..records import (
+    REPEATS,
+    REPEATS_MEANING,
+    TRAINED,
+    Action,
+    Decision,
+    Reason,
+    RetrainReport,
+    TraceSpec,
+    stored_trace_spec,
+)
 from ..representation import to_html
 from ..store.records import (
+    LOSS_REMEDY,
     SAFE_MODE_BEGAN,
     SAFE_MODE_ENDED,
     Event,
     Outcomes,
     StoredDecision,
     StoredVersion,
+    open_losses,
 )
 from ..store.views import HistoryFilter, Stretch, Tally
 
@@ -166,6 +178,9 @@ class Status:
         Of the model that answers; 0 before the first retrain.
     shadow : bool
         Whether every part is verified and the model only observes.
+    pinned : int
+        Number of the earlier version that was rolled back to, if it answers and no automatic
+        retrain replaces it; 0: none is pinned.
     safe_mode : str
         Why everything is verified; "" outside safe mode.
     safe_mode_time : float or None
@@ -190,6 +205,8 @@ class Status:
         The newest, oldest first.
     watch : Watch or None
         None if nothing is watched, or it was not asked for.
+    loss : str
+        What data was lost and what to do, until somebody acknowledges it; "" if nothing was.
     store_fault : str
         Of a running engine: what is wrong with the store; "" if nothing is.
     retraining : bool
@@ -206,6 +223,7 @@ class Status:
     trace: TraceSpec | None
     model: str | None
     version: int
+    pinned: int
     shadow: bool
     safe_mode: str
     safe_mode_time: float | None
@@ -224,6 +242,7 @@ class Status:
     retrains: tuple[StoredVersion, ...]
     events: tuple[Event, ...]
     watch: Watch | None
+    loss: str = ""
     store_fault: str = ""
     retraining: bool = False
     store_lag: float = 0.0
@@ -245,9 +264,9 @@ class Status:
     def alarm(self) -> str:
         """What somebody should look at, in a sentence, of several the most urgent; "" if nothing.
 
-        In this order: the store, safe mode, bad accepts, good rejects, dropped retrains, shadow
-        mode's errors, novel traces, parts outside limits, errors of the model. Of the decisions
-        only the newest count.
+        In this order: the store, lost data, safe mode, bad accepts, good rejects, dropped retrains,
+        traces that nearly repeat another, shadow mode's errors, novel traces, parts outside limits,
+        errors of the model. Of the decisions only the newest count.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -261,8 +280,12 @@ class Status:
         failing = retrain_fault(
             [report.reason for report in reports[newest_accepted:]], self.version
         )
+        trained = [report.reason for report in reports if report.reason.startswith(TRAINED)]
+        notes = trained[-1].split("; ") if trained else []
+        repeats = next((note.partition(":")[0] for note in notes if REPEATS in note), "")
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
+            (self.loss, self.loss),
             (self.safe_mode, f"Safe mode: {self.safe_mode}"),
             (
                 accepts.verdict == "broken",
@@ -275,6 +298,7 @@ class Status:
                 f"more than {rejects.tolerance:.1%}.",
             ),
             (failing, failing),
+            (repeats, f"{repeats}. {REPEATS_MEANING}"),
             (
                 self.shadow and would_accept.verdict == "broken",
                 f"It would break the tolerance of {would_accept.tolerance:.1%}.",
@@ -350,10 +374,11 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     counts = store.status(tally)
     outcomes = tally.outcomes
     events = store.events()
+    losses = [event.text for event in open_losses(events)]
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
     retrains = store.versions(cell_only=True)
     last_seq = retrains[-1].last_seq if retrains else 0
-    accepted = [report.version for report in store.retrains() if report.accepted]
+    accepted = [report for report in store.retrains() if report.accepted]
     since = int(settings.get("policy_since", 0))
     in_force = tally
     if since:
@@ -365,7 +390,8 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         recipe=recipe,
         trace=stored_trace_spec(settings),
         model=settings.get("model"),
-        version=accepted[-1] if accepted else 0,
+        version=accepted[-1].version if accepted else 0,
+        pinned=_read_pinned(store, accepted),
         shadow=policy.shadow,
         safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
         safe_mode_time=None if mode is None else mode.time,
@@ -378,8 +404,17 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         retrains=tuple(retrains),
         events=tuple(events[-N_EVENTS:]),
         watch=read_watch(store, recipe) if watching else None,
+        loss=" ".join(["Data was lost:", *losses, LOSS_REMEDY]) if losses else "",
         **{name: counts[name] for name in COUNTED},
     )
+
+
+def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
+    """Return the number of the version that was rolled back to and answers; 0: none is pinned."""
+    if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
+        return 0
+    version = store.last_version()
+    return 0 if version is None else int(version.state.get("pinned", 0))
 
 
 MODES = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)

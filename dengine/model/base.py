@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -28,6 +29,8 @@ from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 from ..traces import clip_extremes
 
 Embedding = tuple[tuple[float, ...], ...]  # (K, d)
+N_EXAMPLES = 16  # traces on which the answers of a version are compared with what was trained
+NO_TRACES: Floats = np.zeros((0, 1, 1), np.float32)
 
 
 class Prediction(NamedTuple):
@@ -297,8 +300,19 @@ class EngineModel(ABC):
         return ""
 
     def defect(self) -> str:
-        """Return why the trained model must not answer; "" if it may. It must read no label."""
+        """Return why the trained model must not answer; "" if it may. It must read no label.
+
+        It is called right after the training, where the model was trained.
+        """
         return ""
+
+    def check_answers(self) -> Iterator[str]:
+        """Decide on some training traces, one with each step of the iterator.
+
+        Yield for each why the model must not answer, "" if it may. It is called in the process that
+        will answer, after `prepare`. The default yields nothing.
+        """
+        return iter(())
 
     @property
     def report(self) -> FitReport:
@@ -463,6 +477,8 @@ class Exportable:
         As they act on traces.
     model_version, recipe
         What the file says of the engine; 0 and "" without one.
+    examples : array of float32, shape (n, C, T)
+        Traces on which the compiled decision is compared with the reducer.
     note : callable, optional
         Called with the kind and the text of an event, to record the export.
     """
@@ -475,6 +491,7 @@ class Exportable:
     windows: tuple[ForceLimits, ...] = ()
     model_version: int = 0
     recipe: str = ""
+    examples: Floats = field(default_factory=lambda: NO_TRACES)
     note: Callable[[str, str], object] | None = None
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:

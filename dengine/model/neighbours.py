@@ -15,11 +15,12 @@ compiles to TorchScript. Compiled deciders are copied from templates, because sc
 import copy
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from enum import Enum
 from functools import reduce
-from types import FunctionType
+from types import BuiltinFunctionType, FunctionType
 from typing import Any, Self
 
 import numpy as np
@@ -37,13 +38,21 @@ from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
 from ..decision.rule import DecisionRule
-from ..decision.scripting import arrays_with_prefix, incompatible_model_error, restore, script
-from ..errors import ExportError, listed
+from ..decision.scripting import (
+    INTERNAL,
+    arrays_with_prefix,
+    incompatible_model_error,
+    restore,
+    script,
+    tensor_attributes,
+)
+from ..errors import ExportError, StoreError, expect, listed
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, describe_estimator
-from ..records import ACTIONS, REASONS, Reason, TraceSpec, as_success
+from ..records import ACTIONS, REASONS, REPEATS, Reason, TraceSpec, as_success
 from ..reducers import class_default, make_reducer
 from ..reducers.base import (
+    SAME_POINTS,
     FitReport,
     Floats,
     Ints,
@@ -54,7 +63,7 @@ from ..reducers.base import (
     space_scale,
 )
 from ..traces import ForceLimitsGate, as_labels, as_traces, clip_extremes
-from .base import Embedding, EngineModel, Exportable, Prediction
+from .base import N_EXAMPLES, NO_TRACES, Embedding, EngineModel, Exportable, Prediction
 
 log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
@@ -65,7 +74,18 @@ NEAR = 0.12
 # More near repeats are reported; among 100 to 500 insertions of distinct parts there were up to 15.
 MANY_REPEATS = 25
 NOVEL = REASONS.index(Reason.NOVEL)
+MANY_OF_ONE = 20  # traces of a single part, from which nothing can be learned
 KINDS = 16  # compiled modules that a process keeps
+N_CHECKS = 2  # times that a restored version must give the same points,
+SAME_BATCH = 1e-5  # within this, for the traces are embedded together as before
+NOT_RESTORED = (
+    "restored, as when its store is opened, it embeds a trace elsewhere or not at all: `forward` "
+    "must not be random nor change itself, and must read parameters, buffers and other tensors"
+)
+OTHERWISE_COMPILED = (
+    "a trace that is decided on alone lies elsewhere than the reducer embeds it: `forward` must "
+    "depend on nothing but the trace, parameters and other tensors, compiled or not"
+)
 
 
 class Predictor(nn.Module):
@@ -130,8 +150,9 @@ class InPython(nn.Module):
         return torch.from_numpy(self.reducer.embed(x.numpy()))
 
 
-# Types of attributes that TorchScript compiles into the code.
-CONSTANTS = (bool, int, float, str, list, tuple, dict, FunctionType, type(None))
+# Types of attributes whose values TorchScript compiles into the code, or copies from the template.
+CONSTANTS = (bool, int, float, complex, str, type(None), Enum, torch.dtype, torch.device)
+FUNCTIONS = (FunctionType, BuiltinFunctionType, torch.jit.ScriptFunction)
 # A compiled decider for each structure: scripting takes 24 ms and more, copying a template 1 ms.
 _COMPILED: dict[Any, Any] = {}
 
@@ -158,45 +179,47 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 
 
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
-    """Return everything that scripting compiles into a module, as a hashable key to compare by.
+    """Return everything that a copy of a compiled module has of it, as a hashable key.
 
-    That is classes, attributes and shapes of all submodules, but not the tensors' values. The
-    classes themselves are part of it, not their names: a notebook cell that is run again defines
-    another class.
+    That is classes, attributes and shapes of all submodules, but not the tensors' values, which
+    `compiled` sets. The classes themselves are part of it, not their names: a notebook cell that is
+    run again defines another class.
     """
-    return tuple((name, *_own_structure(module)) for name, module in eager.named_modules())
+    modules = eager.named_modules(remove_duplicate=False)
+    return tuple((name, *_own_structure(module)) for name, module in modules)
 
 
 def _own_structure(module: nn.Module) -> tuple[Any, ...]:
     """Return the class, the compiled attributes and the tensors' shapes of one module, as a tuple.
 
-    Submodules are left out. Attributes are (name, text or function) by name, tensors (name, shape);
-    the shapes in a `ForceLimitsGate` are None, because limits may change in number.
+    Submodules are left out. Attributes are (name, key) by name, tensors (name, shape); the shapes
+    in a `ForceLimitsGate` are None, because limits may change in number.
     """
     attributes = sorted(
-        (name, _as_key(value))
-        for name, value in vars(module).items()
-        if is_compiled_in(name, value)
+        (name, _as_key(value)) for name, value in vars(module).items() if name not in INTERNAL
     )
     # Force limits may change in number without a new module.
     is_limits = isinstance(module, ForceLimitsGate)
-    shapes = [
-        (name, None if is_limits else tuple(tensor.shape)) for name, tensor in _tensors_of(module)
-    ]
+    tensors = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
+    shapes = [(name, None if is_limits else tuple(tensor.shape)) for name, tensor in tensors]
     return (type(module), *attributes, *shapes)
 
 
-def is_compiled_in(name: str, value: object) -> bool:
-    """Return whether scripting compiles an attribute into the code.
-
-    That is a plain value or a function, under a name without a leading underscore.
-    """
-    return not name.startswith("_") and isinstance(value, CONSTANTS)
-
-
 def _as_key(value: object) -> object:
-    """Return the text of a value, or a function itself, because another may get its address."""
-    return value if isinstance(value, FunctionType) else repr(value)
+    """Return what an attribute is compared by: its text, its shape or a function itself.
+
+    A function may get the address of an earlier one. An attribute of a type that TorchScript does
+    not take gives None.
+    """
+    if isinstance(value, FUNCTIONS):
+        return value
+    if isinstance(value, Tensor):
+        return tuple(value.shape)
+    if isinstance(value, list | tuple):
+        return (type(value), *map(_as_key, value))
+    if isinstance(value, dict):
+        return tuple((repr(key), _as_key(item)) for key, item in value.items())
+    return repr(value) if isinstance(value, CONSTANTS) else None
 
 
 def _is_code_unchanged(*modules: nn.Module) -> bool:
@@ -215,14 +238,6 @@ def _is_code_unchanged(*modules: nn.Module) -> bool:
     return not changed
 
 
-def _tensors_of(module: nn.Module, recurse: bool = False) -> list[tuple[str, Tensor]]:
-    """Return a module's parameters and buffers as (name, tensor), parameters first.
-
-    With `recurse` those of its submodules as well.
-    """
-    return [*module.named_parameters(recurse=recurse), *module.named_buffers(recurse=recurse)]
-
-
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return a compiled decider that shares the tensors of an eager one.
 
@@ -230,10 +245,38 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     up on a trace of `warm_up_shape` (C, T), see `template_of`.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
-    for name, tensor in _tensors_of(eager, recurse=True):
+    for name, value in tensor_attributes(eager):
         *path, leaf = name.split(".")
-        setattr(reduce(getattr, path, module), leaf, tensor)
+        setattr(reduce(getattr, path, module), leaf, value)
     return module
+
+
+def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]:
+    """Compare the embeddings of a decider with the points of a reducer, a trace with each step.
+
+    Parameters
+    ----------
+    decider : Decider
+        Compiled or not. It decides on each trace as on a new part.
+    X : array of float32, shape (n, C, T)
+    points : array of float32, shape (n, K, d)
+        The scaled embeddings that the reducer gives.
+
+    Yields
+    ------
+    str
+        What is wrong; "" if they are the same, and for a trace that has a fault for the decider.
+    """
+    for x, expected in zip(X, points, strict=True):
+        with torch.inference_mode():
+            verdict = decider(torch.from_numpy(x), 0)
+        is_same = verdict[0] != 0 or is_close(verdict[9].numpy(), expected)
+        yield "" if is_same else OTHERWISE_COMPILED
+
+
+def is_close(points: Floats, expected: Floats, tolerance: float = SAME_POINTS) -> bool:
+    """Return whether points are no NaN and are the expected ones, within a relative tolerance."""
+    return bool(np.allclose(points, expected, rtol=tolerance, atol=tolerance))
 
 
 class ModelPrediction(EngineModel):
@@ -268,7 +311,11 @@ class ModelPrediction(EngineModel):
         Each space is divided by its scale; set by `fit`.
     gate : NoveltyGate
         Set by `fit`.
+    examples : array of float32, shape (n, C, T)
+        Some of the training traces; none in a model that was restored.
     """
+
+    examples: Floats = NO_TRACES
 
     def __init__(
         self,
@@ -404,10 +451,15 @@ class ModelPrediction(EngineModel):
         rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds;
         `numbers` (n,), of the labels, go to the references; `stop` may end the reducer's training
         early. Extreme samples are clipped first. Raises SettingError if the reducer cannot be
-        trained on these.
+        trained on these, and for 20 traces or more that are all of one part, on which no label
+        would have a vote.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
+        is_one_part = len(X) >= MANY_OF_ONE and (hashes == hashes[0]).all()
+        actual = f"{len(X)} of one: all have its number, or are the same to 1/65536 of their unit"
+        do = "check part=, the sensor and the unit"
+        expect(not is_one_part, "traces of several parts", actual, do)
         folds = fold_of(hashes, self.n_spaces)
         points = self.spaces.train(X, y, folds, stop, numbers)
         self.trace_shape = X.shape[1:]
@@ -418,6 +470,7 @@ class ModelPrediction(EngineModel):
         self.index = RadiusIndex(points.shape[1], self.classifier.capacity)
         self.index.add(points / self.scale[folds, None], y, folds, hashes, numbers)
         self.index.estimate_agreement()
+        self.examples = X[np.linspace(0, len(X) - 1, min(len(X), N_EXAMPLES)).astype(int)]
         self._note = repeats_note(X, hashes)
         if self.novelty:
             self.gate = fit_novelty(X, self.novelty, hashes)
@@ -756,8 +809,37 @@ class ModelPrediction(EngineModel):
         return model
 
     def defect(self) -> str:
-        is_finite = np.isfinite(self.index.column("points")).all()
-        return "" if is_finite else "the embedding of a reference is not finite"
+        """Return why an engine could not open a store with this version; "" if it could.
+
+        The references, and the points of some training traces, must be finite, and twice a reducer
+        that is restored from this one's state must give these points. A reducer without a state
+        must give them again itself.
+        """
+        if not np.isfinite(self.index.column("points")).all():
+            return "the embedding of a reference is not finite"
+        points = self.spaces.embed(self.examples)
+        self._example_points = points / self.scale[:, None]
+        some = self.examples[:: N_EXAMPLES // 4]  # four, since each takes a decision's time
+        expected = self.spaces.embed(some)
+        state = self.spaces.get_state()
+        for _ in range(N_CHECKS):
+            restored = self.spaces
+            try:
+                if state is not None:
+                    restored = as_reducer(clone(self.reducer), self.folds).set_state(state)
+            except StoreError:  # of the test trace, whose points `set_state` compares
+                return NOT_RESTORED
+            if not is_close(restored.embed(some), expected, SAME_BATCH):
+                return NOT_RESTORED
+        return ""
+
+    def scaled_points(self, X: Floats) -> Floats:
+        """Return the scaled embeddings (n, K, d) of traces (n, C, T), by the reducer itself."""
+        return self.spaces.embed(X) / self.scale[:, None]
+
+    def check_answers(self) -> Iterator[str]:
+        decider = self.decider(self._conditions)
+        yield from compare_points(decider, self.examples, self._example_points)
 
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
@@ -817,7 +899,7 @@ class ModelPrediction(EngineModel):
             raise ExportError(
                 "Nothing was trained yet; report labels until the first retrain, then export."
             )
-        return Exportable(self, trace or self.trace_spec)
+        return Exportable(self, trace or self.trace_spec, examples=self.examples)
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
@@ -883,6 +965,6 @@ def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
         return ""
     n_compared = min(len(traces), NEWEST)
     return (
-        f"{n_repeats} of the newest {n_compared} traces nearly repeat another: "
+        f"{n_repeats} of the newest {n_compared} {REPEATS}: "
         "if parts come twice, give their numbers (part=)"
     )

@@ -45,6 +45,8 @@ Ints = NDArray[np.int64]
 State = dict[str, NDArray[Any]]
 OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
 OUTLIER_SHARE = 0.05  # more points than this share are not outliers
+SMALLEST = 1e-10  # that the largest sample must reach
+SAME_POINTS = 1e-3  # by which points of one trace may differ: between machines, compiled, restored
 
 
 @dataclass
@@ -290,7 +292,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             If a value is not finite or not a number, if a table has other columns than in `fit`,
             and with `reset` if there is no trace.
         TraceError
-            If the shape is none of traces, or another than in `fit`; a plain ValueError for a
+            If the shape is none of traces, or another than in `fit`, and with `reset` if no sample
+            reaches 1e-10, whose square float32 hardly holds; a plain ValueError for a
             single trace (T,) and for another number of columns of X (n, T).
         """
         if not reset:
@@ -313,6 +316,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
                 self, X if x.ndim == 2 else as_rows(traces), reset=reset, skip_check_array=True
             )
         if reset:
+            largest = float(max(traces.max(), -traces.min()))
+            do = "check the sensor, or use a smaller unit"
+            is_usual = largest >= SMALLEST or largest == 0.0
+            expect(is_usual, f"samples of {SMALLEST} at least", largest, do, TraceError)
             self.trace_shape_ = traces.shape[1:]
         elif traces.shape[1:] != self.trace_shape_:
             expected = "{} channels x {} samples".format(*self.trace_shape_)

@@ -15,6 +15,7 @@ from ..errors import SettingError, expect, instead
 from ..files import write_output
 from .encoder import Members
 
+LARGEST = 1e6  # of a weight or a variance; training stays far below
 SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names of parameters in `encoder.Separate`
 
 
@@ -39,7 +40,8 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     ------
     SettingError
         If the file cannot be read, has other names, shapes or types than the network, or has values
-        that are not finite. In these cases no member is changed.
+        that are not finite or larger than 1e6, or negative variances. In these cases no member is
+        changed.
     """
     weights = read_tensors(path)
     state = members.state_dict()
@@ -56,8 +58,11 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
                 f"{path} is of another: {name} has shape and type {actual.get(name)}, not "
                 f"{expected.get(name)}; train one with training/train_encoder.py."
             )
-    is_finite = all(bool(torch.isfinite(value).all()) for value in weights.values())
-    expect(is_finite, f"finite weights in {path}", "NaN or infinite ones", "train it again")
+    for name, value in weights.items():
+        least = 0.0 if name.endswith("running_var") else -LARGEST
+        is_usual = not value.is_floating_point() or ((value >= least) & (value <= LARGEST)).all()
+        wanted = f"finite weights of at most {LARGEST:g}, and variances of at least 0, in {path}"
+        expect(bool(is_usual), wanted, f"others in {name}", "train it again")
     with torch.no_grad():
         for name, value in state.items():
             weight = weights[names[name]]
@@ -67,7 +72,7 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
     """Return the dict of tensors that `torch.save` wrote to a file, without running code of it.
 
-    Raises SettingError if the file cannot be read, or holds anything but a dict of tensors.
+    Raises SettingError if the file cannot be read, or holds anything but a dict of dense tensors.
     """
     with instead(SettingError, f"The checkpoint {path} cannot be read", OSError):
         content = Path(path).read_bytes()
@@ -75,12 +80,18 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
         weights: Any = torch.load(BytesIO(content), map_location="cpu", weights_only=True)
     except Exception:  # a damaged file raises many types, one of which advises to run its code
         weights = None
-    if isinstance(weights, dict) and all(isinstance(value, Tensor) for value in weights.values()):
+    if isinstance(weights, dict) and all(map(is_dense, weights.values())):
         return dict(weights)
     raise SettingError(
-        f"Expected a checkpoint of named tensors alone, {path} is none; write one with "
+        f"Expected a checkpoint of named dense tensors alone, {path} is none; write one with "
         "training/train_encoder.py."
     )
+
+
+def is_dense(value: Any) -> bool:
+    """Return whether a value is a tensor that holds each of its numbers, as a network's do."""
+    is_strided = isinstance(value, Tensor) and value.layout is torch.strided
+    return is_strided and not (value.is_quantized or value.is_nested or value.is_meta)
 
 
 def shape_of_member(name: str, value: Tensor, count: int) -> torch.Size:

@@ -210,7 +210,7 @@ class ConvReducer(TorchReducer):
         super()._start(traces)
         self.rocket_.init_encoder(traces)
 
-    def _build(self, channels: int, samples: int, average: int) -> None:
+    def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         # Before `encoder_`, by which other threads see that there is a module.
         self.rocket_ = RocketReducer(
             n_components=1,
@@ -219,7 +219,7 @@ class ConvReducer(TorchReducer):
             random_state=self.random_state,
         )
         self.rocket_.build(channels, samples, average)
-        super()._build(channels, samples, average)
+        super()._build(channels, samples, average, seed)
 
     def _train(
         self,

@@ -48,7 +48,8 @@ class Members(nn.Module):
     Raises
     ------
     SettingError
-        If `network` is a module instead of its class, or the module does not give features.
+        If `network` is a module instead of its class, the module does not give features, or members
+        share weights that are trained: they would see the labels of every fold.
     """
 
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
@@ -68,6 +69,14 @@ class Members(nn.Module):
                 else Separate([network(channels, samples) for _ in range(count)])
             )
             features = count_features(self.networks, count, channels, samples)
+        if isinstance(self.networks, Separate):
+            trained = [
+                {id(weight) for weight in network.parameters() if weight.requires_grad}
+                for network in self.networks.networks
+            ]
+            is_apart = sum(map(len, trained)) == len(set().union(*trained))
+            wanted = "a network for each member, with weights of its own"
+            expect(is_apart, wanted, "one that shares them", "make new layers in each call")
         bound = features**-0.5
         self.weight = nn.Parameter(torch.empty(count, features, 2).uniform_(-bound, bound))
         self.bias = nn.Parameter(torch.zeros(count, 2))

@@ -36,10 +36,28 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from ..decision.scripting import arrays_with_prefix, incompatible_model_error, restore, script
+from ..decision.scripting import (
+    arrays_with_prefix,
+    incompatible_model_error,
+    plain_tensors,
+    reason_of,
+    restore,
+    restore_plain_tensors,
+    script,
+)
 from ..errors import SettingError, expect
 from ..records import is_number, is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, binary_labels, folds_of, seed_of
+from .base import (
+    SAME_POINTS,
+    FitReport,
+    Floats,
+    Ints,
+    Reducer,
+    StopRule,
+    binary_labels,
+    folds_of,
+    seed_of,
+)
 from .checkpoints import load_checkpoint
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
 from .preprocessing import Preprocessor, averaging
@@ -53,7 +71,6 @@ STEPS_PER_LABEL = 1.2  # that training must have had before it is called complet
 INITIAL_STEPS = 36  # on top of these
 MANY_LABELS = 4000  # labels beyond which embedding them leaves no time for more steps
 CATCH_UP_FACTOR = 2  # times the steps of a retrain, as long as training is behind
-SAME_POINTS = 1e-3  # by which the points of one trace may differ between two machines
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,13 +290,14 @@ class TorchReducer(Reducer):
         if self.checkpoint:
             load_checkpoint(self.members_, self.checkpoint)
             self.averaged_members_.load_state_dict(self.members_.state_dict())
+        self.encoder_ = self._new_encoder()
         self.is_started_ = True
 
-    def _build(self, channels: int, samples: int, average: int) -> None:
+    def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         """Set initial weights and an empty state for traces of this shape; no trace is read.
 
-        An `encoder_` of the initial weights is set as well. `average` is the number of samples that
-        are averaged to one. The seed is drawn here; torch's global generator keeps its state.
+        `average` is the number of samples that are averaged to one. Without a `seed` one is drawn;
+        torch's global generator keeps its state. The caller sets `encoder_`.
         Raises SettingError for a parameter out of its range, fewer than 2 samples, or a network
         that does not give (B, features).
         """
@@ -288,7 +306,7 @@ class TorchReducer(Reducer):
             actual = f"{samples} (n_features = {channels * samples})"
             raise SettingError(f"Expected at least 2 samples, got {actual}.")
         self.preprocessor_ = Preprocessor(channels, samples, average)
-        self.seed_ = draw_seed(self.random_state)
+        self.seed_ = draw_seed(self.random_state) if seed is None else seed
         shape = self.preprocessor_.channels, self.preprocessor_.samples
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed_)
@@ -301,7 +319,6 @@ class TorchReducer(Reducer):
         self.n_steps_left_ = 0
         self.n_new_steps_ = 0
         self.loss_ = float("nan")
-        self.encoder_ = self._new_encoder()
 
     def _train(
         self,
@@ -422,12 +439,13 @@ class TorchReducer(Reducer):
 
         As `torch.optim.swa_utils.update_bn`, from preprocessed traces x (n, C', L): at most 256 of
         them, drawn at random but the same for the same n. No label is read, so each member may see
-        all folds. Other buffers are copied from the trained members. The averaged members are in
-        evaluation mode afterwards.
+        all folds. Other buffers, and tensors that are plain attributes, are copied from the trained
+        members. The averaged members are in evaluation mode afterwards.
         """
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
             buffer.copy_(trained)
+        restore_plain_tensors(members, plain_tensors(self.members_))
         norms = [module for module in members.modules() if isinstance(module, _BatchNorm)]
         for norm in norms:
             norm.reset_running_stats()
@@ -493,6 +511,7 @@ class TorchReducer(Reducer):
             return self.module()
         untrained: Self = clone(self)
         untrained._build(X.shape[1], X.shape[2], averaging(torch.from_numpy(X)))
+        untrained.encoder_ = untrained._new_encoder()
         return untrained.module()
 
     def module(self) -> nn.Module | None:
@@ -521,7 +540,8 @@ class TorchReducer(Reducer):
 
         They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
         optimiser, so that training can go on, and the points of a test trace, by which `set_state`
-        recognises the network. Raises NotFittedError before a fit.
+        recognises the network. Tensors of the network that are in no state dict come after
+        "plain.". Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
@@ -536,12 +556,14 @@ class TorchReducer(Reducer):
             "preprocessor": self.preprocessor_.state_dict(),
             "members": self.members_.state_dict(),
             "averaged": self.averaged_members_.state_dict(),
+            "plain.members": plain_tensors(self.members_),
+            "plain.averaged": plain_tensors(self.averaged_members_),
         }
         for i, moments in self.optimizer_state_.items():
             tensors[f"optimizer.{i}"] = moments
         for prefix, named in tensors.items():
             for name, value in named.items():
-                state[f"{prefix}.{name}"] = value.numpy().copy()
+                state[f"{prefix}.{name}"] = value.detach().numpy().copy()
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
@@ -555,15 +577,17 @@ class TorchReducer(Reducer):
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
         self.trace_shape_ = (channels, samples)
         self.n_features_in_ = channels * samples
-        self._build(channels, samples, average)
-        self.seed_ = seed
+        self._build(channels, samples, average, seed)
         self.n_steps_ = n_steps
         self.n_steps_left_ = n_steps_left
         self.n_new_steps_ = n_new_steps
         self.loss_ = float(state["loss"])
         restore(self.preprocessor_, arrays_with_prefix(state, "preprocessor."))
-        restore(self.members_, arrays_with_prefix(state, "members."))
-        restore(self.averaged_members_, arrays_with_prefix(state, "averaged."))
+        for name, members in (("members", self.members_), ("averaged", self.averaged_members_)):
+            restore(members, arrays_with_prefix(state, f"{name}."))
+            plain = arrays_with_prefix(state, f"plain.{name}.")
+            tensors = {key: torch.from_numpy(np.array(value)) for key, value in plain.items()}
+            restore_plain_tensors(members, tensors)
         for name, value in arrays_with_prefix(state, "optimizer.").items():
             i, key = name.split(".")
             moments = self.optimizer_state_.setdefault(int(i), {})
@@ -679,17 +703,17 @@ def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
 def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
     """Return whether TorchScript compiles a network; log a warning if it does not.
 
-    A user's network may hold Python that TorchScript does not support. Two members of it are built
-    and compiled to find out, once for each network and shape; torch's global generator keeps its
-    state.
+    A user's network may hold Python that TorchScript does not support. Two members of it are built,
+    compiled and asked to find out, once for each network and shape; torch's global generator keeps
+    its state.
     """
-    with torch.random.fork_rng(devices=[]):
-        members = Members(network, channels, samples, 2).eval()
     try:
-        script(fold_batch_norms(members))
+        with torch.random.fork_rng(devices=[]), torch.inference_mode():
+            members = Members(network, channels, samples, 2).eval()
+            script(fold_batch_norms(members))(torch.zeros(1, 2, channels, samples))
     except Exception as error:
         name = getattr(network, "__qualname__", repr(network))
-        reason = str(error).strip().splitlines()[0]
+        reason = reason_of(error)
         message = (
             "%s cannot be compiled by TorchScript, so it answers in Python and is not exported: %s"
         )

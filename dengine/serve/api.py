@@ -155,7 +155,10 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
     try:
         decoded: T = DECODERS[media](body, type=struct_type)
     except msgspec.ValidationError as error:
-        raise Refusal(422, f"{error}.") from error
+        # msgspec takes a text for bytes in base64; whoever sends one knows nothing of that.
+        wanted = "Expected lists of numbers, or raw float32 in base64, got a text"
+        text = str(error).replace("Invalid base64 encoded string", wanted)
+        raise Refusal(422, f"{text}.") from error
     except (ValueError, RecursionError) as error:
         raise Refusal(400, f"Expected {media}: {error}.") from error
     # msgspec takes the last of two equal keys.
@@ -216,8 +219,8 @@ def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
     """
     if isinstance(value, bytes):
         if len(value) % (4 * channels):
-            form = f"float32, little-endian, channel after channel, {channels} of them"
-            raise TraceError(f"Expected {form}, got {len(value)} bytes.")
+            form = f"raw float32, little-endian, channel after channel, {channels} of them"
+            raise TraceError(f"Expected a list of numbers, or {form}, got {len(value)} bytes.")
         words = np.frombuffer(value, dtype="<f4")
         if _look_like_float64(words):
             raise TraceError(

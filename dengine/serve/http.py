@@ -139,6 +139,7 @@ class HttpApi:
             Operation("POST", "/correct", self.correct, "Changed"),
             Operation("POST", "/forget", self.forget, "Changed"),
             Operation("POST", "/rollback", self.rollback, "Changed"),
+            Operation("POST", "/release", self.release, "Changed"),
             Operation("POST", "/policy", self.policy, "Changed", policy),
             Operation("POST", "/retrain", self.retrain, "Changed"),
             Operation("POST", "/export", self.export, "application/zip"),
@@ -202,8 +203,9 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        The same report twice is no error, a different one is 409, but for a line stop after a
-        confirmation. With an author, or a token that has a name, a new label is an event, too.
+        The same report twice is no error, a different one is 409; but `false` for an accepted part
+        that counts as good is a late line stop, and corrects that. With an author, or a token that
+        has a name, a new label is an event, too.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -256,8 +258,14 @@ class HttpApi:
         version: Annotated[int, Meta(description="Its number, as /versions lists it.")],
         author: Author = "",
     ) -> Json:
-        """Let an earlier version of the model decide again, as a new version."""
+        """Let an earlier version of the model decide again, as a new version, and pin it: no
+        automatic retrain replaces it, until /release or /retrain.
+        """
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
+
+    async def release(self, author: Author = "") -> Json:
+        """Let retrains replace a pinned version again."""
+        return await self._change(author, lambda engine, by: engine.release(by))
 
     async def policy(self, author: Author = "", **changes: Any) -> Json:
         """Change settings of the policy, from the next decision on; shadow verifies every part.
@@ -269,7 +277,8 @@ class HttpApi:
         )
 
     async def retrain(self, author: Author = "") -> Json:
-        """Begin a retrain, which is an event, and do not wait for its end.
+        """Begin a retrain, which is an event, and do not wait for its end; it replaces a pinned
+        version, too.
 
         If one is under way, the response says so, and nothing is begun or recorded.
         """

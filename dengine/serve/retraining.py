@@ -1,5 +1,5 @@
-"""`RetrainingProcess`, an executor with one process, in which the engine of `dengine serve`
-retrains.
+"""`RetrainingProcess`, an executor with one process that can be started again, in which the engine
+of `dengine serve` retrains.
 
 In a process of its own a retrain never holds the lock of the interpreter that answers decisions.
 Calls and results are pickled in the executor's thread, and their arrays are passed through a file
@@ -20,7 +20,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing.connection import wait
@@ -39,19 +39,37 @@ PR_SET_PDEATHSIG = 1  # linux/prctl.h: send a signal when the parent ends
 T = TypeVar("T")
 
 
-class RetrainingProcess(ProcessPoolExecutor):
-    """A `ProcessPoolExecutor` with one spawned process that imports torch at once.
+class RetrainingProcess(Executor):
+    """An executor with one spawned process that imports torch at once.
 
-    The process ends with the thread that created it, even if that thread's process is killed. It
+    The process ends with the thread that started it, even if that thread's process is killed. It
     is spawned, since a forked process would inherit locks that other threads hold.
+
+    Attributes
+    ----------
+    ready : Future
+        Done when the process can work; it fails if the process ends before.
     """
 
+    ready: Future[None]
+
     def __init__(self) -> None:
-        super().__init__(1, multiprocessing.get_context("spawn"), _prepare_process)
+        self._start()
+
+    def _start(self) -> None:
+        """Start a process, and let it import what a retrain needs."""
+        context = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(1, context, _prepare_process)
         other_processes = set(multiprocessing.active_children())
         with _signals_blocked():
-            self.submit(_warm_up).add_done_callback(partial(_log_start, time.monotonic()))
+            self.ready = self._pool.submit(_warm_up)
+        self.ready.add_done_callback(partial(_log_start, time.monotonic()))
         (self._process,) = set(multiprocessing.active_children()) - other_processes
+
+    def restart(self) -> None:
+        """Kill the process, also at work, and start another; raises OSError where that fails."""
+        self.shutdown(wait=False)
+        self._start()
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
         """Queue a call of a picklable function, which runs in the process after earlier calls.
@@ -61,7 +79,7 @@ class RetrainingProcess(ProcessPoolExecutor):
         BrokenExecutor if the process has ended.
         """
         call = _SharedPickle((fn, args, kwargs))
-        return super().submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
+        return self._pool.submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Kill the process at once, also during a retrain, whose future then fails.
@@ -70,7 +88,7 @@ class RetrainingProcess(ProcessPoolExecutor):
         thread has ended.
         """
         self._process.kill()
-        super().shutdown(wait, cancel_futures=cancel_futures)
+        self._pool.shutdown(wait, cancel_futures=cancel_futures)
 
 
 @contextmanager

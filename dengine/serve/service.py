@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from numpy.typing import ArrayLike
 
 from ..engine.engine import DataEngine, core_of
-from ..errors import BusyError
+from ..errors import BusyError, NotTakenError
 from ..history.status import NEWEST, Status, status
 from ..records import Decision, Reason, RetrainReport, as_id, as_success
 from ..store.opening import open_store
@@ -338,13 +338,14 @@ class CellService:
     async def read(self, work: Callable[[SqlStore], T]) -> T:
         """Call a function with a store that has every decision so far, and return its result.
 
-        The engine is flushed first, so this waits in the queue; decisions that the store does not
-        take in time are missing. The function, which must only read, runs in a thread of its own,
-        over the second connection, or in the engine's thread if the store is in memory. Raises
-        BusyError if the queue is full or the service is closing, and what the flush or the function
-        raises.
+        The engine is flushed first, so this waits in the queue; decisions that the disk or the
+        store does not take in time are missing. The function, which must only read, runs in a
+        thread of its own, over the second connection, or in the engine's thread if the store is in
+        memory. Raises BusyError if the queue is full or the service is closing, and what the
+        function raises.
         """
-        await self.call(lambda engine: engine.flush(), read_only=True)
+        with suppress(NotTakenError):
+            await self.call(lambda engine: engine.flush(), read_only=True)
         if self.read_store is self.engine.store:
             return await self.call(lambda engine: work(engine.store), read_only=True)
         return await asyncio.to_thread(work, self.read_store)

@@ -1,5 +1,6 @@
 from .backup import BackupReport as BackupReport
 from .backup import backup_store as backup_store
+from .backup import restore_store as restore_store
 from .opening import open_store as open_store
 from .records import Change as Change
 from .records import Correction as Correction

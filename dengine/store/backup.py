@@ -1,6 +1,7 @@
 """Copies an SQLite store into a new file, together with the records still in the cells' journals.
 `backup_store` does that, while engines may use the store, and returns a `BackupReport` with the
-numbers of decisions and labels. `dengine backup` uses it; PostgreSQL stores are refused.
+numbers of decisions and labels. `restore_store` puts such a copy in the place of a store, on this
+or another machine. `dengine backup` and `dengine restore` use them; PostgreSQL stores are refused.
 
     report = backup_store("engine.db", "copy.db")
     report.decisions, report.labels, report.from_journals
@@ -21,10 +22,11 @@ import sqlalchemy as sa
 from ..errors import OutputError, StoreError, instead
 from ..files import output_file
 from .connections import reading
-from .journal import Record, journal_path, read_undrained
+from .journal import Journal, Record, journal_path, read_undrained
 from .records import CHUNK
 from .schema import DECISION, LABEL, SETTING
 from .sql import SqlStore
+from .verification import CellHistory, verify_history
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,7 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.
-    waiting = {cell: read_undrained(path) for cell, path in paths.items() if path.exists()}
+    waiting = {cell: read_undrained(path)[0] for cell, path in paths.items() if path.exists()}
     with output_file(out) as partial:
         try:
             with instead(
@@ -102,6 +104,46 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
                 partial.with_name(partial.name + suffix).unlink(missing_ok=True)
     without = tuple(cell for cell in cells if cell not in waiting)
     return BackupReport(decisions, labels, sum(map(len, waiting.values())), without)
+
+
+def restore_store(
+    copy: str | os.PathLike[str], store: str | os.PathLike[str]
+) -> tuple[CellHistory, ...]:
+    """Copy a backup to the place of a store, on this or another machine, with a journal per cell.
+
+    The journal names the newest ledger entry, so that the first engine knows that nothing is
+    missing. A journal that is there stays: that engine takes from it what the copy lacks.
+
+    Parameters
+    ----------
+    copy : str or path
+        What `backup_store` wrote. It is checked in full, and only read.
+    store : str or path
+        A file that does not exist yet.
+
+    Returns
+    -------
+    tuple of CellHistory
+
+    Raises
+    ------
+    StoreError
+        If `copy` is no store, or its history is not as it was written.
+    OutputError
+        If `store` exists, or cannot be written.
+    """
+    report = verify_history(os.fspath(copy))
+    if not report.ok:
+        do = "see `dengine verify`, and take another copy"
+        raise StoreError(f"Expected a history as it was written in {copy}, found faults; {do}.")
+    backup_store(copy, store)
+    for cell in report.cells:
+        path = journal_path(sa.URL.create("sqlite", database=os.fspath(store)), cell.cell_id)
+        if not path.exists():
+            journal = Journal(path)
+            journal.save_newest_entry((cell.entries, cell.digest))
+            journal.close()
+    return report.cells
 
 
 def _copy(url: str, target: Path) -> None:

@@ -7,10 +7,14 @@ verification read it.
 
 Each record has its length, its CRC-32, and a digest over itself and the record before, so that a
 changed record and a missing one are both noticed. The header names the process that owns the cell,
-the offset up to which the store holds the records, and the newest entry of the cell's ledger that
-the store held: a store that was cut off or restored from an older copy lacks that entry. A small
-file beside the journal, its head, repeats the entry, for the case that the journal was lost
-together with the store.
+the records that the store holds (their number, and the offset up to which they stand), and the
+newest entry of the cell's ledger that the store held: a store that was cut off or restored from an
+older copy lacks that entry.
+
+A small file beside the journal, its head, repeats the entry, and names the newest synced record
+(number and digest). It is written before a record is acknowledged: a journal that lacks the record
+has lost its end. The head is synced later than the journal, by the thread that drains: after a
+power failure it may be older than the journal, never newer.
 """
 
 import hashlib
@@ -20,29 +24,33 @@ import re
 import socket
 import struct
 import sys
+import threading
 import urllib.parse
 import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 from ..errors import StoreError, instead
 from ..records import Decision
-from .owned_file import OwnedFile, open_plain
+from .owned_file import OwnedFile, open_plain, sync
 from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
 
 # Length of a record's JSON text, before it; the samples of a trace or point follow it.
 LENGTH = struct.Struct("<I")
 # Bytes: 1,800 traces of 1000 samples, or 2.5 hours of a cell that verifies every part.
 RESERVE = 8 << 20
-HEADER = 256  # bytes of the header; the first record begins there
+HEADER = 256  # bytes of the header, and of the head; the first record begins there
 MAGIC = b"dengine journal 2\n"
 MARK = b"\x89rec"  # where a record begins, to find the next one behind a damaged length
 IGNORES_CASE = sys.platform in ("win32", "darwin")  # of names in its usual file systems
 FRAME = struct.Struct("<4sII16s")  # before a record: mark, length, CRC-32, digest
+DAMAGES = (ValueError, LookupError, TypeError)  # of reading a damaged header or head
 
 Record = StoredDecision | NewLabel | Event
 
@@ -81,6 +89,31 @@ def decode_record(blob: bytes) -> Record:
         return from_row(Event, row)
 
 
+@dataclass(frozen=True, slots=True)
+class Head:
+    """The content of the small file beside a journal; by default that of an earlier release.
+
+    Attributes
+    ----------
+    newest : (int, str) or None
+        Number and digest of the newest ledger entry of the store.
+    n_drained : int
+        Number of the last record that the store holds: 1, 2, ... in a journal.
+    n_synced : int
+        Number of the newest record that is synced in the journal.
+    digest : str
+        Of that record, hexadecimal.
+    time : float
+        When it was written, in seconds since 1970.
+    """
+
+    newest: tuple[int, str] | None
+    n_drained: int = 0
+    n_synced: int = 0
+    digest: str = ""
+    time: float = 0.0
+
+
 class Journal:
     """An open journal file. One thread appends; any thread may read.
 
@@ -98,17 +131,19 @@ class Journal:
     ----------
     end : int
         Offset behind the last record, in bytes.
-    drained_to : int
-        Offset up to which the store holds the records; set by the outbox.
+    drained_to, n_drained : int
+        Offset up to which the store holds the records, and number of the last of these: 1, 2, ...;
+        set by the outbox.
     newest_entry : (int, str) or None
         Number and digest of the newest ledger entry that the header names; None: no entry yet.
-    head_entry : (int, str) or None
-        The same as the head beside the journal has it.
+    head : Head
+        The head beside the journal, as it was at the opening; empty if it is missing or damaged.
     dropped : int
         Bytes of an unfinished record at the end, left by a killed process and cut off. That record
         was never acknowledged.
-    damaged : int
-        Records that are missing or not as they were written. The others are read all the same.
+    loss : str
+        Which acknowledged records are missing or not as they were written, in words; "" if none is.
+        The others are read all the same.
 
     Raises
     ------
@@ -122,10 +157,15 @@ class Journal:
         self.drained_to = HEADER
         self.end = HEADER
         self.dropped = 0
-        self.damaged = 0
+        self.loss = ""
         self.newest_entry: tuple[int, str] | None = None
-        self.head_entry = _read_head(path)
+        self.head = _read_head(path) or Head(None)
+        self.n_drained = 0
+        self._n_synced = 0
+        self._time = 0.0
         self._digest = bytes(16)
+        # Guards what header and head hold: two threads write them.
+        self._describing = threading.RLock()
         self._owning = owning
         self._file = _open_file(path, owning)
         try:
@@ -143,16 +183,18 @@ class Journal:
         """Whether the store holds all records."""
         return self.drained_to >= self.end
 
-    def append(self, records: Sequence[bytes]) -> list[int]:
+    def append(self, records: Sequence[bytes], time: float) -> list[int]:
         """Append encoded records behind the last one, and return when they are synced to the disk.
 
-        If it fails, the journal's end stays where it was, and the same records can be appended
-        again.
+        The head then names the newest of them. If it fails, the journal's end stays where it was,
+        and the same records can be appended again.
 
         Parameters
         ----------
         records : sequence of bytes
             As `encode_record` returns them.
+        time : float
+            The present time, in seconds since 1970.
 
         Returns
         -------
@@ -181,9 +223,22 @@ class Journal:
                 f"The journal {self.path} was deleted, moved or replaced while it was open; "
                 "leave it."
             )
-        self.end += len(framed)
-        self._digest = digest
+        with self._describing:
+            self.end += len(framed)
+            self._n_synced += len(records)
+            self._time = time
+            self._digest = digest
+            self._write_head()
         return offsets
+
+    def sync_head(self) -> None:
+        """Sync the head to the disk, which may take as long as a sync of the journal.
+
+        A failure is ignored: after a power failure the head is then older than the journal.
+        """
+        head = head_path(self.path)
+        with suppress(OSError), os.fdopen(open_plain(head, os.O_WRONLY), "wb") as file:
+            sync(file.fileno())
 
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
@@ -217,34 +272,44 @@ class Journal:
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
     def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
-        """Write the newest ledger entry and `drained_to` to the header, the entry also to the head.
+        """Write the newest ledger entry and `drained_to` to the header and to the head.
 
         Set `newest_entry`. Nothing is synced: an older header is harmless, since the store ignores
         a record that it is given twice. Raise StoreError if the header cannot be written; a failure
-        of the head is ignored. None leaves the head as it is.
+        of the head is ignored.
         """
-        self.newest_entry = newest
-        with _os_errors(self.path):
+        with self._describing, _os_errors(self.path):
+            self.newest_entry = newest
             self._file.write(self._header(), 0)
-        if newest is None:
-            return
+            self._write_head()
+
+    def _write_head(self) -> None:
+        """Write the head as this journal now is, without a sync; a failure is ignored."""
+        fields = {
+            "newest": self.newest_entry,
+            "n_drained": self.n_drained,
+            "n_synced": self._n_synced,
+            "digest": self._digest.hex(),
+            "time": self._time,
+        }
         path = head_path(self.path)
         # An older head is harmless.
         with suppress(OSError), os.fdopen(open_plain(path, os.O_WRONLY | os.O_CREAT), "wb") as head:
-            head.write(json.dumps(newest).ljust(HEADER).encode())
+            head.write(_pack_fields(fields).ljust(HEADER))
 
     def clear(self) -> None:
         """Remove all records, drained or not; the caller has made sure that the store holds them.
 
         The file is cut off behind its header, which frees the reserved space: call `reserve`
-        afterwards. Raise StoreError if the file cannot be written.
+        afterwards, and also before, so that no disk keeps the cut without the header. Raise
+        StoreError if the file cannot be written.
         """
-        with _os_errors(self.path):
+        with self._describing, _os_errors(self.path):
             self._file.truncate(HEADER)
             self.drained_to = HEADER
+            self.n_drained = self._n_synced
             self.end = HEADER
             self._digest = bytes(16)
-            self.damaged = 0
             self._file.write(self._header(), 0)
 
     def reserve(self) -> None:
@@ -279,25 +344,26 @@ class Journal:
         """Cut off the reserved space, and the records if all are drained; close, unlock the file.
 
         The file stays with its header, for the next engine to compare with the ledger. A journal
-        that was opened for reading is only closed. Raise StoreError, and leave it open, if the cut
-        fails.
+        that was opened for reading is only closed, and so is one whose disk fails.
         """
         if self._owning and not self._file.closed:
-            with _os_errors(self.path):
+            with suppress(OSError):
+                self._file.sync()  # the header, or a disk might keep the cut without it
                 self._file.truncate(HEADER if self.is_drained else self.end)
         self._file.close()
 
     def _header(self) -> bytes:
         """Return the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
 
-        The JSON has this process as the owner, `drained_to` and `newest_entry`.
+        The JSON has this process as the owner, the drained records and `newest_entry`.
         """
         fields = {
-            "owner": describe_process()[:80],
+            "owner": describe_process()[:60],
             "drained": self.drained_to,
             "newest": self.newest_entry,
+            "n_drained": self.n_drained,
         }
-        return (MAGIC + json.dumps(fields).encode()).ljust(HEADER, b"\0")
+        return (MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0")
 
     def _write_header_and_reserve(self) -> None:
         """Write the header, and reserve disk space for records."""
@@ -305,39 +371,61 @@ class Journal:
         self.reserve()
 
     def _scan(self) -> None:
-        """Read the header and all undrained records, and set the attributes that describe them.
+        """Read header, head and all undrained records, and set the attributes that describe them.
 
-        These are `drained_to`, `newest_entry`, `end`, `dropped`, `damaged` and the digest of the
-        last record. With a damaged header all records count as undrained. Nothing is written. Raise
-        StoreError if the file is no journal.
+        With a damaged header all records count as undrained. Nothing is written. Raise StoreError
+        if the file is no journal.
         """
-        size = self._file.size
-        if size == 0:
-            return
-        header = self._file.read(HEADER, 0)
-        if not header.startswith(MAGIC):
-            raise StoreError(
-                f"Expected a journal of dengine, found another file: {self.path}; move it away."
-            )
-        try:
-            self.drained_to, self.newest_entry, _ = _parse_header(header)
-        except (ValueError, KeyError, TypeError):  # all of it is drained again, which is harmless
-            self.damaged += 1
-        # The first record is not checked: those before it may be gone.
+        head = self.head
+        self.n_drained = head.n_drained
+        damaged = 0
+        if self._file.size:
+            header = self._file.read(HEADER, 0)
+            if not header.startswith(MAGIC):
+                raise StoreError(
+                    f"Expected a journal of dengine, found another file: {self.path}; move it away."
+                )
+            try:
+                fields = _parse_header(header)
+                self.drained_to = int(fields["drained"])
+                self.newest_entry = fields["newest"]
+                self.n_drained = fields["n_drained"]
+            except DAMAGES:  # all of it is drained again, which is harmless
+                damaged = 1
+                head = Head(None)
+        self.end = max(self._file.size, HEADER)
+        self.drained_to = min(max(self.drained_to, HEADER), self.end)
+        # Behind the record that the head names nothing was acknowledged.
+        newest = bytes.fromhex(head.digest)
+        is_acknowledged = not newest or head.n_synced > self.n_drained
+        # The first record's digest is not checked: those before it may be gone.
         previous: bytes | None = None
-        self.drained_to = min(max(self.drained_to, HEADER), size)
         begin = self.drained_to
-        self.end = size
+        digests: set[bytes] = set()
         for offset, end, record in self.undrained_records():
             digest: bytes = FRAME.unpack(self._file.read(FRAME.size, offset))[3]
             follows = previous is None or digest == _chain_digest(previous, record)
-            self.damaged += offset > begin or not follows
+            damaged += is_acknowledged and (offset > begin or not follows)
+            is_acknowledged &= digest != newest
+            digests.add(digest)
             previous = digest
             begin = end
-        rest = self._file.read(size - begin, begin)
+        rest = self._file.read(self.end - begin, begin)
         self.end = begin
         self.dropped = len(rest.rstrip(b"\0"))
         self._digest = previous or bytes(16)
+        n_known = self.n_drained + len(digests)
+        self._n_synced = max(head.n_synced, n_known)
+        if head.n_synced > self.n_drained and (n_known < head.n_synced or newest not in digests):
+            self.loss = (
+                f"{max(1, head.n_synced - n_known)} records (decisions, labels or events) are "
+                "missing from the journal, though they were on disk; the newest is of "
+                f"{datetime.fromtimestamp(head.time, UTC):%Y-%m-%d %H:%M:%S} UTC."
+            )
+        elif damaged:
+            self.loss = (
+                f"the journal was not as it was written in {damaged} places, which were left out."
+            )
 
     def _read_record(self, offset: int) -> bytes | None:
         """Return the encoded record at an offset, without its frame.
@@ -382,8 +470,8 @@ def _open_file(path: Path, owning: bool = True) -> OwnedFile:
         except BlockingIOError as error:
             try:
                 with path.open("rb") as file:
-                    owner = _parse_header(file.read(HEADER))[2]
-            except (OSError, ValueError, KeyError, TypeError):
+                    owner = _parse_header(file.read(HEADER))["owner"]
+            except (OSError, *DAMAGES):
                 owner = "another engine"
             raise owned_error(owner, str(path)) from error
 
@@ -438,18 +526,19 @@ def read_newest_entries(path: Path) -> set[tuple[int, str]]:
 
     They are none, one or two; a file that is missing or damaged names none.
     """
-    entries = {_read_head(path)}
-    with suppress(OSError, ValueError, KeyError, TypeError), path.open("rb") as file:
-        entries.add(_parse_header(file.read(HEADER))[1])
+    entries = {(_read_head(path) or Head(None)).newest}
+    with suppress(OSError, *DAMAGES), path.open("rb") as file:
+        entries.add(_parse_header(file.read(HEADER))["newest"])
     return {entry for entry in entries if entry is not None}
 
 
-def read_undrained(path: Path) -> list[Record]:
-    """Return the records of a journal that its store has not taken, oldest first, whoever owns it.
+def read_undrained(path: Path) -> tuple[list[Record], str]:
+    """Return the records of a journal that its store has not taken, and what it lost, in words.
 
-    If several decisions share an id, only the last is returned. Damaged records are left out.
-    Nothing is locked or changed. Raise StoreError if the file cannot be read or is no journal, and
-    for a record that another release of dengine wrote.
+    The records are oldest first, whoever owns the journal; of several decisions with one id only
+    the last is returned, and damaged records are left out. The loss is `Journal.loss`. Nothing is
+    locked or changed. Raise StoreError if the file cannot be read or is no journal, and for a
+    record that another release of dengine wrote.
     """
     journal = Journal(path, owning=False)
     try:
@@ -457,33 +546,46 @@ def read_undrained(path: Path) -> list[Record]:
     finally:
         journal.close()
     last = {record.decision.id: record for record in records if isinstance(record, StoredDecision)}
-    return [
+    newest = [
         record
         for record in records
         if not isinstance(record, StoredDecision) or last[record.decision.id] is record
     ]
+    return newest, journal.loss
 
 
-def _read_head(journal: Path) -> tuple[int, str] | None:
-    """Return number and digest of the ledger entry in the head, the small file beside a journal.
-
-    None if the head is missing or damaged, or names no entry.
-    """
-    with suppress(OSError, ValueError, TypeError):
-        number, digest = json.loads(head_path(journal).read_bytes())
-        return int(number), str(digest)
+def _read_head(journal: Path) -> Head | None:
+    """Return the content of the head beside a journal; None if it is missing or damaged."""
+    with suppress(OSError, *DAMAGES):
+        return Head(**_unpack_fields(head_path(journal).read_bytes()))
     return None
 
 
-def _parse_header(header: bytes) -> tuple[int, tuple[int, str] | None, str]:
-    """Return the fields of a header: drained offset, newest ledger entry or None, owner.
+def _parse_header(header: bytes) -> dict[str, Any]:
+    """Return the fields of a header by name; for a damaged one an error of DAMAGES is raised."""
+    return {"n_drained": 0} | _unpack_fields(header[len(MAGIC) :])
 
-    Raise ValueError, KeyError or TypeError for a damaged header.
+
+def _pack_fields(fields: dict[str, Any]) -> bytes:
+    """Return fields as JSON that ends with their CRC-32, for `_unpack_fields`."""
+    text = json.dumps(fields).encode()
+    return b'%s, "crc": %d}' % (text[:-1], zlib.crc32(text))
+
+
+def _unpack_fields(content: bytes) -> dict[str, Any]:
+    """Return the fields of a header or head; those of earlier releases have no CRC-32.
+
+    An error of DAMAGES is raised if they are damaged.
     """
-    fields = json.loads(header[len(MAGIC) :].rstrip(b"\0"))
-    newest = fields["newest"]
-    entry = None if newest is None else (int(newest[0]), str(newest[1]))
-    return int(fields["drained"]), entry, str(fields["owner"])
+    fields = json.loads(content.rstrip(b"\0 "))
+    if isinstance(fields, list):
+        fields = {"newest": fields}
+    crc = fields.pop("crc", None)
+    if crc not in (None, zlib.crc32(json.dumps(fields).encode())):
+        raise ValueError("the checksum differs")
+    number, digest = fields["newest"] or (0, "")
+    fields["newest"] = (int(number), str(digest)) if digest else None
+    return dict(fields)
 
 
 def forked_error(pid: int, name: str) -> StoreError:

@@ -38,7 +38,8 @@ from .journal import (
     encode_record,
     forked_error,
 )
-from .records import Event, NewLabel, StoredDecision, as_text
+from .records import DATA_LOST, LOSS_REMEDY, Event, NewLabel, StoredDecision, as_text
+from .views import HistoryFilter
 
 if TYPE_CHECKING:
     from .sql import SqlStore
@@ -188,13 +189,17 @@ class Outbox:
     def _start(self, journal: Journal) -> None:
         """Drain what an earlier process left in the journal, check the store, start the threads.
 
-        Damage in the journal is stored as an event. The journal is emptied, and space reserved in
-        it. From now on every use of the store drains the journal first. The check by SQLite is
-        waited for only CHECK_SECONDS and goes on in a thread. What a check finds is not raised: it
-        becomes `integrity_error`. On any other error the journal is closed, and the error raised.
+        Damage in the journal, or records that it lacks, become an event, which is an alarm. The
+        journal is emptied, and space reserved in it. From now on every use of the store drains the
+        journal first. The check by SQLite is waited for only CHECK_SECONDS and goes on in a thread.
+        What a check finds is not raised: it becomes `integrity_error`. On any other error the
+        journal is closed, and the error raised.
         """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
+            since = "The store held no decision before them."
+            for item in self.store.decisions(HistoryFilter(), limit=1):
+                since = f"They came after decision {item.decision.id} of {item.when:%F %T} UTC."
             for offset, end, blob in journal.undrained_records():
                 record = decode_record(blob)
                 self._appended += 1
@@ -205,17 +210,15 @@ class Outbox:
                 self._mark_synced(record, offset, end)
             while not self.is_drained:
                 self._drain_chunk(journal)
-            if journal.dropped:
+            if journal.loss:
+                self._log_event(DATA_LOST, f"{journal.loss} {since}")
+            elif journal.dropped:
                 self._log_event(
                     "journal",
                     f"{journal.dropped} bytes at its end were dropped: a process was killed as it "
                     "wrote them",
                 )
-            if journal.damaged:
-                self._log_event(
-                    "journal",
-                    f"{journal.damaged} records that are not as they were written were left out",
-                )
+            journal.reserve()
             journal.clear()
             journal.reserve()
             self.n_decisions = self.store.n_decisions()
@@ -254,21 +257,22 @@ class Outbox:
         journal or its head is new though the store is not.
         """
         entries = [
-            entry for entry in (journal.newest_entry, journal.head_entry) if entry is not None
+            entry for entry in (journal.newest_entry, journal.head.newest) if entry is not None
         ]
         database = self.store.database
         if missing := [entry for entry in entries if not database.has_entry(*entry)]:
             self._log_event(
-                "lost",
+                DATA_LOST,
                 f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: the "
-                "store was cut off, or restored from a copy; labels may be missing",
+                "store was cut off, or restored from a copy; labels may be missing.",
             )
             journal.drained_to = HEADER  # the journal may still hold some of them
         elif len(entries) < 2 and database.newest_entry is not None:
             self._log_event(
                 "journal",
                 f"the journal {journal.path}, or its head beside it, is new here, and the store is "
-                "not: whether the store was cut off, or labels are elsewhere, is unknown",
+                "not: whether the store was cut off, or labels are elsewhere, is unknown; bring "
+                "the old files here, or copy a store by `dengine backup` and `dengine restore`.",
             )
 
     def check_integrity(self, since: int | None = None) -> None:
@@ -294,7 +298,7 @@ class Outbox:
 
     def _log_event(self, kind: str, text: str) -> None:
         """Log an error, and commit it to the store as an event, directly and not by the journal."""
-        log.error("%s: %s", kind, text)
+        log.error("%s: %s%s", kind, text, f" {LOSS_REMEDY}" if kind == DATA_LOST else "")
         self.store.put_event(kind, text)
 
     def _save_newest_entry(self) -> None:
@@ -795,20 +799,20 @@ class Outbox:
     def close(self) -> None:
         """Drain, stop the threads, close store and journal, within seconds unless `patient`.
 
-        What the store does not take stays in the journal, and the next engine drains it. A second
-        call does nothing, nor does one in a forked process.
-
-        Raises
-        ------
-        NotTakenError
-            If the journal cannot be written; then nothing is closed.
+        What the store does not take stays in the journal, and the next engine drains it. What the
+        disk does not take is given up, and an error is logged: whoever waited for that was told so.
+        A second call does nothing, nor does one in a forked process.
         """
         if not self.is_usable:
             return
-        self.flush()
+        try:
+            self.flush()
+        except NotTakenError as error:
+            log.error("closed without the newest records, which no report acknowledged: %s", error)
         with self._changed:
             self._changed.wait_for(
-                lambda: self.is_drained or bool(self._store_error), CLOSE_SECONDS
+                lambda: self.is_drained or bool(self._journal_fault or self._store_error),
+                CLOSE_SECONDS,
             )
             self._closed = True
             self._changed.notify_all()
@@ -867,18 +871,20 @@ class Outbox:
             with self._changed:  # a cell that never pauses would fill the disk
                 self._to_drain = max(self._to_drain, self._synced)
                 self._changed.notify_all()
-                if is_drained := self._changed.wait_for(lambda: journal.is_drained, BATCH_SECONDS):
+                is_drained = self._changed.wait_for(lambda: journal.is_drained, BATCH_SECONDS)
+            if is_drained:  # syncs without the lock: a disk that hangs would hang the cell
+                journal.reserve()
+                with self._changed:
                     journal.clear()
-            if is_drained:
-                journal.reserve()  # without the lock: a disk that hangs would hang the cell
+                journal.reserve()
         blobs = [encode_record(record) for record in batch]
         try:
-            offsets = journal.append(blobs)
+            offsets = journal.append(blobs, self.store.clock())
         except LostJournalError as error:
             log.error("%s It is created again with what the store lacks.", error)
             with self._changed:  # nobody reads it or writes its header meanwhile
                 journal.recreate()
-            offsets = journal.append(blobs)
+            offsets = journal.append(blobs, self.store.clock())
             self.record_event(
                 "journal", f"{error} It was created again with what the store lacked."
             )
@@ -924,6 +930,8 @@ class Outbox:
                 )
                 call = self._calls.popleft() if self._calls else None
             try:
+                if self._drained < self._synced:
+                    journal.sync_head()
                 while self._drained < self._synced:
                     self._drain_chunk(journal)
                 self._store_error = ""
@@ -971,12 +979,13 @@ class Outbox:
         numbers = self.store.apply_records(records)
         if damaged:
             self._log_event(
-                "journal",
+                DATA_LOST if any(damaged) else "journal",
                 f"{len(damaged)} records of the journal were damaged on disk and are stored from "
-                f"memory; decisions that are lost: {listed(filter(None, damaged)) or 'none'}",
+                f"memory; decisions that are lost: {listed(filter(None, damaged)) or 'none'}.",
             )
         with self._changed:
             journal.drained_to = chunk[-1][1]
+            journal.n_drained += len(chunk)
             self._save_newest_entry()
             self._remove_drained(records, numbers)
             for _ in chunk:

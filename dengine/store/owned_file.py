@@ -77,6 +77,9 @@ def open_plain(path: Path, flags: int) -> int:
     return os.open(path, flags | no_follow | binary, 0o600)
 
 
+sync = getattr(os, "fdatasync", os.fsync)  # not every system has the quicker one
+
+
 class OwnedFile:
     """An open file that one process owns; it is created, with its folder, if need be.
 
@@ -165,7 +168,7 @@ class OwnedFile:
 
     def sync(self) -> None:
         """Return once what was written is on the disk."""
-        getattr(os, "fdatasync", os.fsync)(self._fd)  # not every system has the quicker one
+        sync(self._fd)
 
     def truncate(self, size: int) -> None:
         """Set the size in bytes: cut the file off, or extend it."""

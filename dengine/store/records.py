@@ -10,7 +10,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -39,6 +39,12 @@ SAFE_MODE_BEGAN = "safe mode"
 SAFE_MODE_ENDED = "safe mode ended"
 POLICY_CHANGED = "policy"  # its data holds the old and the new policy
 SHADOW_CHANGED = "shadow"  # likewise
+DATA_LOST = "lost"  # an alarm until the next event ACKNOWLEDGED
+ACKNOWLEDGED = "acknowledged"
+LOSS_REMEDY = (
+    "Report the outcomes of that time again, then end this alarm: dengine verify STORE "
+    "--acknowledge."
+)
 T = TypeVar("T")
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
@@ -362,6 +368,20 @@ class Event:
     when = property(_when)
 
 
+def open_losses(events: Iterable[Any]) -> list[Any]:
+    """Return those of a cell's events, oldest first, that say that data was lost.
+
+    Those before the newest acknowledgement are left out. Rows of the table may be given as well.
+    """
+    losses: list[Any] = []
+    for event in events:
+        if event.kind == ACKNOWLEDGED:
+            losses.clear()
+        elif event.kind == DATA_LOST:
+            losses.append(event)
+    return losses
+
+
 @dataclass(frozen=True, slots=True)
 class Change:
     """A change that a person makes: one event and everything it changes, committed together.
@@ -625,14 +645,18 @@ def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
 
 
 def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return arrays as the bytes of an npz file, uncompressed; unlike `np.savez` it takes any name.
+    """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
-    Raise ValueError for an array of Python objects.
+    Integers are compressed, of which a state repeats many; weights hardly get smaller. Raise
+    ValueError for an array of Python objects.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in state.items():
-            with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as member:
+            info = zipfile.ZipInfo(f"{name}.npy")
+            if values.dtype.kind in "iu":
+                info.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(info, "w", force_zip64=True) as member:
                 np.save(member, values, allow_pickle=False)
     return buffer.getvalue()
 

@@ -236,7 +236,9 @@ def check_schema(connection: sa.Connection, name: str) -> None:
     for table in METADATA.tables.values():
         expected = {column.name for column in table.c if column not in ADDED}
         if missing := expected - tables.get(table.name, set()):
+            query = sa.select(SETTING.c.value).where(SETTING.c.key == "dengine").distinct()
+            versions = ", ".join(connection.execute(query).scalars()) or "unknown"
             raise StoreError(
-                f"Expected columns {sorted(missing)} of {table.name} in {name}; restore it "
-                "from a copy."
+                f"Expected columns {sorted(missing)} of {table.name} in {name}, found a store of "
+                f"dengine {versions}, which lacks them; open it with that dengine."
             )

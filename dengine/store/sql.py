@@ -44,6 +44,7 @@ from .queries import (
     training_query,
 )
 from .records import (
+    ACKNOWLEDGED,
     CHUNK,
     FORGOTTEN,
     KEEP,
@@ -68,6 +69,7 @@ from .records import (
     from_row,
     keeps_state,
     nothing_to_correct,
+    open_losses,
     overdue_outcomes,
     read_decision,
     to_npz,
@@ -743,7 +745,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         if self.product is not None and row["accepted"]:  # a peer's may have been stored before
             lock(connection, PRODUCT, self.product)
             number = max(number, self._scope.newest_version(connection) + 1)
-        self.database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         if row["accepted"]:
             with_state = connection.execute(
                 self._accepted_query().where(VERSION.c.state.is_not(None))
@@ -756,6 +757,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             if dropped:
                 is_dropped = self._scope.shared(VERSION.c.cell_id) & VERSION.c.retrain.in_(dropped)
                 connection.execute(sa.update(VERSION).where(is_dropped).values(state=None))
+        # Afterwards, so that the new state takes the room of those.
+        self.database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         return number
 
     def _accepted_query(self) -> sa.Select[Any]:
@@ -903,6 +906,21 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 self.put_event("damaged", text)
             except StoreError as error:  # a store that can only be read is read all the same
                 log.warning("%s (%s)", text, error)
+
+    def acknowledge_losses(self, author: str = "") -> None:
+        """End the alarm about lost data by an event; without an alarm nothing is written.
+
+        Parameters
+        ----------
+        author : str
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        if losses := open_losses(self.events()):
+            self.put_event(ACKNOWLEDGED, f"{len(losses)} losses of data", author=author)
 
     def events(self, limit: int | None = None) -> list[Event]:
         """Return the newest events of the cell, oldest first.

@@ -36,8 +36,19 @@ from .ledger import (
     rows_digest,
     state_sum,
 )
-from .records import CHUNK
-from .schema import CHAINED, DECISION, LABEL, LEDGER, METADATA, SCHEMA_KEY, SETTING, TRACE, VERSION
+from .records import CHUNK, LOSS_REMEDY, open_losses
+from .schema import (
+    CHAINED,
+    DECISION,
+    EVENT,
+    LABEL,
+    LEDGER,
+    METADATA,
+    SCHEMA_KEY,
+    SETTING,
+    TRACE,
+    VERSION,
+)
 
 # The column of each chained table that, with the cell, identifies a row.
 KEY = {
@@ -126,8 +137,9 @@ def verify_history(
     """Check every row of a store's history; nothing is written, and engines may run meanwhile.
 
     What is wrong is returned as faults, not raised: a row that was changed, added or removed, a
-    damaged SQLite file, a ledger entry that a cell's journal names and the store lacks, and an
-    `expect` that no entry has. Takes about 80 bytes of memory per row.
+    damaged SQLite file, a ledger entry that a cell's journal names and the store lacks, lost data
+    that nobody has acknowledged, and an `expect` that no entry has. Takes about 80 bytes of memory
+    per row.
 
     Parameters
     ----------
@@ -161,7 +173,7 @@ def verify_history(
         names = _selected_cells(connection, cell_id)
         journals = {name: journal_path(connection.engine.url, name) for name in names}
         journal_entries = {name: read_newest_entries(path) for name, path in journals.items()}
-        waiting = {name: _count_undrained(path) for name, path in journals.items()}
+        inspected = {name: _inspect_journal(path) for name, path in journals.items()}
     with reading(str(url)) as connection:  # a later snapshot: it has what the journals knew
         pages = run_integrity_check(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", finding) for finding in pages]
@@ -169,6 +181,9 @@ def verify_history(
         for check in checks:
             check_key(connection, check.cell_id, check.key)
             faults += check.run()
+            if loss := inspected[check.cell_id][1]:
+                problem = f"is damaged: {loss} The next engine records that as an alarm"
+                faults.append(HistoryFault(check.cell_id, "journal", "", problem))
             missing = [
                 number
                 for number, digest in journal_entries[check.cell_id]
@@ -193,21 +208,24 @@ def verify_history(
             entries=len(check.digests),
             rows=check.rows,
             digest="".join(check.digests[-1:]),
-            waiting=waiting[check.cell_id],
+            waiting=inspected[check.cell_id][0],
         )
         for check in checks
     ]
     return HistoryReport(tuple(cells), tuple(faults))
 
 
-def _count_undrained(journal: Path) -> int | None:
-    """Return the number of records in a journal that its store has not taken.
+def _inspect_journal(path: Path) -> tuple[int | None, str]:
+    """Return the number of records in a journal that its store has not taken, and what it lost.
 
-    None if there is no journal, or it cannot be read.
+    None and "" if there is no journal, or it cannot be read.
     """
     with suppress(StoreError):  # it is damaged, or another user's
-        return len(read_undrained(journal)) if journal.exists() else None
-    return None
+        if path.exists():
+            records, loss = read_undrained(path)
+            # Read again, since a running engine may have emptied it meanwhile.
+            return len(records), loss and read_undrained(path)[1]
+    return None, ""
 
 
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
@@ -276,6 +294,7 @@ class CellCheck:
         ]
         faults += self._catch_database_errors(LEDGER.name, self._check_ledger())
         faults += self._catch_database_errors(SETTING.name, self._check_settings())
+        faults += self._catch_database_errors(EVENT.name, self._check_losses())
         if not self._is_unreadable:  # else everything that cannot be read would be missing
             for table, required in REQUIRED:
                 faults += self._catch_database_errors(
@@ -398,6 +417,12 @@ class CellCheck:
             yield self._fault(
                 SETTING.name, SCHEMA_KEY, "is missing: no engine has opened this cell"
             )
+
+    def _check_losses(self) -> Iterator[HistoryFault]:
+        """Yield a fault for each event that says that data was lost and is not acknowledged."""
+        query = sa.select(EVENT).where(EVENT.c.cell_id == self.cell_id).order_by(EVENT.c.number)
+        for event in open_losses(self.connection.execute(query)):
+            yield self._fault(EVENT.name, event.number, f"says: {event.text} {LOSS_REMEDY}")
 
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of a table whose row of the required table is missing."""

@@ -506,6 +506,18 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
     assert file.read_bytes() == before
 
 
+def test_a_store_of_another_version_is_refused_by_that_version_and_what_it_lacks(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "a.db"
+    with SqlStore(str(file)) as store:
+        store.save_settings({"dengine": "0.8.2"})
+    execute(file, "ALTER TABLE label DROP COLUMN silent")
+    with pytest.raises(StoreError, match=r"dengine 0\.8\.2, which lacks them; open") as refused:
+        SqlStore(str(file))
+    assert "['silent'] of label" in str(refused.value)
+
+
 @pytest.mark.parametrize("table", ["trials (id)", "setting (name)", "label (id)"])
 def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, table: str) -> None:
     file = tmp_path / "a.db"

@@ -140,6 +140,37 @@ def test_a_backup_of_a_copy_says_that_it_has_no_journal(tmp_path: Path, in_use: 
     assert "No journal of cell cell lies beside" in text
 
 
+def test_a_cell_moves_to_another_machine_by_backup_and_restore(
+    tmp_path: Path, in_use: DataEngine, data: Dataset, caplog: pytest.LogCaptureFixture
+) -> None:
+    copy, there = tmp_path / "copy.db", tmp_path / "elsewhere" / "engine.db"
+    there.parent.mkdir()
+    line_of("backup", tmp_path / "engine.db", "--out", copy)
+    restored = document("restore", copy, "--store", there)
+    verified = document("verify", there)
+    assert (verified["ok"], verified["cells"]) == (True, [restored["cells"][0] | {"waiting": 0}])
+    caplog.clear()
+    with DataEngine.open(str(there)) as engine:
+        assert engine.status().labels == IN_STORE + IN_JOURNAL
+        assert (engine.status().alarm, engine.store.events()) == ("", [])
+        learn(engine, data, range(70, 80))
+    assert caplog.messages == []
+    assert document("verify", there)["ok"]
+    assert "name another file" in dengine("restore", copy, "--store", there).output
+
+
+def test_a_copy_whose_history_was_changed_is_not_restored(
+    tmp_path: Path, in_use: DataEngine
+) -> None:
+    copy, there = tmp_path / "copy.db", tmp_path / "there.db"
+    backup_store(tmp_path / "engine.db", copy)
+    with closing(sqlite3.connect(copy)) as connection, connection:
+        connection.execute("UPDATE label SET success = 1 - success WHERE seq = 3")
+    result = dengine("restore", copy, "--store", there)
+    assert (result.exit_code, "found faults" in result.output) == (1, True)
+    assert not there.exists()
+
+
 @pytest.mark.parametrize(
     ("store", "out", "words"),
     [

@@ -14,7 +14,7 @@ import click
 import numpy as np
 import pytest
 
-from dengine import DataEngine, load_dataset
+from dengine import DataEngine, backup_store, load_dataset
 from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
@@ -97,8 +97,8 @@ def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What examples name: a trained engine.db of the bundled set, and cell.csv, a journal of two of
-    its traces.
+    """What examples name: a trained engine.db of the bundled set, backup.db, its copy, and cell.csv,
+    a journal of two of its traces.
     """
     folder = tmp_path_factory.mktemp("examples")
     succeed("train", "--data", "insertion", "--store", folder / "engine.db", "--reducer", "pca")
@@ -108,6 +108,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for i in range(2)
     ]
     (folder / "cell.csv").write_bytes(cell_journal(*lines))
+    backup_store(folder / "engine.db", folder / "backup.db")
     return folder
 
 
@@ -274,7 +275,7 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(
         "guarantee local",
         "retrain every 50",
         "budget 450 ms",
-        "rate 500 Hz",
+        "rate unknown, unit unknown",
     ):
         assert words in out
     with np.load(data) as file, DataEngine.open(trained) as engine:
@@ -427,6 +428,34 @@ def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected(words: str, expe
     result = dengine(*words.split())
     assert result.exit_code == 2
     assert expected in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize("verb", ["run --cycles 20", "train"])
+def test_limits_in_seconds_need_a_rate_that_the_recordings_or_an_option_state(
+    verb: str, data: Path, tmp_path: Path
+) -> None:
+    words = (*verb.split(), "--data", data, "--reducer", "pca", *POLICY, "--store")
+    limits = ("--window", "0.01:0.02:-500:")
+    refused = dengine(*words, tmp_path / "new.db", *limits)
+    assert refused.exit_code == 1
+    assert "start the engine with --samples ..., --rate-hz ... first" in refused.stderr
+    succeed(*words, tmp_path / "new.db", *limits, "--rate-hz", 100, "--unit", "kN")
+    with DataEngine.open(tmp_path / "new.db") as engine:
+        assert (engine.trace.rate_hz, engine.trace.unit) == (100.0, "kN")
+        assert engine.policy.windows
+
+
+def test_a_run_states_the_rate_that_its_store_does_not_know(
+    trained: Path, data: Path, tmp_path: Path
+) -> None:
+    store = Path(shutil.copytree(trained.parent, tmp_path / "cell")) / trained.name
+    more = tmp_path / "more.npz"
+    fresh = easy_parts(30, 5)
+    np.savez(more, X=fresh.X, y=fresh.y, rate_hz=250.0)
+    limit = ("policy", store, "--window", "0.01:0.02:-500:")
+    assert dengine(*limit).exit_code == 1
+    succeed("run", "--data", more, "--cycles", 5, "--store", store)
+    assert "windows none -> 0.01:0.02:-500:" in line_of(*limit)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from tests.support.command_line import dengine, document, line_of
 def used(make_data, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A store with 60 labels and two versions."""
     path = tmp_path_factory.mktemp("used") / "engine.db"
-    import_labelled(path, make_data(60), "pca", 0)
+    import_labelled(path, replace(make_data(60), rate_hz=500.0), "pca", 0)
     with DataEngine.open(path) as engine:
         engine.retrain()
         engine.retrain()
@@ -122,11 +122,15 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Pa
 
 def test_an_earlier_version_answers_again(store: Path) -> None:
     line = line_of("rollback", store, 1, "--author", "kim")
-    assert line == "Version 1 answers again, as version 3 after 2. Event 1, by kim."
-    assert document("status", store)["version"] == 3
+    assert line == "Version 1 answers again, as version 3 after 2, and is pinned. Event 1, by kim."
+    status = document("status", store)
+    assert (status["version"], status["pinned"]) == (3, 1)
+    assert line_of("release", store).startswith("Version 3 is pinned no more: ")
+    assert document("status", store)["pinned"] == 0
+    assert line_of("release", store) == "No version is pinned; nothing changed."
     failed = dengine("rollback", store, 9)
     assert failed.exit_code == 1
-    assert "load one of these: 1, 2, 3" in " ".join(failed.stderr.split())
+    assert "load one of these: 1, 2, 3, 4" in " ".join(failed.stderr.split())
 
 
 def test_a_policy_is_changed_in_what_is_given_and_stays(

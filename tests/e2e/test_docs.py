@@ -44,6 +44,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "python -m tests.slow.proof --only null": "--repeats 2",
     "python -m tests.slow.faults": "--trials 1 --kills 1 --others 1 --only locked",
     "python training/benchmark_fleet.py": "--cells 2 --minutes 0.05 --cycles 0 --samples 100",
+    "python training/benchmark_store.py": "--data small.npz --reducer pca --parts 40",
     "cmake -S cell_cpp": "-DCMAKE_CXX_FLAGS_RELEASE=-O0 -DDENGINE_ONNX=OFF",  # test_cpp.py builds it as it is meant
     "cmake --build build/cpp": "--parallel 2",
     "python training/benchmark_export.py": "--data small.npz --random 40 --calls 20",

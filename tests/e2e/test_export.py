@@ -163,7 +163,10 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
         windows=["0.1:0.15:-20:"],
     )
     engine = DataEngine(
-        recipe=settings, trace=TraceSpec(SAMPLES, limit=LIMIT), seed=3, replaying=True
+        recipe=settings,
+        trace=TraceSpec(SAMPLES, rate_hz=500.0, limit=LIMIT),
+        seed=3,
+        replaying=True,
     )
     rng, happened, modes, saved = np.random.default_rng(7), Counter[str](), set(), False
     with engine:
@@ -272,7 +275,7 @@ def test_several_channels_are_exported_too(
     data = make_data(150, 40, 3)
     model = fitted(data)
     exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
-    assert exported.trace.channels == 3
+    assert exported.trace == TraceSpec(40, channels=3)  # rate and unit were not stated
     new = make_data(
         100, 40, 3, seed=1
     ).X  # a reference that is asked about itself has no vote in the file
@@ -302,7 +305,7 @@ def test_the_file_says_what_it_is_without_being_loaded(
         audited.recipe.novelty,
     )
     assert metadata["safe_modes"] == list(SAFE_MODES)
-    assert metadata["trace"] == asdict(TraceSpec(SAMPLES, limit=LIMIT)) | {"columns": []}
+    assert metadata["trace"] == asdict(TraceSpec(SAMPLES, 500.0, limit=LIMIT)) | {"columns": []}
     assert (metadata["alpha"], metadata["lower_bound"], metadata["audit_rate"]) == (0.1, 0.9, 0.3)
     assert metadata["model_version"] == audited.version
     assert metadata["references"] == len(audited.model.index)

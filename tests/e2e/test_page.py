@@ -240,6 +240,7 @@ def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path:
         page.wait_for_timeout(500)
     expect(page.locator("#result")).to_have_text(begun)
     confirmed(page, "Roll back")
+    confirmed(page, "Release the version")
     page.get_by_role("button", name="Export").click()
     with page.expect_download() as download:
         page.get_by_role("button", name="Do it").click()
@@ -249,7 +250,7 @@ def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path:
     with demo.store() as store:
         done = {event.kind for event in store.events(20) if event.author == "Robin"}
         trace = store.get_decision(store.decisions(HistoryFilter(), 1)[0].decision.id).trace
-    assert done == {"retrain", "rollback", "export"}
+    assert done == {"retrain", "rollback", "release", "export"}
     assert load_exported(tmp_path / "model.ts").decide(trace).action in Action
 
 
@@ -482,6 +483,19 @@ def test_what_is_said_of_several_channels_is_said_by_their_names(
         caption = page.locator("#trace figcaption").nth(1)
         expect(caption).to_contain_text(
             re.compile(r"Channel 2 over .*of all channels lies outside the band")
+        )
+
+
+def test_the_axis_is_in_samples_and_no_unit_is_shown_while_these_are_unknown(
+    browser: Browser, tmp_path: Path, stream: Dataset
+) -> None:
+    file = tmp_path / "cell.db"
+    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
+        played(service, stream, 40)
+        opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
+        caption = page.locator("#trace figcaption")
+        expect(caption).to_contain_text(
+            re.compile(rf"Trace over {stream.X.shape[-1]} samples, from [−\d.]+ to [\d.]+\. ")
         )
 
 

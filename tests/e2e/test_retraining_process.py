@@ -16,6 +16,7 @@ import pytest
 import torch
 
 from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine.engine import trainer
 from dengine.engine.engine import core_of
 from dengine.serve.retraining import RetrainingProcess
 from tests.support.driving import learn
@@ -23,6 +24,7 @@ from tests.support.driving import learn
 CONV = replace(
     Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9)
 )
+PCA = replace(CONV, reducer="pca", params={})
 
 
 class Lines(logging.Handler):
@@ -67,6 +69,10 @@ def process(running: list[RetrainingProcess]) -> RetrainingProcess:
 
 def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
     learn(engine, data, range(40))
+    settle(engine)
+
+
+def settle(engine: DataEngine) -> None:
     while core_of(engine).is_retraining:
         core_of(engine).process_retrains()
         time.sleep(0.01)
@@ -136,16 +142,48 @@ def test_it_ends_with_whoever_made_it_also_at_work(
         at_work.result(0)
 
 
-def test_after_its_process_was_killed_it_takes_no_more_calls_and_the_engine_retrains_in_line(
-    data: Dataset,
+def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_taken_for_hung(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with RetrainingProcess() as process:
+        engine = DataEngine(recipe=PCA, executor=process)
+        with monkeypatch.context() as patched:
+            patched.setattr(trainer, "HUNG", 0.001)
+            learn(engine, data, range(40))
+            engine.set_policy(replace(engine.policy, alpha=0.2))
+            engine.forget(next(engine.history()).decision.id)
+            assert core_of(engine).is_retraining
+            assert not process.ready.done()  # to be ready takes it seconds
+        settle(engine)
+        assert (engine.version, engine.policy.alpha) == (1, 0.2)
+        assert [report.accepted for report in engine.store.retrains()] == [True]
+
+
+@pytest.mark.parametrize("fault", ["killed", "hung"])
+def test_a_process_that_was_given_up_is_started_again_and_retrains_in_line_until_it_is_ready(
+    fault: str, data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others = set(multiprocessing.active_children())
     with RetrainingProcess() as process:
-        engine = DataEngine(recipe=replace(CONV, reducer="pca", params={}), executor=process)
-        (killed,) = set(multiprocessing.active_children()) - others
-        os.kill(killed.pid, signal.SIGKILL)  # at once: to be ready takes it seconds
-        with pytest.raises(BrokenExecutor):
-            process.submit(os.getpid).result(300)
-        learn_and_settle(engine, data)
-        core_of(engine).start_retrain()
-    assert engine.version >= 1
+        engine = DataEngine(recipe=PCA, executor=process)
+        (first,) = set(multiprocessing.active_children()) - others
+        process.ready.result(300)
+        if fault == "killed":
+            os.kill(first.pid, signal.SIGKILL)
+            with pytest.raises(BrokenExecutor):
+                process.submit(os.getpid).result(300)
+            learn(engine, data, range(40))
+        else:
+            process.submit(time.sleep, 600)
+            learn(engine, data, range(40))
+            monkeypatch.setattr(trainer, "HUNG", 0.0)
+            core_of(engine).process_retrains()
+            assert not engine.store.retrains()[-1].accepted
+            core_of(engine).start_retrain()
+            monkeypatch.undo()
+        assert engine.version == 1
+        assert process.ready.result(300) is None
+        assert process.submit(os.getpid).result(300) != first.pid
+        assert core_of(engine).start_retrain() is None  # there
+        settle(engine)
+        assert engine.version == 2

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
+from xmlrpc.client import Fault, ServerProxy
 
 import numpy as np
 import pytest
@@ -316,7 +317,7 @@ def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained
 ) -> None:
     with serving() as (_, client):
         client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "first"})
-        client.post("/policy", json={"windows": ["0:0:1000000::reject"], "author": "Kim"})
+        client.post("/policy", json={"windows": ["-1e9:1e9:1e6::along=0:reject"], "author": "Kim"})
         decided = client.post(
             "/decide", json={"trace": stream.X[1].tolist(), "request": "r", "part": "R1"}
         ).json()
@@ -346,6 +347,19 @@ def test_a_rejected_part_that_was_found_good_is_reported_corrected_and_explained
             )
 
 
+def test_limits_in_seconds_are_refused_in_one_sentence_while_the_rate_is_unknown(
+    stream: Dataset,
+) -> None:
+    with serving() as (service, client):
+        client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "first"})
+        trace = client.get("/status").json()["trace"]
+        assert (trace["rate_hz"], trace["unit"]) == (None, None)
+        asked = {"windows": ["0.01:0.02:-5:"], "author": "Kim"}
+        problem = must_be_problem(client.post("/policy", json=asked), 422)
+        assert "start the engine with --samples ..., --rate-hz ... first" in problem["detail"]
+        assert service.core.settings.now.recipe.policy.windows == ()
+
+
 def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
     stream: Dataset,
 ) -> None:
@@ -357,7 +371,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
             ("correct", {"id": "wrong-0", "success": False}),
             ("forget", {"ids": ["wrong-1", "wrong-2"], "reason": "a dirty sensor"}),
             ("policy", {"alpha": 0.2, "audit_rate": 0.1}),
-            ("policy", {"windows": ["0.01:0.02:-5:"]}),
+            ("policy", {"windows": ["-100:100:-5::along=0"]}),
             ("policy", {"shadow": True}),
         ):
             changed = client.post(f"/{path}", json=asked | {"author": " Kim  Lee "}).json()
@@ -394,6 +408,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
         (422, "correct", {"id": "label-0", "success": "bad", "author": "Kim"}),
         (404, "correct", {"id": "nobody", "success": False, "author": "Kim"}),
         (404, "rollback", {"version": 7, "author": "Kim"}),
+        (422, "release", {"version": 7, "author": "Kim"}),
         (422, "rollback", {"version": "../1", "author": "Kim"}),
         (422, "policy", {"alpha": 7, "author": "Kim"}),
         (
@@ -417,6 +432,31 @@ def test_what_cannot_be_put_right_so_is_refused_and_leaves_no_event(
             client.post(f"/{path}", json=asked, headers={"origin": "http://evil.example"}), 403
         )
         assert client.get("/events").json()["events"] == []
+
+
+def test_a_version_is_pinned_until_it_is_released_or_somebody_retrains(stream: Dataset) -> None:
+    def put_right(path: str, **fields: Any) -> str:
+        return (
+            client.post(f"/{path}", json=fields | {"author": "Kim"})
+            .raise_for_status()
+            .json()["text"]
+        )
+
+    with serving() as (_, client):
+        for i, x in enumerate(stream.X[:30]):
+            client.post("/decide", json={"trace": x.tolist(), "request": f"order-{i}"})
+            client.post("/report", json={"id": f"order-{i}", "success": bool(stream.y[i])})
+        assert client.get("/status").json()["pinned"] == 0
+        for end in ("release", "retrain"):
+            put_right("retrain")
+            assert "is pinned" in put_right("rollback", version=1)
+            assert client.get("/status").json()["pinned"] == 1
+            put_right(end)
+            assert client.get("/status").json()["pinned"] == 0
+        kinds = [event["kind"] for event in client.get("/events").json()["events"]]
+        assert kinds.count("rollback") == 2
+        assert "release" in kinds
+        assert put_right("release") == "No version is pinned; nothing changed."
 
 
 def test_a_retrain_that_is_under_way_is_not_begun_once_more(stream: Dataset) -> None:
@@ -550,6 +590,8 @@ REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
     "a bool among numbers": (422, {"json": {"trace": [1.0, True]}}),
     "unequal channels": (422, {"json": {"trace": [[1.0] * SAMPLES, [1.0]]}}),
     "another length": (422, {"json": {"trace": [1.0] * (SAMPLES - 1)}}),
+    "a text": (422, {"json": {"trace": "abc"}}),
+    "a text in base64": (422, {"json": {"trace": "abcd"}}),
     "a request that is a number": (422, {"json": ONE | {"request": 7}}),
     "a request that ends a line": (422, {"json": ONE | {"request": "a\nb"}}),
     "a request too long": (422, {"json": ONE | {"request": "a" * 201}}),
@@ -573,10 +615,27 @@ def test_what_is_no_trace_is_refused_and_leaves_nothing(
     answer = client.post("/decide", **request)
     must_be_problem(answer, status)
     assert client.get("/status").json()["ever"]["decisions"] == before
+    if "text" in name:
+        assert re.search("list.? of numbers, or raw float32", answer.json()["detail"])
     if name == "another length":  # in the words of who sends it, and of who serves it
         assert (
             f"or start a new store with --samples {SAMPLES}, --fit pad." in answer.json()["detail"]
         )
+
+
+@pytest.mark.parametrize("n", [SAMPLES // 2 - 1, 2 * SAMPLES + 1])
+def test_a_length_that_the_contract_cannot_fit_is_refused_over_http_and_xml_rpc(n: int) -> None:
+    spec = TraceSpec(SAMPLES, fit="pad")
+    with (
+        closing(CellService(lambda: DataEngine(recipe=RECIPE, trace=spec))) as service,
+        running(service, all_=True) as client,
+    ):
+        for trace in forms(np.ones(n, np.float32), "a").values():
+            detail = must_be_problem(client.post("/decide", **trace), 422)["detail"]
+            assert f"Expected 30 to 120 samples, got {n}; pad fits no other length" in detail
+        with pytest.raises(Fault, match=f"Expected 30 to 120 samples, got {n}"):
+            ServerProxy(f"{client.base_url}/RPC2").decide([1.0] * n)
+        assert client.get("/status").json()["ever"]["decisions"] == 0
 
 
 def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header(

@@ -216,6 +216,8 @@ def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_befor
         3,
         tuple(channels),
     )
+    units = ["N" if name.startswith("F") else "" for name in channels]
+    assert (recorder.spec.rate_hz, recorder.spec.units) == (500.0, tuple(units))
 
 
 def test_who_waits_for_an_insertion_is_woken_when_the_recorder_is_closed() -> None:
@@ -235,6 +237,7 @@ def test_who_waits_for_an_insertion_is_woken_when_the_recorder_is_closed() -> No
 def decisions(cell: Cell, n: int) -> list[dict]:
     with DataEngine("pca", retrain_every=10, policy=Policy(0.3, 0.6), seed=0) as engine:
         cycles = list(engine.run(cell, n))
+        assert engine.trace == cell.spec
     return [
         asdict(cycle.decision) | {"id": "", "outcome": cycle.outcome, "success": cycle.success}
         for cycle in cycles

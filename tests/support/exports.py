@@ -43,7 +43,7 @@ def trained(
 ) -> DataEngine:
     """An engine that saw every label and retrained on all of them."""
     spec, place = (
-        trace or TraceSpec(data.X.shape[-1], limit=LIMIT),
+        trace or TraceSpec(data.X.shape[-1], rate_hz=500.0, limit=LIMIT),
         None if store is None else str(store),
     )
     engine = DataEngine(recipe=recipe(**settings), store=place, trace=spec, seed=3, replaying=True)

@@ -3,7 +3,7 @@ store again gives.
 """
 
 import sqlite3
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
-from dengine import Action, DataEngine, Dataset, Reason
+from dengine import Action, DataEngine, Dataset, Reason, Recipe
 from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError
 from dengine.folds import fold_of
@@ -207,6 +207,8 @@ def test_what_is_so_already_is_said_and_changes_nothing(data: Dataset) -> None:
     play(engine, data, 0, 60, confirm=True)
     name = labelled(engine, 1)
     engine.forget(name)
+    assert engine.release().event is None
+    engine.rollback(engine.version)
     before = (state(engine), len(engine.store.events()))
     stored = labelled(engine, 2)
     answers = [
@@ -346,10 +348,62 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     assert engine.model.index.column("labels")[0] == (
         not cycles[0].success
     )  # as it was corrected since
-    play(engine, data, 100, 138, confirm=True)  # and one above: the next retrain waits for forty
-    assert engine.version == version + 1
-    play(engine, data, 138, 160, confirm=True)
-    assert engine.version == version + 2
+
+
+@pytest.mark.parametrize("end", ["release", "retrain", "forget"])
+def test_a_version_that_was_rolled_back_to_stays_until_somebody_ends_that(
+    end: str, data: Dataset, tmp_path: Path
+) -> None:
+    with make(store=tmp_path / "engine.db") as made:
+        cycles = play(made, data, 0, 100, confirm=True)
+        made.rollback(1, author="kim")
+        pinned, n = made.version, len(made.model.index)
+        play(made, data, 100, 130, confirm=True)
+    with DataEngine.open(tmp_path / "engine.db", replaying=True) as engine:
+        cycles += play(engine, data, 130, 190, confirm=True)
+        assert (engine.version, core_of(engine).new_labels) == (pinned, len(engine.model.index) - n)
+        assert core_of(engine).new_labels > 2 * RECIPE.retrain_every
+        unseen = next(c for c in cycles[::-1] if c.success is not None).decision.id
+        assert "pinned" not in engine.forget(unseen).text  # the version was not trained with it
+        engine.set_policy(replace(engine.policy, lower_bound=0.85))
+        play(engine, data, 190, 200, confirm=True)
+        assert (engine.version, engine.status().pinned) == (pinned + 1, 1)
+        if end == "retrain":
+            assert engine.retrain().version == pinned + 2
+        else:
+            change = engine.forget(cycles[0].decision.id) if end == "forget" else engine.release()
+            assert "is pinned no more" in change.text.replace("which learned from this, ", "")
+            assert core_of(engine).process_retrains() is not None  # that is due
+            assert engine.version == pinned + 3
+        assert engine.status().pinned == 0
+
+
+@pytest.mark.parametrize(
+    ("part", "start"), [(5, "from initial weights"), (45, "from version 1")], ids=["first", "later"]
+)
+@pytest.mark.parametrize("reopens", [False, True])
+def test_after_forgetting_a_label_the_weights_are_as_if_it_had_been_another(
+    part: int, start: str, reopens: bool, make_data, tmp_path: Path
+) -> None:
+    data = make_data(80)
+    policy = replace(RECIPE.policy, alpha=0.001, lower_bound=0.999)  # that verifies them all
+    recipe = replace(Recipe.load("conv"), policy=policy, retrain_every=30, max_steps=5)
+    predicted = []
+    for label in (True, False):
+        (place := tmp_path / str(label)).mkdir()
+        with make(recipe, store=place / "engine.db") as engine:
+            ids = [engine.decide(x).id for x in data.X[:62]]
+            for i, id_ in enumerate(ids):
+                engine.report(id_, label if i == part else bool(data.y[i]))
+            assert engine.version == 2
+            engine.forget(ids[part])
+            with again(engine, place) if reopens else nullcontext(engine) as going:
+                assert start in going.retrain().reason
+                predicted.append(asked(going, data))
+                corrected = ids[part - 1]
+                going.correct(corrected, not going.find(corrected).success)
+                assert "from" not in going.retrain().reason  # it goes on from its weights
+    assert predicted[0] == predicted[1]
 
 
 def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_labelled_now(

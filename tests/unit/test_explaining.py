@@ -175,7 +175,7 @@ def test_each_reason_is_explained_by_what_it_rests_on(
     make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
     data = make_data(260, samples=60)
-    spec = TraceSpec(60, limit=200.0, unit="Nm")
+    spec = TraceSpec(60, rate_hz=500.0, limit=200.0, unit="Nm")
     with played(tmp_path, data, RECIPES["local"], trace=spec) as engine:
         bump, dead, torn, loud = (np.array(data.X[0]) for _ in range(4))
         bump[20:40] += 60.0
@@ -207,6 +207,26 @@ def test_each_reason_is_explained_by_what_it_rests_on(
     assert "the trace was not embedded" in said_of(untrained)
     assert "the decision was lost, and recorded again" in said_of(lost)
     assert "The part turned out bad (stop)" in said_of(lost)
+
+
+def test_times_are_in_samples_and_values_have_no_unit_while_these_are_unknown(
+    make_data: Callable[..., Dataset],
+) -> None:
+    with played(
+        None, make_data(40, 60), RECIPES["local"], trace=TraceSpec(60, limit=200.0)
+    ) as engine:
+        x = make_data(1, 60).X[0]
+        loud, dead, huge, high = x.copy(), np.full_like(x, 4.0), x.copy(), x.copy()
+        loud[30], huge[5], high[20:25] = 200.0, 1e30, 150.0
+        saturated, constant, _, outside = (
+            engine.explain(engine.decide(trace).id) for trace in (loud, dead, huge, high)
+        )
+    assert "touch the sensor's range of 200, first after 30 samples (channel 1)" in said_of(
+        saturated
+    )
+    assert "every sample is 4: a dead sensor" in said_of(constant)
+    excess = outside.envelope.excesses[0]
+    assert (excess.first, excess.last, excess.from_s, excess.to_s) == (20, 24, None, None)
 
 
 def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
@@ -294,7 +314,10 @@ def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_mad
     times = iter(np.arange(1e6) * clock_goes + 1e9)
     data, window = make_data(260, samples=60), "0:0.1:-1000:1000"
     engine = played(
-        SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))), data, RECIPES["local"]
+        SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))),
+        data,
+        RECIPES["local"],
+        trace=TraceSpec(60, rate_hz=500.0),
     )
     (past,) = engine.history(last=1, action="accept")
     trace, policies, ids = engine.find(past.decision.id).trace, [engine.policy], [past.decision.id]

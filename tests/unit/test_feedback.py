@@ -508,6 +508,7 @@ def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_
         cycles = play(engine, Dataset(X[order], y[order], part=parts))
         last = [c.retrain for c in cycles if c.retrain is not None][-1]
         assert ("give their numbers" in last.reason) is text
+        assert ("same number each time it comes" in engine.status().alarm) is text
 
 
 def rejected(engine: DataEngine, data: Dataset) -> list[Decision]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from dengine.experiments.figures import (
 from dengine.experiments.replay import Replay, to_replay
 from dengine.experiments.tables import frame_of, pool, pooled_table, promise_lines
 from dengine.reducers import has_own_unit
+from tests.support.driving import drive
 from tests.support.replays import replay_of as by_hand
 
 RECIPE = Recipe("pca", policy=Policy(alpha=0.1, lower_bound=0.9))
@@ -208,6 +210,22 @@ def test_every_figure_is_written_as_a_png_without_pyplot_and_no_legend_lies_on_i
         assert box.x1 <= max(
             axes.get_window_extent().x1 for axes in figure.axes
         )  # or the axes would have to shrink
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "x_label", "end"), [(None, "sample", 99.0), (50.0, "time [s]", 1.98)]
+)
+def test_the_axis_of_an_unknown_rate_is_in_samples_and_no_unit_is_made_up(
+    data: Dataset, rate_hz: float | None, x_label: str, end: float
+) -> None:
+    shown = replace(data, rate_hz=rate_hz)
+    with DataEngine(recipe=RECIPE, trace=shown.spec) as engine:
+        drive(engine, shown, 0, 30)
+        explained = explained_picture(engine.explain(engine.decide(shown.X[0] + 50.0).id))
+    for figure in (data_picture(shown, "x"), explained):
+        axes = figure.axes[0]
+        assert (axes.get_xlabel(), axes.get_ylabel()) == (x_label, "trace")
+        assert axes.lines[0].get_xdata()[-1] == end
 
 
 def test_every_channel_is_drawn_in_its_own_unit(data: Dataset) -> None:

@@ -270,6 +270,32 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
     assert (counts(again, probe), rule(again)) == before
 
 
+def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases_it(
+    fleet: Fleet, parts: Dataset
+) -> None:
+    first, second = taught(fleet, parts, 90)
+    with ThreadPoolExecutor(1) as executor:
+        third = fleet.engine("c", executor=executor)
+        core_of(third).learner.start_retrain(by_hand=False)  # it does not know of the rollback
+        first.rollback(1)
+        executor.shutdown()
+    pinned = first.version
+    for engine, rows in (
+        (third, range(90, 91)),
+        (second, range(91, 140)),
+        (first, range(140, 190)),
+    ):
+        core_of(engine).process_retrains()
+        learn(engine, parts, rows)
+    for engine in (first, second, third):
+        core_of(engine).process_retrains()
+        assert (engine.version, engine.status().pinned) == (pinned, 1)
+    second.release()
+    for engine in (first, second, third):
+        core_of(engine).process_retrains()
+        assert (engine.version > pinned, engine.status().pinned) == (True, 0)
+
+
 def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(120))

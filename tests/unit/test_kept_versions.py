@@ -2,6 +2,8 @@
 one.
 """
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,10 @@ import pytest
 from dengine import DataEngine, Dataset, Policy
 from dengine.errors import StoreError
 from dengine.experiments.baselines import AgreeingNeighbours
-from dengine.store import SqlStore, verify_history
+from dengine.store import SqlStore, StoredDecision, verify_history
 from dengine.store.records import KEEP, keeps_state
 from tests.support.driving import learn
-from tests.support.stores import execute, report
+from tests.support.stores import decision, execute, report
 
 
 def put(store: SqlStore, versions: int) -> None:
@@ -40,6 +42,41 @@ def test_what_is_kept_grows_with_the_logarithm_of_what_was_trained() -> None:
         most[newest] = len(names)
     assert names >= {1, 10_000, 19_000, 19_900, 19_990, 19_996, 20_000}
     assert max(most.values()) <= KEEP + 1 + 4 * 10
+
+
+def test_a_new_state_takes_the_room_of_those_that_are_not_kept_any_more(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    state = np.random.default_rng(0).random(2**17)  # 1 MiB
+    with SqlStore(str(file), keep_versions=2) as store:
+        for version in range(1, 10):
+            store.put_version(report(version), version, {"w": state})
+        assert kept(store) == [1, 8, 9]
+    assert 3 * 2**20 < file.stat().st_size < 3.6 * 2**20
+
+
+def test_integers_of_a_state_that_repeat_take_little_room(store: SqlStore) -> None:
+    taps = np.tile(np.arange(9), 2000)
+    store.put_version(report(1), 1, {"taps": taps})
+    assert store.versions()[0].n_bytes < taps.nbytes / 10
+    np.testing.assert_array_equal(store.load_version(1).state["taps"], taps)
+
+
+@pytest.mark.parametrize("samples", [200, 600, 1000, 1900])
+def test_traces_fill_the_pages_of_a_file(samples: int, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    file = tmp_path / "a.db"
+    items = [
+        StoredDecision(
+            decision(f"part {i}"), rng.random((1, samples), dtype=np.float32), i, False, float(i)
+        )
+        for i in range(200)
+    ]
+    with SqlStore(str(file)) as store:
+        store.apply_records(items)
+    with closing(sqlite3.connect(file)) as connection:
+        query = "SELECT sum(pgsize) FROM dbstat WHERE name = 'trace'"
+        (n_bytes,) = connection.execute(query).fetchone()
+    assert n_bytes < 1.4 * sum(item.trace.nbytes for item in items)
 
 
 def test_a_version_is_loaded_by_its_number(store: SqlStore) -> None:

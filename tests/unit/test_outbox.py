@@ -68,7 +68,7 @@ def test_a_damaged_label_that_waits_alone_is_stored_from_memory(
     assert box.pop_label_numbers() == [("part 1", 1)]
     (text,) = journal_events(box)
     assert text.startswith("1 records of ")
-    assert text.endswith("are stored from memory; decisions that are lost: none")
+    assert text.endswith("are stored from memory; decisions that are lost: none.")
 
 
 def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(
@@ -113,8 +113,8 @@ def test_a_damaged_decision_that_is_not_in_memory_any_more_is_named_in_an_event(
     assert box.store.get_decision("part 1") is None
     assert box.find_decision("part 1") is None
     assert box.store.get_decision("part 2").success is True
-    (text,) = journal_events(box)
-    assert text.endswith("decisions that are lost: part 1")
+    (text,) = (event.text for event in box.store.events() if event.kind == "lost")
+    assert text.endswith("decisions that are lost: part 1.")
     (letter,) = (event.text for event in box.store.events() if event.kind == "dead letter")
     assert "a label, success from verification, on 'part 1'" in letter
 

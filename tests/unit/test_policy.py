@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from dengine import Action, DataEngine, Policy, Reason, Recipe, TraceSpec
 from dengine.errors import SettingError
 from dengine.limits import ForceLimits
 from dengine.traces import ForceLimitsGate
+from tests.support.driving import Counting
 from tests.support.exports import SAMPLES, recipe, trained
 
 policies = st.builds(Policy, alpha=st.floats(0.001, 0.9), lower_bound=st.floats(0.501, 0.999))
@@ -90,6 +92,34 @@ def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits
     assert ForceLimitsGate(limited.policy.windows, spec)(torch.stack([x, -x])) == expected
     assert Recipe.from_toml(limited.to_toml()) == limited
     assert str(*limited.policy.windows) == window
+
+
+IN_SECONDS = Policy(windows=("0.02:0.1::1e6",))
+UNSTATED = "Expected the rate of the traces, because force limits are in seconds"
+
+
+@pytest.mark.parametrize(
+    "begin",
+    [
+        partial(DataEngine, policy=IN_SECONDS),
+        partial(DataEngine, policy=IN_SECONDS, trace=TraceSpec(SAMPLES, unit="N")),
+        partial(DataEngine.open_or_create, None, policy=IN_SECONDS),
+        partial(DataEngine, recipe=Recipe("pca", policy=IN_SECONDS)),
+        partial(DataEngine, model=Counting(), policy=IN_SECONDS),
+        lambda: DataEngine().set_policy(IN_SECONDS),
+        lambda: DataEngine(trace=TraceSpec(SAMPLES)).set_policy(IN_SECONDS),
+    ],
+)
+def test_force_limits_in_seconds_are_refused_at_once_while_the_rate_is_unknown(begin) -> None:
+    with pytest.raises(SettingError, match=rf"{UNSTATED} .* TraceSpec\(samples=\.\.\., rate_hz"):
+        begin()
+
+
+def test_force_limits_along_a_path_need_no_rate(make_data) -> None:
+    policy = Policy(windows=("-1e9:1e9::1e6:along=0",))
+    with DataEngine("pca", policy=policy) as engine:
+        assert engine.decide(make_data(1).X[0]).reason is Reason.NO_MODEL
+        assert engine.trace.rate_hz is None
 
 
 def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(

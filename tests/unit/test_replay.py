@@ -7,7 +7,7 @@ import pytest
 from sklearn.decomposition import PCA
 
 from dengine import DataEngine, Dataset, Outcome, Recipe, Replay, ReplayCell, replay
-from dengine.errors import DataError, SettingError
+from dengine.errors import SettingError
 from dengine.experiments.replay import Contender, watch
 from tests.support.driving import RECIPE
 from tests.support.replays import same
@@ -134,7 +134,7 @@ def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(
 ) -> None:
     highest = data.X.max(axis=1)
     window = f"0:1:-1e9:{np.quantile(highest, 0.8)}:reject"
-    with pytest.raises(DataError, match="because windows are in seconds; give rate_hz"):
+    with pytest.raises(SettingError, match="Expected the rate of the traces"):
         replay(data, RECIPE.with_policy(windows=[window]))
     data = replace(data, rate_hz=500.0)
     log, wide = (

@@ -21,6 +21,7 @@ from dengine import (
     Dataset,
     ModelPrediction,
     Policy,
+    Reason,
     Recipe,
     TraceSpec,
     WilsonRadiusClassifier,
@@ -137,6 +138,67 @@ def test_other_settings_than_the_stores_are_an_error_that_names_both(
         {"seed": 0},
     ):  # the rest is not asked for
         DataEngine.open_or_create(url, **given).close()
+
+
+FIRST = TraceSpec(100, channels=2)
+STATED = TraceSpec(100, 1000.0, 2, ("N", "mm"), columns=("force", "path"))
+
+
+@pytest.mark.parametrize("first", [FIRST, None], ids=["a contract", "the first trace"])
+def test_a_rate_is_stated_later_and_contradicted_never(
+    first: TraceSpec | None, make_data, tmp_path: Path
+) -> None:
+    url = tmp_path / "engine.db"
+    with DataEngine("pca", store=url, trace=first) as engine:
+        engine.decide(make_data(1, channels=2).X[0])
+        assert engine.trace == FIRST
+    for begin in (DataEngine.open_or_create, DataEngine.open):
+        with begin(url, trace=STATED) as engine:
+            assert engine.trace == STATED
+            engine.set_policy(Policy(windows=("0.02:0.1::1e9",)))
+    for asked in (None, FIRST, TraceSpec(100, channels=2, unit="N, ")):  # they ask for nothing
+        with DataEngine.open_or_create(url, trace=asked) as engine:
+            assert engine.trace == STATED
+    for begin in (DataEngine.open_or_create, DataEngine.open):
+        for other in ({"rate_hz": 500.0}, {"unit": "N"}, {"samples": 99}, {"columns": ("a", "b")}):
+            with pytest.raises(SettingError, match=r"the store's own settings \(trace TraceSpec"):
+                begin(url, trace=replace(STATED, **other))
+
+
+def test_a_store_keeps_the_rate_that_it_holds(make_data, tmp_path: Path) -> None:
+    url, data = tmp_path / "engine.db", make_data(1)
+    DataEngine("pca", store=url).close()
+    old = '{"samples": 100, "rate_hz": 500.0, "channels": 1, "unit": "N", "limit": null, "columns": []}'
+    with DataEngine.open(url) as engine:
+        engine.store.save_settings(engine.store.settings() | {"trace": old, "inferred": "true"})
+    with DataEngine.open_or_create(url, trace=TraceSpec(100)) as engine:
+        engine.decide(data.X[0])
+        assert engine.trace == TraceSpec(100, 500.0, unit="N")
+    with pytest.raises(SettingError, match=r"rate_hz=500\.0"):
+        DataEngine.open_or_create(url, trace=TraceSpec(100, 1000.0))
+
+
+def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stated(
+    make_data, tmp_path: Path
+) -> None:
+    url = tmp_path / "engine.db"
+    limited = Recipe("pca", policy=Policy(windows=("0.02:0.1::1e9",)))
+    DataEngine("pca", store=url).close()
+    with DataEngine.open(url) as engine:
+        engine.store.save_settings(engine.store.settings() | {"recipe": limited.to_toml()})
+    for begin in (DataEngine.open, DataEngine.open_or_create):
+        with pytest.raises(SettingError, match="Expected the rate of the traces"):
+            begin(url)
+    with DataEngine.open(url, trace=TraceSpec(100, 1000.0)) as engine:
+        assert engine.decide(make_data(1).X[0]).reason is Reason.NO_MODEL
+
+
+def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path: Path) -> None:
+    url, policy = tmp_path / "line.db", Policy(windows=("0.02:0.1::1e9",))
+    for cell, trace in (("a", STATED), ("b", None)):
+        DataEngine("pca", policy, store=address(url, cell, "nut"), trace=trace).close()
+    with DataEngine.open(address(url, "b", "nut")) as engine:
+        assert engine.trace == STATED
 
 
 def ours(**changes) -> ModelPrediction:

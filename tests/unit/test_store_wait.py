@@ -1,5 +1,7 @@
-"""How long a cell waits for its store: the argument, the environment, the default."""
+"""How long a cell waits for its store, and what a full disk raises."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -40,3 +42,40 @@ def test_an_engine_that_is_opened_hands_its_wait_to_the_store(tmp_path: Path) ->
         assert engine.store.wait == 3.0
     with DataEngine.open(tmp_path / "a.db", wait=4.0) as engine:
         assert engine.store.wait == 4.0
+
+
+FULL_DISK = """
+import resource, sys
+import numpy as np
+from dengine import DataEngine
+from dengine.errors import NotTakenError
+
+traces = np.random.default_rng(0).normal(size=(40, 30))
+with DataEngine("pca", retrain_every=1000, store=sys.argv[1]) as engine:
+    for trace in traces[:10]:
+        engine.report(engine.decide(trace).id, True)
+    engine.flush()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (300, resource.RLIM_INFINITY))  # no file may grow
+    for trace in traces[10:]:
+        decision = engine.decide(trace)
+        try:
+            engine.report(decision.id, True)
+        except NotTakenError:
+            print(decision.action, decision.reason)
+    print(engine.status().alarm)
+print("closed")
+"""
+
+
+def test_on_a_full_disk_only_report_raises(tmp_path: Path) -> None:
+    store = tmp_path / "engine.db"
+    done = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, store], capture_output=True, text=True, check=False
+    )
+    lines = done.stdout.splitlines()
+    assert (done.returncode, lines[-1]) == (0, "closed"), done.stderr
+    assert "verify no_store" in lines
+    assert lines[-2].startswith("The store cannot be written: Could not use the journal")
+    assert "closed without the newest records, which no report acknowledged" in done.stderr
+    with DataEngine.open(store) as engine:
+        assert (engine.status().labels, engine.status().alarm) == (10, "")

@@ -305,16 +305,23 @@ def test_a_reducer_that_starts_from_a_checkpoint_learns_something_else_than_from
     assert not np.array_equal(from_checkpoint.embed(X), from_scratch.embed(X))
 
 
+VARIANCE = "networks.network.convolutions.1.running_var"
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"no checkpoint", "of named tensors alone"),
+        (b"no checkpoint", "of named dense tensors alone"),
         (None, "cannot be read"),
-        (b"\x80\x02a.", "of named tensors alone"),  # a pickle whose stack is empty
+        (b"\x80\x02a.", "of named dense tensors alone"),  # a pickle whose stack is empty
         ("other", r"of this network for traces .* has shape and type \(.*\), not \("),
         ("float64", r"of this network for traces .*torch.float64\), not \(.*torch.float32\)"),
-        ("a whole training", "of named tensors alone"),
-        ("NaN", "finite weights"),
+        ("a whole training", "of named dense tensors alone"),
+        ({"bias": torch.full((1, 2), float("nan"))}, "finite weights .*others in bias"),
+        ({"bias": torch.full((1, 2), -1e30)}, "finite weights .*others in bias"),
+        ({VARIANCE: torch.full((8,), -1.0)}, f"variances of at least 0.*others in {VARIANCE}"),
+        ({"bias": torch.zeros(1, 2).to_sparse()}, "of named dense tensors alone"),
+        ({"bias": torch.zeros(1, 2, device="meta")}, "of named dense tensors alone"),
     ],
 )
 def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(
@@ -328,8 +335,8 @@ def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(
         torch.save({"epoch": 3, "model": state}, path)
     elif content == "float64":
         torch.save({name: value.double() for name, value in state.items()}, path)
-    elif content == "NaN":
-        torch.save(state | {"bias": torch.full((1, 2), float("nan"))}, path)
+    elif isinstance(content, dict):
+        torch.save(state | content, path)
     elif content is not None:
         path.write_bytes(content)
     with pytest.raises(SettingError, match=message):
@@ -520,3 +527,12 @@ def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps
             core_of(engine).process_retrains()
     assert left[:4] == [12, 4, 0, 0]
     assert set(left[3:]) == {0}
+
+
+def test_members_that_share_the_weights_of_one_module_are_refused_since_they_see_every_label() -> (
+    None
+):
+    X, y = toy_traces(60)
+    shared = SmallNetwork(2, 120)
+    with pytest.raises(SettingError, match="for each member, with weights of its own"):
+        own_reducer(lambda channels, samples: shared).fit(X, y)

@@ -1,7 +1,8 @@
 """Where a trace enters: shapes and types are the caller's, faults are the world's."""
 
 import json
-from dataclasses import asdict
+from contextlib import nullcontext
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,18 @@ from dengine import (
     Dataset,
     DengineError,
     Reason,
+    ReplayCell,
+    SimulatedCell,
     TraceError,
     TraceSpec,
     export_torchscript,
+    load_dataset,
     load_exported,
 )
 from dengine.decision.scripting import script
-from dengine.engine.engine import core_of
 from dengine.errors import SettingError
 from dengine.records import FITS, stored_trace_spec
-from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length, fit_length, spec_of
+from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length, spec_of
 from tests.support.driving import learn
 
 NO_TRACES = (np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5)))
@@ -53,6 +56,9 @@ def reason_of(x: np.ndarray, limit: float | None = None, compiled: bool = False)
         (("N", "N"), 2, "N", ("N", "N")),
         (("N",), 1, "N", ("N",)),
         ("mixed units", 3, "mixed units", ("mixed units",) * 3),
+        *((unknown, 2, None, ("", "")) for unknown in (None, "", " ", ("", ""), ", ")),
+        ("N, ", 2, ("N", ""), ("N", "")),
+        ("", 1, None, ("",)),
     ],
 )
 def test_each_channel_has_a_unit(
@@ -79,6 +85,31 @@ def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
     assert result.flags.c_contiguous
     np.testing.assert_array_equal(result[0], x.astype(np.float32))
     assert as_trace(x.reshape(50, 2), TraceSpec(2, channels=50)).shape == (50, 2)  # it is agreed on
+
+
+def test_what_nobody_stated_of_a_trace_is_unknown(make_data) -> None:
+    data = make_data(2)
+    with DataEngine("pca") as engine:
+        engine.decide(data.X[0])
+        assert (engine.trace.rate_hz, engine.trace.unit) == (None, None)
+        assert (engine.status().trace, engine.trace) == (TraceSpec(100), TraceSpec(100))
+    unstated = Dataset(data.X, data.y).spec
+    assert (unstated.rate_hz, unstated.unit) == (None, None)
+    for bundled in (load_dataset("insertion").spec, SimulatedCell.spec):
+        assert bundled == TraceSpec(1000, rate_hz=500.0, unit="N")
+
+
+def test_a_cell_that_knows_its_traces_states_what_the_engine_does_not_know(make_data) -> None:
+    data = replace(make_data(3), rate_hz=250.0, unit="kN")
+    for stated, trace in (
+        (None, TraceSpec(100, 250.0, unit="kN")),
+        (TraceSpec(100, unit="N"), TraceSpec(100, 250.0, unit="N")),
+        (TraceSpec(100, 500.0, fit="pad"), TraceSpec(100, 500.0, unit="kN", fit="pad")),
+        (TraceSpec(50, fit="resample"), TraceSpec(50, fit="resample")),  # another rate
+    ):
+        with DataEngine("pca", trace=stated) as engine:
+            assert len(list(engine.run(ReplayCell(data), 2))) == 2
+            assert engine.trace == trace
 
 
 AGREED = TraceSpec(samples=100, channels=6)
@@ -109,8 +140,13 @@ def test_a_contract_that_no_trace_can_keep_is_refused(message: str) -> None:
         ),
         (
             np.ones(998),
-            TraceSpec(1000),
+            TraceSpec(1000, rate_hz=500.0),
             r"^Expected 1000 samples, got 998; resample the trace to 500 Hz x 2 s, or .*fit='pad'\)\.$",
+        ),
+        (
+            np.ones(998),
+            TraceSpec(1000),
+            r"^Expected 1000 samples, got 998; resample the trace to 1000 samples, or .*fit='pad'\)\.$",
         ),
         (np.ones(100), AGREED, r"Expected 6 channel\(s\), got 1; pass \(channels, samples\)"),
         *(
@@ -201,19 +237,17 @@ def test_resample_is_linear_interpolation_over_the_whole(
     seed=st.integers(0, 99),
 )
 @settings(max_examples=150, deadline=None)
-def test_what_cannot_honestly_be_fitted_is_not_finite_and_nothing_else_is(
+def test_what_cannot_honestly_be_fitted_is_refused_and_nothing_else_is(
     have, samples: int, fit: int, seed: int
 ) -> None:
-    x = torch.from_numpy(np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32))
-    result = fit_length(x, samples, fit)
-    assert result.shape == (2, samples)
-    assert bool(result.isfinite().all()) == can_fit_length(have, samples, fit)
+    x = np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32)
+    spec = TraceSpec(samples, channels=2, fit=FITS[fit])
     honest = have >= samples if fit == 1 else samples <= 2 * have <= 4 * samples
     assert can_fit_length(have, samples, fit) == honest
-    if not honest:  # it keeps what there is
-        kept = min(have, samples - 1)
-        assert torch.equal(result[:, :kept], x[:, :kept])
-        assert result[:, kept:].isnan().all()
+    with nullcontext() if honest else pytest.raises(TraceError, match=f"samples, got {have}; "):
+        fitted = as_trace(x, spec)
+        assert fitted.shape == (2, samples)
+        assert np.isfinite(fitted).all()
 
 
 def other_lengths(data: Dataset) -> list[np.ndarray]:
@@ -239,6 +273,13 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(
     decided = []
     assert exported.trace == engine.trace
     for x in other_lengths(make_data(130, samples=SAMPLES, seed=7)):
+        if not can_fit_length(len(x), SAMPLES, FITS.index(fit)):
+            for decide in (engine.decide, exported.decide):
+                with pytest.raises(TraceError, match=f"got {len(x)}"):
+                    decide(x)
+            with pytest.raises(torch.jit.Error, match="Expected one trace of 1 x 100 samples"):
+                exported.module.decide(torch.from_numpy(x))
+            continue
         ours = engine.decide(x)
         theirs = exported.decide(x)
         raw = exported.module.decide(
@@ -259,19 +300,8 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(
             np.testing.assert_array_equal(raw[6].numpy(), theirs.embedding)
         decided.append((x, ours))
     for x, decision in decided:
-        lost = not can_fit_length(len(x), SAMPLES, FITS.index(fit)) or np.isnan(x[:SAMPLES]).any()
-        assert (decision.reason is Reason.NOT_FINITE) == lost
+        assert (decision.reason is Reason.NOT_FINITE) == np.isnan(x[:SAMPLES]).any()
     assert {decision.action for _, decision in decided} >= {Action.VERIFY, Action.ACCEPT}
-    lost = engine.decide(np.linspace(0, 9, 30))
-    labels = core_of(engine).new_labels
-    engine.report(lost.id, True)
-    kept = engine.store.get_decision(lost.id)  # and never learned from
-    assert (lost.reason, kept.quarantined, core_of(engine).new_labels) == (
-        Reason.NOT_FINITE,
-        True,
-        labels,
-    )
-    np.testing.assert_array_equal(kept.trace[0, :30], np.linspace(0, 9, 30, dtype=np.float32))
 
 
 def recording(samples: int = 60) -> pd.DataFrame:

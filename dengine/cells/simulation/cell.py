@@ -16,8 +16,15 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ...errors import DengineError, expect
-from ...records import Outcome
-from .conditions import RATE_HZ, CellParameters, Conditions, draw_conditions, find_scenario
+from ...records import Outcome, TraceSpec
+from .conditions import (
+    RATE_HZ,
+    SAMPLES,
+    CellParameters,
+    Conditions,
+    draw_conditions,
+    find_scenario,
+)
 from .world import DEPTH_MM, TIME_STEP_S, Push, push
 
 CAUSES = ("none", "missed_grasp", "rim_contact", "wedging", "stuck", "slip", "debris", "wrong_part")
@@ -206,11 +213,15 @@ class SimulatedCell:
 
     Attributes
     ----------
+    spec : TraceSpec
+        Of the traces: 1000 samples at 500 Hz, in newtons.
     clock : float
         Seconds of production so far.
     last : SimulatedInsertion or None
         The newest insertion with its label, for reports; an engine does not read it.
     """
+
+    spec = TraceSpec(SAMPLES, RATE_HZ, unit="N")
 
     def __init__(
         self,

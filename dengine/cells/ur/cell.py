@@ -104,6 +104,8 @@ class UrCell(AbstractContextManager["UrCell"]):
 
     Attributes
     ----------
+    spec : TraceSpec
+        Of the traces, with the rate that the recorder requests.
     last : InsertionRecord or None
         The newest insertion, which says what is missing in its trace.
     incomplete : int
@@ -128,6 +130,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.recorder = RtdeRecorder(
             host, trigger, also=(ANSWER, ORDER, RUNTIME), inputs=(ORDER,), **how
         )
+        self.spec = self.recorder.spec
         self.order_timeout = order_timeout
         self.start_timeout = start_timeout
         self.last: InsertionRecord | None = None

@@ -45,6 +45,18 @@ class InsertionRecord:
     reconnects: int
 
 
+def spec_of_recording(
+    samples: int = 1000, channels: Sequence[str] = ("FZ_Base",), rate_hz: float = 500.0
+) -> TraceSpec:
+    """Return the contract of the traces that an `RtdeRecorder` with these settings records.
+
+    The unit of a force is N, any other unit is unknown.
+    """
+    forces = {f"actual_TCP_force[{i}]" for i in range(3)}
+    unit = tuple("N" if CHANNELS.get(name, name) in forces else "" for name in channels)
+    return TraceSpec(samples, rate_hz, len(channels), unit, columns=tuple(channels))
+
+
 class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     """Records insertions over RTDE; by itself it only reads.
 
@@ -99,14 +111,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self.channels = (channels,) if isinstance(channels, str) else tuple(channels)
         self._columns = [CHANNELS.get(name, name) for name in self.channels]
         self._signals = {name: CHANNELS.get(name, name) for name in self.trigger.signals}
-        forces = {f"actual_TCP_force[{i}]" for i in range(3)}.issuperset(self._columns)
-        self.spec = TraceSpec(
-            samples,
-            rate_hz,
-            len(self.channels),
-            "N" if forces else "mixed units",
-            columns=self.channels,
-        )
+        self.spec = spec_of_recording(samples, self.channels, rate_hz)
         self._before = before
         self.stream = RtdeStream(
             host, (*self._columns, *self._signals.values(), *also), inputs, rate_hz, port, timeout

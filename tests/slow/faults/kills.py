@@ -231,7 +231,7 @@ def flip_journal(place: Place, seed: int) -> str:
     journal.write_bytes(written)
     if len(written) > HEADER:
         flipped(journal, np.random.default_rng(seed))
-    return "not as they were written"
+    return "the journal"
 
 
 def check_cell(outcome: Outcome, place: Place, told: list[list[str]], excuse: str = "") -> None:
@@ -246,6 +246,8 @@ def check_cell(outcome: Outcome, place: Place, told: list[list[str]], excuse: st
         outcome.labels += len(labels)
         outcome.versions += sum(engine.version - int(version) for _, version in began)
         text = bool(excuse) and any(excuse in event.text for event in engine.store.events())
+        loss = engine.status().loss
+        outcome.must(bool(excuse) or not loss, f"an alarm though nothing was damaged: {loss}")
         lost, n_stored = missing(engine.store, labels), engine.store.status()["labels"]
         probe = engine.decide(stream().X[-1])
         outcome.lost += 0 if text and lost == 1 else lost

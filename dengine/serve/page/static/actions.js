@@ -121,9 +121,11 @@ export const policy = (now) => ({
 
 export const rollback = (versions) => ({
   title: "Roll back", path: "rollback",
-  explanation: "An earlier model decides again, as a new version. Labels and corrections since then are kept.",
+  explanation: "An earlier model decides again, as a new version, until it is released or somebody retrains. Labels and corrections since then are kept.",
   fields: [{ name: "version", label: "Version", options: versions }],
 });
+
+export const release = { title: "Release the version", explanation: "The next retrain may replace the model that was rolled back to.", path: "release" };
 
 export const retrain = { title: "Retrain now", explanation: "The model is trained on all labels so far.", path: "retrain" };
 export const exported = { title: "Export", explanation: "The model that decides now, as a TorchScript file for a controller, with its checksum.", path: "export" };

@@ -45,15 +45,19 @@ function axis(side, given = {}) {
   return { side, stroke: ink, font: "14px system-ui, sans-serif", labelFont: "14px system-ui, sans-serif", grid, ticks: grid, ...given };
 }
 
-// Traces, and over them the operator's force limits, in the stretches of time where they hold
+// Traces, and over them the operator's force limits, in the stretches of time where they hold. Times are in samples if the rate is unknown.
+
+const timeOf = ({ rate_hz }, sample) => sample / (rate_hz ?? 1);
+
+const timeText = ({ rate_hz }, time, digits) => (rate_hz === null ? `${number(time)} samples` : `${number(time, digits)} s`);
 
 // Return the force limits of a channel, with the times between which they hold.
 function limitsOf(explanation, channel) {
-  const { rate_hz, columns } = explanation.spec;
+  const { spec, spec: { columns } } = explanation;
   const at = (named) => (typeof named === "string" ? columns.indexOf(named) : named);
   return explanation.windows.filter((each) => at(each.channel) === channel).map((each) => {
     if (each.along === null) return { ...each, from: each.start, to: each.end };
-    const there = explanation.trace[at(each.along)].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [i / rate_hz] : []));
+    const there = explanation.trace[at(each.along)].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [timeOf(spec, i)] : []));
     return { ...each, from: there[0], to: there.at(-1) };
   }).filter((each) => each.from !== undefined);
 }
@@ -80,12 +84,12 @@ function drawLimits({ ctx, bbox, valToPos }, windows) {
   ctx.restore();
 }
 
-function limitsText({ from, to, low, high, reject }) {
+function limitsText(spec, { from, to, low, high, reject }) {
   const limits = [low !== null && `at least ${number(low, 1)}`, high !== null && `at most ${number(high, 1)}`].filter(Boolean).join(" and ");
-  return `From ${number(from, 2)} to ${number(to, 2)} s the operator's limits are ${limits}, else ${reject ? "reject" : "verify"}. `;
+  return `From ${timeText(spec, from, 2)} to ${timeText(spec, to, 2)} the operator's limits are ${limits}, else ${reject ? "reject" : "verify"}. `;
 }
 
-const unitOf = ({ unit }, channel) => (typeof unit === "string" ? unit : unit[channel]);
+const unitOf = ({ unit }, channel) => (Array.isArray(unit) ? unit[channel] : unit ?? "");
 
 export const isForce = ({ channels, unit }) => channels === 1 && /^[µmckM]?N$/.test(unit);
 
@@ -107,11 +111,11 @@ function traceChart(explanation, channel, height) {
   const caption = traceCaption(explanation, channel);
   const line = (name, width, dash) => ({ stroke: colour(name), width, dash, points: { show: false } });
   const makePlot = () => ({
-    data: [trace.map((_, i) => i / explanation.spec.rate_hz), ...(band ?? []), ...bads, trace],
+    data: [trace.map((_, i) => timeOf(explanation.spec, i)), ...(band ?? []), ...bads, trace],
     options: {
       scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...limits), Math.max(high, ...limits), 0.1, true) } },
       hooks: { draw: [(plot) => drawLimits(plot, windows)] },
-      axes: [axis(2, { label: "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56 })],
+      axes: [axis(2, { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56 })],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
       series: [
         {},
@@ -130,13 +134,16 @@ function traceCaption(explanation, channel) {
   const [low, high] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
   const several = explanation.trace.length > 1;
   const what = isForce(spec) ? "Force" : spec.columns[channel] ?? (several ? `Channel ${channel + 1}` : "Trace");
-  const caption = `${what} over ${number(explanation.trace[channel].length / spec.rate_hz, 1)} s, from ${number(low, 1)} to ${number(high, 1)} ${unitOf(spec, channel)}. ${limitsOf(explanation, channel).map(limitsText).join("")}`;
+  const duration = timeText(spec, timeOf(spec, explanation.trace[channel].length), 1);
+  const range = `${number(low, 1)} to ${number(high, 1)} ${unitOf(spec, channel)}`.trim();
+  const limits = limitsOf(explanation, channel).map((each) => limitsText(spec, each)).join("");
+  const caption = `${what} over ${duration}, from ${range}. ${limits}`;
   if (!envelope) return `${caption}The band of good parts is drawn from 20 good parts on.`;
   const outside = `${caption}${percent(envelope.outside, 1)} of ${several ? "all channels" : "it"} lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
   const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];
   if (!most) return outside;
-  const [from, to] = [number(most.from_s, 2), number(most.to_s, 2)];
-  return `${outside} It leaves the band farthest ${most.above ? "upwards" : "downwards"} ${from === to ? "at" : `between ${from} s and`} ${to} s.`;
+  const [from, to] = [most.first, most.last].map((sample) => timeText(spec, timeOf(spec, sample), 2));
+  return `${outside} It leaves the band farthest ${most.above ? "upwards" : "downwards"} ${from === to ? "at" : `between ${from} and`} ${to}.`;
 }
 
 export function traceLegend(explanation) {

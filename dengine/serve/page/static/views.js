@@ -34,7 +34,8 @@ export function warnings(status) {
   if (status.store_fault) texts.push(`The store cannot be written: ${status.store_fault}`);
   if (status.safe_mode) texts.push(`Safe mode: every part is verified until fresh evidence keeps the tolerance (${status.safe_mode})`);
   if (status.shadow) texts.push("Shadow mode: every part is verified, and the model only predicts");
-  if (status.alarm && !status.store_fault && !status.safe_mode) texts.unshift(status.alarm); // else the alarm has the same text
+  if (status.pinned) texts.push(`Version ${status.pinned} was rolled back to, and no automatic retrain replaces it until it is released`);
+  if (status.alarm && (status.loss || !status.safe_mode) && !status.store_fault) texts.unshift(status.alarm); // else the alarm has the same text
   return texts.map((text) => el("p", { class: "banner" }, icon("shield"), el("span", {}, text)));
 }
 
@@ -318,6 +319,7 @@ async function actions(get, _, status) {
   const blocks = el("div", { class: "acts", id: "actions", "data-part": true },
     block("shadow", act.shadow(!status.shadow)), block("report", act.reportPart),
     block("rollback", act.rollback(choices), !back.length, "There is no earlier version."),
+    status.pinned > 0 && block("release", act.release),
     block("policy", act.policy(status.recipe.policy)), block("retrain", act.retrain),
     block("export", act.exported, status.version === 0, "There is no model yet."));
   return { title: "Actions", elements: [el("h1", {}, "Actions"), small("Each asks for confirmation and your name, which goes into the event log. Labels are corrected on the page of the part."), blocks] };

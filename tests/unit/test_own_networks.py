@@ -1,0 +1,317 @@
+"""Networks of users: a version answers as it was trained, can be opened again, or is dropped. What
+can never be learned from, such as a tiny window or tiny traces, is told in a sentence.
+"""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sklearn.decomposition import PCA
+from torch import nn
+
+from dengine import DataEngine, ModelPrediction, Recipe, TorchReducer, export_torchscript
+from dengine.errors import ExportError, SettingError
+from dengine.reducers import Reducer
+from dengine.testing import check_reducer, toy_traces
+
+COUNTER = itertools.count()
+
+
+class Network(nn.Module):
+    """Eight features, which a subclass turns into others."""
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv1d(channels, 8, 7, stride=4, padding=3),
+            nn.BatchNorm1d(8),
+            nn.ReLU(),
+            nn.AdaptiveMaxPool1d(1),
+            nn.Flatten(),
+        )
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(x)
+        return features
+
+
+class TiedWeights(Network):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.first, self.second = nn.Linear(8, 8), nn.Linear(8, 8)
+        self.second.weight = self.first.weight
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.second(self.first(self.layers(x)).relu())
+        return features
+
+
+class TwoNames(TiedWeights):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.second = self.first
+
+
+class Recurrent(nn.Module):
+    """torch keeps the weights of a GRU a second time, in a list."""
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__()
+        self.layer = nn.GRU(channels, 8, batch_first=True)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.layer(x.transpose(1, 2)[:, ::8])[0][:, -1]
+
+
+class UnsavedBuffer(Network):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.register_buffer("gain", torch.randn(8), persistent=False)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.layers(x) * self.gain
+
+
+class PlainTensor(UnsavedBuffer):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        del self.gain
+        self.gain = torch.randn(8)
+
+
+class ChangedInTraining(PlainTensor):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if self.training:
+            self.gain.mul_(0.99)
+        return self.layers(x) * self.gain
+
+
+class NestedTensors(Network):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.gains = {"first": [torch.randn(8)], "second": [torch.randn(8)]}
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(x) * self.gains["first"][0]
+        return features * self.gains["second"][0]
+
+
+class OwnNumber(Network):
+    """A number and a function of torch that differ from one instance to the next."""
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self._gain = float(torch.randn(()))
+        self.activation = torch.tanh if torch.rand(()) > 0.5 else torch.sigmoid
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.activation(self.layers(x)) * self._gain
+        return features
+
+
+class WeightNorm(Network):
+    """TorchScript compiles it, and cannot run it."""
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.head = nn.utils.parametrizations.weight_norm(nn.Linear(8, 8))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.head(self.layers(x))
+        return features
+
+
+class RandomAnswer(Network):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return nn.functional.dropout(self.layers(x), 0.3, True)
+
+
+class CountsItsCalls(Network):
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.register_buffer("calls", torch.zeros(1))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        self.calls += 1
+        return self.layers(x) + 0.01 * self.calls
+
+
+class NoPointForARamp(Network):
+    """NaN for a linear trace, which no cell records."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        is_linear = (x[:, :, 1:] - x[:, :, :-1]).std(2).amax(1) < 1e-4
+        return torch.where(is_linear[:, None], torch.nan, self.layers(x))
+
+
+class NumberOfElsewhere(Network):
+    """Another number at each start of a program."""
+
+    def __init__(self, channels: int, samples: int) -> None:
+        super().__init__(channels, samples)
+        self.gain = 1.0 + next(COUNTER)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(x) * self.gain
+        return features
+
+
+class OtherwiseCompiled(Network):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        features: torch.Tensor = self.layers(x)
+        return -features if torch.jit.is_scripting() else features
+
+
+class FailingModule(nn.Module):
+    dim = 2
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if torch.jit.is_scripting():
+            raise RuntimeError("not in a script")
+        return x[:, :, :2]
+
+
+class FailsCompiled(Reducer):
+    """A reducer whose module compiles, and raises when it is asked."""
+
+    def __init__(self, n_components: int = 2) -> None:
+        self.n_components = n_components
+
+    def fit(self, X: Any, y: Any = None) -> "FailsCompiled":
+        self.check_traces(X, reset=True)
+        return self
+
+    def transform(self, X: Any) -> np.ndarray:
+        return self.check_traces(X)[:, 0, :2]
+
+    def module(self) -> nn.Module:
+        return FailingModule()
+
+
+def reducer_of(network: Any, random_state: Any = 0) -> TorchReducer:
+    return TorchReducer(network=network, folds=2, steps=4, fit_steps=30, random_state=random_state)
+
+
+def taught(reducer: Any, store: Path | None = None, n: int = 60) -> DataEngine:
+    engine = DataEngine(reducer=reducer, store=store, replaying=True, retrain_every=20)
+    for x, good in zip(*toy_traces(n), strict=True):
+        engine.report(engine.decide(x).id, bool(good))
+    return engine
+
+
+ANSWERING = (
+    TiedWeights,
+    TwoNames,
+    Recurrent,
+    UnsavedBuffer,
+    PlainTensor,
+    ChangedInTraining,
+    NestedTensors,
+    OwnNumber,
+    WeightNorm,
+)
+
+
+@pytest.mark.parametrize("network", ANSWERING)
+def test_every_engine_of_a_process_decides_by_the_weights_that_it_trained(network: Any) -> None:
+    X = toy_traces(20, seed=3)[0]
+    for seed in (0, 1):
+        engine = taught(reducer_of(network, seed))
+        assert engine.version > 0
+        actual = [engine.decide(x).embedding for x in X]
+        np.testing.assert_allclose(actual, engine.model.spaces.embed(X), atol=1e-6)
+
+
+@pytest.mark.parametrize("network", ANSWERING)
+def test_a_store_opens_again_with_the_same_points_whatever_tensors_a_network_keeps(
+    network: Any, tmp_path: Path
+) -> None:
+    X = toy_traces(20, seed=3)[0]
+    with taught(reducer_of(network, None), tmp_path / "cell.db") as engine:
+        version = engine.version
+        expected = [engine.decide(x).embedding for x in X]
+    with DataEngine.open(tmp_path / "cell.db", reducer=reducer_of(network, None)) as engine:
+        assert engine.version == version > 0
+        np.testing.assert_allclose([engine.decide(x).embedding for x in X], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("network", "reason"),
+    [
+        (RandomAnswer, "restored, as when its store is opened"),
+        (CountsItsCalls, "restored, as when its store is opened"),
+        (NoPointForARamp, "restored, as when its store is opened"),
+        (NumberOfElsewhere, "restored, as when its store is opened"),
+        (OtherwiseCompiled, "decided on alone lies elsewhere than the reducer embeds it"),
+    ],
+)
+def test_a_version_that_could_not_be_opened_or_answers_otherwise_is_dropped_and_the_cell_goes_on(
+    network: Any, reason: str, tmp_path: Path
+) -> None:
+    with taught(reducer_of(network), tmp_path / "cell.db") as engine:
+        assert engine.version == 0
+        assert all(reason in report.reason for report in engine.store.retrains())
+        assert reason in engine.status().alarm
+    with DataEngine.open(tmp_path / "cell.db", reducer=reducer_of(network)) as engine:
+        assert engine.decide(toy_traces(1)[0][0]).action == "verify"
+
+
+def test_a_model_that_answers_otherwise_than_it_was_trained_is_neither_exported_nor_in_the_contract(
+    tmp_path: Path,
+) -> None:
+    X, y = toy_traces(60)
+    model = ModelPrediction(reducer_of(OtherwiseCompiled)).fit(X, y)
+    with pytest.raises(ExportError, match="lies elsewhere than the reducer embeds it"):
+        export_torchscript(model, tmp_path / "model.ts")
+    with pytest.raises(AssertionError, match="its_module_compiles_and_embeds_as_it_does"):
+        check_reducer(reducer_of(OtherwiseCompiled))
+
+
+@pytest.mark.parametrize("network", [RandomAnswer, CountsItsCalls, NoPointForARamp])
+def test_the_contract_of_a_reducer_has_what_an_engine_requires_of_a_version(network: Any) -> None:
+    with pytest.raises(AssertionError, match=r"breaks '(a_version_answers|it_embeds)"):
+        check_reducer(reducer_of(network))
+
+
+def test_a_network_that_compiles_and_does_not_run_answers_in_python_and_keeps_the_contract(
+    tmp_path: Path,
+) -> None:
+    X, y = toy_traces(60)
+    check_reducer(reducer_of(WeightNorm))
+    with pytest.raises(ExportError, match="has no module"):
+        export_torchscript(ModelPrediction(reducer_of(WeightNorm)).fit(X, y), tmp_path / "m.ts")
+
+
+def test_a_module_that_compiles_and_does_not_run_is_told_everywhere_in_a_sentence(
+    tmp_path: Path,
+) -> None:
+    X, y = toy_traces(60)
+    assert "not in a script" in taught(FailsCompiled()).status().alarm
+    with pytest.raises(ExportError, match=r"cannot be exported.*not in a script"):
+        export_torchscript(ModelPrediction(FailsCompiled()).fit(X, y), tmp_path / "model.ts")
+    with pytest.raises(AssertionError, match=r"cannot run it.*not in a script"):
+        check_reducer(FailsCompiled())
+
+
+@pytest.mark.parametrize("reducer", ["conv", "rocket"])
+def test_a_window_that_never_holds_enough_for_a_first_training_is_refused(reducer: str) -> None:
+    with pytest.raises(SettingError, match=r"a window of at least 20 labelled traces.*got 19"):
+        DataEngine(recipe=Recipe(reducer, window=19))
+
+
+@pytest.mark.parametrize("amplitude", [-1e-8, 1e-12, 1e-45])
+@pytest.mark.parametrize("reducer", ["conv", "rocket", "umap", "pca", PCA(2)])
+def test_traces_too_small_for_their_unit_raise_an_alarm_that_says_so(
+    reducer: Any, amplitude: float
+) -> None:
+    X, y = toy_traces(60)
+    tiny = np.abs(X) * amplitude if amplitude < 0.0 else X * amplitude
+    engine = DataEngine(reducer=reducer, replaying=True, retrain_every=20)
+    for x, good in zip(tiny.astype(np.float32), y, strict=True):
+        engine.report(engine.decide(x).id, bool(good))
+    assert engine.version == 0
+    assert "the sensor" in engine.status().alarm
+    assert "unit" in engine.status().alarm
