@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import UNKNOWN, Description, LabelSource
+from ..description import UNKNOWN, Clock, Description, LabelSource
 from ..read.bags import LOG_TIME, STAMP, read_messages
+from ..read.clock import column_times
 from ..read.places import listing_table
 from . import labels
 from .clock import round_rate
@@ -61,6 +62,9 @@ def describe_bag(paths: Sequence[Path], stated: Mapping[str, Any]) -> Descriptio
     values["traces.samples"] = round(SECONDS * rate)
     notes["traces.samples"] = f"{SECONDS:g} s from where a part begins"
     values |= _windows(paths[0].parent, words, stated, notes)
+    if "seconds" in values:
+        values["traces.samples"] = round(values.pop("seconds") * rate)
+        del notes["traces.samples"]
     ignored = {name: unit for name, unit in units.items() if name not in channels}
     start = Description.from_dict({"channels": channels, "ignored": ignored})
     own = {key: value for key, value in stated.items() if key not in ("files",)}
@@ -90,13 +94,13 @@ def _windows(
         if values and not any(key.startswith("windows.trigger") for key in stated):
             notes["windows.listing"] = "its columns say when each part began and ended"
             return values
-    verdicts = {}
+    verdicts = dict[str, LabelSource]()
     for topic, cells in words.items():
         source = labels.with_meanings(LabelSource(topic=topic, column=topic), cells)
         is_known = (source.good or source.bad) and UNKNOWN not in source.good + source.bad
         verdicts |= {topic: source} if is_known and len({*cells}) < labels.MOST_WORDS else {}
     signals = [t for t, cells in words.items() if t not in verdicts and len({*cells}) == 2]
-    values: dict[str, Any] = {}
+    values = {}
     for key, found in (("label.topic", [*verdicts]), ("windows.trigger", signals)):
         counts = "; ".join(
             f"{topic} ({labels.counts_of(words[topic])})" for topic in found or words
@@ -132,9 +136,20 @@ def _listing(path: Path) -> dict[str, Any]:
     is_number = all(cell.replace(".", "", 1).isdigit() for cell in table.words(start))
     windows = {"listing": path.name, "key": keys[0], "start": start, "end": end}
     windows["format"] = "s" if is_number else "iso"
-    label = {"listing": path.name, "key": keys[0], "column": source.column}
+    label: dict[str, Any] = {"listing": path.name, "key": keys[0], "column": source.column}
     label |= {"good": source.good, "bad": source.bad}
     pairs = [(f"windows.{k}", v) for k, v in windows.items()] + [
         (f"label.{k}", v) for k, v in label.items()
     ]
-    return {**dict(pairs), "traces.lengths": "pad"}
+    clock = Clock(column=(start, end), format=(windows["format"],) * 2)
+    times = [
+        first + relative
+        for relative, first in (
+            column_times(table, name, windows["format"], clock, form) for name in (start, end)
+        )
+    ]
+    return {
+        **dict(pairs),
+        "traces.lengths": "pad",
+        "seconds": float(np.median(times[1] - times[0])),
+    }

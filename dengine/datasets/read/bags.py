@@ -48,7 +48,7 @@ def read_messages(
         from mcap.reader import NonSeekingReader, make_reader
         from mcap_ros2.decoder import DecoderFactory
         from zstandard import ZstdError
-    damages = (*UNREADABLE, McapError, ZstdError, struct.error)
+    damages: tuple[type[Exception], ...] = (*UNREADABLE, McapError, ZstdError, struct.error)
     statistics = None
     with suppress(*damages), path.open("rb") as file:
         summary = make_reader(file).get_summary()
@@ -124,15 +124,17 @@ def read_bag(
             why = (*notes, *faults)[0]
             raise DataError(f"Expected whole files before {name}, since a trigger cuts: {why}")
         try:
-            for found, _, logged, message in read_messages(path, {topic, *others}, notes):
-                if found in others:
-                    events[found].append((logged, value_of(message, "data")))
-                if found == topic:
-                    stamp = getattr(getattr(message, "header", None), "stamp", None)
-                    time = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-                    rows.append((logged, time, [value_of(message, field) for field in fields]))
+            messages = list(read_messages(path, {topic, *others}, notes))
         except UnreadableError as error:
-            faults.append(Fault(name, 0, str(error), error.column))
+            faults.append(Fault(name, 0, str(error)))
+            continue
+        for found, _, logged, message in messages:
+            if found in others:
+                events[found].append((logged, value_of(message, "data")))
+            if found == topic:
+                stamp = getattr(getattr(message, "header", None), "stamp", None)
+                time = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
+                rows.append((logged, time, [value_of(message, field) for field in fields]))
     if not rows:
         why = f" {faults[0]}." if faults else ""
         raise DataError(f"Expected messages of {topic}, found none.{why}")

@@ -11,6 +11,7 @@ from ...errors import DataError
 from ..dataset import Fault
 from ..description import ANY, Description
 from ..table import Table, as_word
+from ..triggers import as_trigger
 from . import frames
 from .files import natural_key
 from .text import read_text
@@ -48,6 +49,8 @@ def column_kinds(description: Description) -> tuple[Any, Any]:
     words |= {description.order} - {"name", "time"}
     patterns = [pattern_of(channel.column) for channel in description.channels]
     numbers = {*clock} - dated
+    if description.windows.trigger:
+        numbers |= {*as_trigger(description.windows.trigger).signals}
     is_number = lambda name: name in numbers or any(p.fullmatch(name) for p in patterns)  # noqa: E731
     return is_number, words.__contains__
 
