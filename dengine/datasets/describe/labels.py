@@ -7,20 +7,23 @@ the end of a name, a folder, a cell of a column, or a line, whose name is a verd
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 from ...errors import DataError, listed
 from ..description import UNKNOWN, LabelSource, TextForm
 from ..read.places import SUFFIX, Place, listing_table, read_labels
-from ..table import Table
+from ..table import UnreadableError
+from .cells import Column, Notes, columns_of
 
 GOOD = ("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "io", "accepted", "合格")
 BAD = (
-    *("nok", "not ok", "fail", "failed", "bad", "failure", "schlecht", "false", "n.i.o.", "nio"),
-    *("ng", "reject", "rejected", "不合格"),
+    *("nok", "not ok", "not_ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
+    *("n.i.o.", "nio", "ng", "reject", "rejected", "不合格"),
 )
-UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a", "?")
+UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
 YES, NO = ("1", "true", "yes", "ja"), ("0", "false", "no", "nein")
 NAME = re.compile(
     r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
@@ -32,8 +35,11 @@ BAD_NAME = re.compile(
 GOOD_NAME = re.compile(
     r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
 )
+KINDS = ("listing", "column", "path", "line")
 MOST_WORDS = 12
 Names = Iterable[str]
+Sources = list[LabelSource]
+Places = Mapping[str, Place]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,22 +59,21 @@ class Candidate:
     @property
     def title(self) -> str:
         """What to type for it, with the counts of its words."""
-        source = self.source
         keys = ("listing", "key", "column", "path", "line")
-        stated = [f"label.{key}={getattr(source, key)}" for key in keys if getattr(source, key)]
+        stated = [f"label.{key}={value}" for key in keys if (value := getattr(self.source, key))]
         return f"{' '.join(stated)} ({counts_of(self.words.values())})"
+
+    @property
+    def labels(self) -> dict[str, bool]:
+        """Whether each recording that was checked is good."""
+        source = self.source
+        checked = {name: w for name, w in self.words.items() if w not in source.unchecked}
+        return {name: word in source.good for name, word in checked.items()}
 
     def disagreements(self, other: "Candidate") -> int:
         """Return for how many recordings another candidate has another label."""
-        good = [
-            {name: word in one.source.good for name, word in one.words.items()}
-            for one in (self, other)
-        ]
-        open_ = [
-            {n for n, w in one.words.items() if w in one.source.unchecked} for one in (self, other)
-        ]
-        both = good[0].keys() & good[1].keys() - open_[0] - open_[1]
-        return sum(good[0][name] != good[1][name] for name in both)
+        labels, others = self.labels, other.labels
+        return sum(labels[name] != others[name] for name in labels.keys() & others.keys())
 
 
 def counts_of(words: Names) -> str:
@@ -85,47 +90,63 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     words = sorted({*words})
     lower = {word.lower() for word in words}
     name = source.column or source.line
-    verdicts = {*GOOD} - ({"io"} if "nio" not in lower else set())
-    good, bad = verdicts, {*BAD}
+    good, bad = {*GOOD} - ({"io"} if "nio" not in lower else set()), {*BAD}
     if lower <= {*YES, *NO, *UNCHECKED} and name:
         is_good = GOOD_NAME.search(name) or (lower & {"true", "false"} and NAME.search(name))
         good, bad = ({*YES}, {*NO}) if is_good else (set(), set())
         if BAD_NAME.search(name):
             good, bad = {*NO}, {*YES}
-    meanings = {
-        "good": [word for word in words if word.lower() in good],
-        "bad": [word for word in words if word.lower() in bad],
-        "unchecked": [word for word in words if word.lower() in UNCHECKED],
-    }
-    if {*words} - {*meanings["good"], *meanings["bad"], *meanings["unchecked"]}:
+    kinds = {"good": good, "bad": bad, "unchecked": {*UNCHECKED}}
+    meanings = {key: [w for w in words if w.lower() in some] for key, some in kinds.items()}
+    if {*words} - {word for some in meanings.values() for word in some}:
         meanings |= {key: meanings[key] or [UNKNOWN] for key in ("good", "bad")}
     return replace(
         source, **{key: getattr(source, key) or tuple(some) for key, some in meanings.items()}
     )
 
 
-def candidate(
-    base: Path,
-    source: LabelSource,
-    places: Mapping[str, Place],
-    parts: Mapping[str, str],
-    form: TextForm,
-) -> Candidate:
-    """Return a source with the word of each recording that has one, and what the words mean."""
-    words = dict[str, str]()
-    try:
-        reader = read_labels(base, source, form)
-    except DataError:
-        reader = None
-    for name, place in places.items() if reader else ():
-        try:
-            words[name] = reader.words(place, parts.get(name, ""))[0]  # type: ignore[union-attr]
-        except DataError:
-            continue
-    return Candidate(with_meanings(source, words.values()), words)
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """Finds the sources of labels of some recordings.
+
+    base : folder with the listings. places, parts : where each recording stands, and its part.
+    """
+
+    base: Path
+    places: Places
+    parts: Mapping[str, str]
+    form: TextForm
+
+    def candidate(self, source: LabelSource) -> Candidate:
+        """Return a source with the word of each recording that has one, and their meanings."""
+        words = dict[str, str]()
+        with suppress(DataError):
+            reader = read_labels(self.base, source, self.form)
+            for name, place in self.places.items():
+                with suppress(UnreadableError):
+                    words[name] = reader.words(place, self.parts.get(name, ""))[0]
+        return Candidate(with_meanings(source, words.values()), words)
+
+    def in_listings(self, names: Names) -> Sources:
+        """Return the columns of verdicts in files that list most recordings, with their key."""
+        sources: Sources = []
+        for name in names:
+            try:
+                table = listing_table(self.base / name, (), self.form)
+            except (DataError, ValueError):
+                continue
+            for key in table.columns:
+                plain = LabelSource(listing=name, key=key, column=key)
+                if len(self.candidate(plain).words) > len(self.places) / 2:
+                    rows = [table.take(slice(i, i + 1)) for i in range(len(table.lines))]
+                    others = [c for c in columns_of(rows, self.form).values() if c.name != key]
+                    found = in_columns(others)
+                    sources += [replace(plain, column=source.column) for source in found]
+                    break
+        return sources
 
 
-def path_sources(paths: Names) -> list[LabelSource]:
+def in_paths(paths: Names) -> Sources:
     """Return the expressions for verdicts in folders, and at the end or beginning of names."""
     stems = [SUFFIX.sub("", path) for path in paths]
     word = "|".join(sorted(map(re.escape, (*GOOD, *BAD)), key=len, reverse=True))
@@ -134,7 +155,7 @@ def path_sources(paths: Names) -> list[LabelSource]:
         rf"(?:^|[-_ ./])({word})(?:[-_ ]?\d+)?$",
         rf"(?:^|/)({word})(?=[-_ ][^/]*$)",
     )
-    sources = []
+    sources: Sources = []
     for pattern in patterns:
         found = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
         if len(found) > len(stems) / 2:
@@ -143,63 +164,49 @@ def path_sources(paths: Names) -> list[LabelSource]:
     return sources
 
 
-def column_sources(views: Mapping[str, Table], columns: Names) -> list[LabelSource]:
+def in_columns(columns: Iterable[Column]) -> Sources:
     """Return the columns whose name is a verdict's, and whose words are few.
 
     A label that changes within a recording is that of its last row, if above it stand only words
     for not checked.
     """
-    sources = []
-    for name in columns:
-        words = [view.words(name) for view in views.values() if name in view.columns]
-        if not (NAME.search(name) or BAD_NAME.search(name)) or not all(map(len, words)):
+    sources: Sources = []
+    for column in columns:
+        is_named = NAME.search(column.name) or BAD_NAME.search(column.name)
+        if not is_named or not all(map(len, column.words)):
             continue
-        changes = [{*cells} - {cells[-1]} for cells in words if len({*cells}) > 1]
-        is_last = all(word.lower() in UNCHECKED for some in changes for word in some)
-        different = {cells[-1] for cells in words}
-        known = with_meanings(LabelSource(column=name), different)
-        if (
-            is_last
-            and len(different) <= MOST_WORDS
-            and (len(different) > 1 or known.good or known.bad)
-        ):
-            sources.append(LabelSource(column=name, at="last" if changes else "same"))
+        last = [str(words[-1]) for words in column.words]
+        above = (
+            {
+                word
+                for words, end in zip(column.words, last, strict=True)
+                for word in words
+                if word != end
+            }
+            if not column.fixed
+            else set[str]()
+        )
+        different = {*last}
+        known = with_meanings(LabelSource(column=column.name), different)
+        is_label = len(different) > 1 or known.good or known.bad
+        if {w.lower() for w in above} <= {*UNCHECKED} and len(different) <= MOST_WORDS and is_label:
+            sources.append(LabelSource(column=column.name, at="same" if column.fixed else "last"))
     return sources
 
 
-def line_sources(above: Sequence[str]) -> list[LabelSource]:
+def line_keys(above: Sequence[str]) -> list[str]:
+    """Return the beginnings of lines above a header, before the first mark."""
+    return [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0].strip(" \"'") for line in above]
+
+
+def in_lines(above: Sequence[str]) -> Sources:
     """Return the beginnings of lines above a header that are the name of a verdict."""
-    keys = [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0].strip(" \"'") for line in above]
-    return [LabelSource(line=key) for key in keys if NAME.search(key)]
-
-
-def listing_sources(
-    base: Path, names: Names, places: Mapping[str, Place], parts: Mapping[str, str], form: TextForm
-) -> list[LabelSource]:
-    """Return the columns of verdicts in files that list most of the recordings, with their key."""
-    sources = []
-    for name in names:
-        try:
-            table = listing_table(base / name, (), form)
-        except (DataError, ValueError):
-            continue
-        for key in table.columns:
-            plain = LabelSource(listing=name, key=key, column=key)
-            found = candidate(base, plain, places, parts, form).words
-            if len(found) > len(places) / 2:
-                columns = [column for column in table.columns if column != key]
-                view = {
-                    row: table.take(slice(i, i + 1)) for i, row in enumerate(map(str, table.lines))
-                }
-                some = column_sources(view, columns)
-                sources += [replace(plain, column=source.column) for source in some]
-                break
-    return sources
+    return [LabelSource(line=key) for key in line_keys(above) if NAME.search(key)]
 
 
 def choose(
-    candidates: Sequence[Candidate], notes: dict[str, str], hints: Sequence[str], n: int
-) -> tuple[LabelSource, list[LabelSource]]:
+    candidates: Sequence[Candidate], notes: Notes, hints: Names, n: int
+) -> tuple[LabelSource, Sources]:
     """Return the source of the labels, and those that must agree with it.
 
     The first candidate whose words are known is the label if all such agree, and the others are
@@ -207,24 +214,28 @@ def choose(
 
     hints : columns that may hold labels under other names. n : recordings that were looked at.
     """
-    known = [one for one in candidates if one.is_known]
-    pairs = [(a, b, a.disagreements(b)) for i, a in enumerate(known) for b in known[i + 1 :]]
-    first, second, count = max(pairs, key=lambda pair: pair[2], default=(None, None, 0))
-    if first is not None and second is not None and count:
-        text = f"{first.title} and {second.title} disagree on {count:,} of {n:,} recordings"
-        notes["label.column"] = f"{text}: which is right?"
+    known = [candidate for candidate in candidates if candidate.is_known]
+    pairs = [(a.disagreements(b), a, b) for a, b in combinations(known, 2)]
+    count, *pair = max(pairs, key=lambda pair: pair[0], default=(0,))
+    if count:
+        titles = " and ".join(candidate.title for candidate in pair)
+        text = f"{titles} disagree on {count:,} of {n:,} recordings: which is right?"
+        notes["label.column"] = text
         return LabelSource(column=UNKNOWN), []
+    over = f"over {n:,} recordings"
     if known or len(candidates) == 1:
-        best, *others = known or candidates
-        kind = next(
-            key for key in ("listing", "column", "path", "line") if getattr(best.source, key)
-        )
-        notes[f"label.{kind}"] = f"{counts_of(best.words.values())}, over {n:,} recordings"
-        if not best.is_known:
-            notes["label.good"] = f"which of the words? {counts_of(best.words.values())}"
-        return best.source, [other.source for other in others]
-    text = "; ".join(one.title for one in candidates)
+        best, *checks = known or candidates
+        kind = next(kind for kind in KINDS if getattr(best.source, kind))
+        others = [one.title for one in candidates if one not in (best, *checks)]
+        also = f"; its meaning is not known: {listed(others)}" if others else ""
+        notes[f"label.{kind}"] = f"{counts_of(best.words.values())}, {over}{also}"
+        if UNKNOWN in (*best.source.good, *best.source.bad):
+            text = f"which of the words? {counts_of(best.words.values())}"
+            notes |= {"label.good": text, "label.bad": text}
+        return best.source, [check.source for check in checks]
+    text = "; ".join(candidate.title for candidate in candidates)
     text = f"one of {text}" if text else "none was found: state label.column, path, line or listing"
-    text += f"; columns of few words: {listed(hints)}" if hints else ""
-    notes["label.column"] = f"{text}; over {n:,} recordings"
+    columns = listed(hints)
+    text += f"; columns of few words: {columns}" if columns else ""
+    notes["label.column"] = f"{text}; {over}"
     return LabelSource(column=UNKNOWN), []
