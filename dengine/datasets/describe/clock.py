@@ -37,7 +37,7 @@ NAMED_UNITS = (
 # Counts since some day: their unit, the seconds from that day to 1970, and what they are called.
 EPOCHS = (
     *((unit, 0, f"{unit} since 1970") for unit in ("s", "ms", "us", "ns")),
-    ("d", 2_209_161_600, "days, as spreadsheets count them"),
+    ("d", 2_209_161_600, "days since 1900, as spreadsheets count them"),
     ("0.1 us", 11_644_473_600, "0.1 us since 1601"),
     ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
 )
@@ -61,7 +61,9 @@ def describe_clock(columns: Columns, notes: Notes, stated: Sequence[str] = ()) -
         notes["time.rate_hz"] = "unknown, for no clock was found; state it if you know it"
         return {}
     formats = [form_of(column, notes, len(clock) == 1) for column in clock]
-    return {"time.column": names, "time.format": formats}
+    values: Values = {"time.column": names, "time.format": formats}
+    is_dated = "since" in notes.get("time.format", "") or any(c.tells_day for c in clock)
+    return values | ({"order": "time"} if is_dated and UNKNOWN not in formats else {})
 
 
 def clock_columns(columns: Columns, notes: Notes) -> list[str]:

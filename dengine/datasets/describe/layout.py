@@ -29,18 +29,19 @@ MOST_PARTS = 240
 Files = Sequence[Tables]  # the tables of each file
 
 
-def layout_of(kind: str, files: Files, stated: Stated) -> str:
+def layout_of(start: Description, files: Files) -> str:
     """Return how parts are laid out: in files, rows or columns.
 
     Raises DataError for a table of results without samples.
     """
     first = files[0][0]
+    kind = start.format
     is_json = kind in ("json", "jsonl")
     if is_json and (len(files) == 1 or len(files[0]) > 1):
         return "wide" if any(len(cells) > 1 for cells in first.columns.values()) else "long"
     if kind == "ts" or numbered_columns(first) or _has_lists(first):
         return "wide"
-    stated_part = np.atleast_1d(stated.get("part.column", [])).tolist()
+    stated_part = start.part.column
     changes = any(len({*first.words(name)}) > 1 for name in stated_part if name in first.columns)
     if changes or run_columns([tables[0] for tables in files]):
         return "long"
