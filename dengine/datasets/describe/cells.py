@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -23,6 +23,7 @@ FORMS = (
     *(f"{day} {time}" for day in DAY_FORMS for time in TIME_FORMS),
 )
 LIKE_A_TIME = r"^\d+[:\-./T](?:\d+|[A-Za-z]{3})[:\-./T]\d|^\d+:\d+\.\d|^\d{8}T\d{6}"
+MOST_WORDS = 12  # that are told apart, as labels
 MOST_CELLS = 20  # of a recording whose form of times is looked at
 # A number with any decimal mark and any mark of groups.
 NUMBER = re.compile(
@@ -33,6 +34,11 @@ Notes = dict[str, str]
 Values = dict[str, Any]
 Tables = Sequence[Table]
 Floats = NDArray[np.float64]
+
+
+def counts_of(words: Iterable[str]) -> str:
+    """Return how often each word comes, most frequent first."""
+    return ", ".join(f"{w or 'empty'}: {n:,}" for w, n in Counter(words).most_common(MOST_WORDS))
 
 
 @dataclass
@@ -61,7 +67,18 @@ class Column:
     @cached_property
     def are_numbers(self) -> bool:
         """Whether all words but empty ones are numbers."""
-        return all(NUMBER.fullmatch(word) for word in self.counts if word)
+        return not any(self.odd)
+
+    @property
+    def title(self) -> str:
+        """How often each word comes, most frequent first."""
+        return counts_of(self.counts.elements())
+
+    @cached_property
+    def odd(self) -> Counter[str]:
+        """How often each word comes that is no number."""
+        words = self.counts.items()
+        return Counter({word: n for word, n in words if not NUMBER.fullmatch(word)})
 
     @cached_property
     def numbers(self) -> list[Floats]:

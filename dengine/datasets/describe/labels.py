@@ -16,7 +16,7 @@ from ...errors import DataError, listed
 from ..description import UNKNOWN, LabelSource, TextForm
 from ..read.places import SUFFIX, Place, listing_table, read_labels
 from ..table import UnreadableError
-from .cells import Column, Notes, columns_of
+from .cells import MOST_WORDS, Column, Notes, columns_of, counts_of
 
 GOOD = ("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "io", "accepted", "合格")
 BAD = (
@@ -36,7 +36,6 @@ GOOD_NAME = re.compile(
     r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
 )
 KINDS = ("listing", "column", "path", "line")
-MOST_WORDS = 12
 Names = Iterable[str]
 Sources = list[LabelSource]
 Places = Mapping[str, Place]
@@ -74,11 +73,6 @@ class Candidate:
         """Return for how many recordings another candidate has another label."""
         labels, others = self.labels, other.labels
         return sum(labels[name] != others[name] for name in labels.keys() & others.keys())
-
-
-def counts_of(words: Names) -> str:
-    """Return how often each word comes, most frequent first."""
-    return ", ".join(f"{w or 'empty'}: {n:,}" for w, n in Counter(words).most_common(MOST_WORDS))
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:

@@ -15,7 +15,7 @@ from ..read.places import Place
 from ..read.split import split
 from ..table import Table
 from . import labels
-from .cells import Column, Notes, Stated, Tables, columns_of
+from .cells import MOST_WORDS, Notes, Tables, columns_of
 from .clock import NAME as CLOCK_NAME
 
 PART_NAME = re.compile(
@@ -90,7 +90,7 @@ def run_columns(tables: Tables) -> list[str]:
 def _refuse_results(table: Table) -> None:
     """Raise DataError for a table with a row for each result, and no samples."""
     for column in columns_of([table], TextForm()).values():
-        few = column.is_text and len(column.counts) < labels.MOST_WORDS
+        few = column.is_text and len(column.counts) < MOST_WORDS
         source = labels.with_meanings(labels.LabelSource(), column.counts if few else ())
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1]) if few else np.empty(0)
         in_runs = len(edges) > 1 and int(np.gcd.reduce(np.diff(edges))) >= LEAST_RUN
@@ -142,5 +142,3 @@ def places_of(files: Files, description: Description, is_cut: bool) -> dict[str,
             places[source] = Place(path, table)
     return places
 
-
-__all__ = ["Column", "layout_of", "part_columns", "places_of"]
