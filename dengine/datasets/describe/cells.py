@@ -19,7 +19,7 @@ from ..units import bare
 DAY_FORMS = ("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y")
 TIME_FORMS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%I:%M:%S.%f %p", "%I:%M:%S %p")
 FORMS = (
-    *(ISO, "%Y-%m-%d", *DAY_FORMS, *TIME_FORMS, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC"),
+    *(ISO, "%Y-%m-%d", *DAY_FORMS, *TIME_FORMS, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f"),
     *(f"{day} {time}" for day in DAY_FORMS for time in TIME_FORMS),
 )
 LIKE_A_TIME = r"^\d+[:\-./T](?:\d+|[A-Za-z]{3})[:\-./T]\d|^\d+:\d+\.\d|^\d{8}T\d{6}"
@@ -117,9 +117,11 @@ class Column:
         texts = pd.Series([cell for column in some for cell in column]).astype(str).str.strip()
         if not texts.str.contains(LIKE_A_TIME, regex=True).all():
             return []
+        has_comma = texts.str.contains(",").any()
         texts = texts.drop_duplicates().str.replace(",", ".", regex=False)
-        forms = [form for form in FORMS if _fits(texts, form)]
-        return forms[1:] if forms[:2] == [ISO, "%Y-%m-%d"] else forms
+        forms = [form for form in FORMS[int(has_comma) :] if _fits(texts, form)]
+        is_day = "%Y-%m-%d" in forms
+        return ["%Y-%m-%d"] if is_day else forms[:1] if ISO in forms else forms
 
     @property
     def tells_day(self) -> bool:

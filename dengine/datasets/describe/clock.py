@@ -57,6 +57,11 @@ def describe_clock(columns: Columns, notes: Notes, stated: Sequence[str] = ()) -
     """
     names = [*stated] or clock_columns(columns, notes)
     clock = [columns[name] for name in names if name in columns]
+    odd = [c for c in columns.values() if NAME.search(c.name) and c.is_text and not c.fixed]
+    if not clock and odd and not odd[0].are_numbers:
+        text = f"{odd[0].name} has times of no known form; state time.format, or time.column=[]"
+        notes["time.column"] = text
+        return {"time.column": UNKNOWN}
     if not clock:
         notes["time.rate_hz"] = "unknown, for no clock was found; state it if you know it"
         return {}

@@ -18,10 +18,13 @@ from ..read.places import SUFFIX, Place, listing_table, read_labels
 from ..table import UnreadableError
 from .cells import MOST_WORDS, Column, Notes, columns_of, counts_of
 
-GOOD = ("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "io", "accepted", "合格")
+GOOD = (
+    *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
+    *("accepted", "合格"),
+)
 BAD = (
     *("nok", "not ok", "not_ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
-    *("n.i.o.", "nio", "ng", "reject", "rejected", "不合格"),
+    *("n.i.o.", "n.i.o", "n_i_o", "nio", "ng", "reject", "rejected", "不合格"),
 )
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
 YES, NO = ("1", "true", "yes", "ja"), ("0", "false", "no", "nein")
@@ -35,6 +38,7 @@ BAD_NAME = re.compile(
 GOOD_NAME = re.compile(
     r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
 )
+NO_NOT = r"(?<!(?i:not))(?<!(?i:nicht))(?<!(?-i:[-_ .]n))"  # before a verdict in a name
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
 Sources = list[LabelSource]
@@ -146,7 +150,7 @@ def in_paths(paths: Names) -> Sources:
     word = "|".join(sorted(map(re.escape, (*GOOD, *BAD)), key=len, reverse=True))
     patterns = (
         rf"(?:^|/)({word})/",
-        rf"(?:^|[-_ ./])({word})(?:[-_ ]?\d+)?$",
+        rf"(?:^|{NO_NOT}[-_ ./(=+\[])({word})[-_ \d()\]]*$",
         rf"(?:^|/)({word})(?=[-_ ][^/]*$)",
     )
     sources: Sources = []

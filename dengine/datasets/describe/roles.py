@@ -65,7 +65,7 @@ class Roles:
         self.find_label()
         self.find_channels()
         clock = self.description.time
-        if clock.column and UNKNOWN not in clock.format:
+        if clock.column and UNKNOWN not in clock.column + clock.format:
             tables = [*map(self.kept_rows, self.tables)]
             self.put(describe_rate(tables, clock, self.description.text, self.notes))
         self.find_lengths()
