@@ -121,7 +121,7 @@ def _split_wide(table: Table, name: str, description: Description) -> Parts:
     }
     units = {key: table.units.get(names[0], "") for key, names in groups.items() if names}
     used = {column for names in groups.values() for column in names}
-    others = [column for column in table.columns if column not in used]
+    others = [name for name, cells in table.columns.items() if name not in used and len(cells)]
     for i, line in enumerate(table.lines):
         columns = {key: without_empty_end(rows[i]) for key, rows in cells.items()}
         for column in others:
