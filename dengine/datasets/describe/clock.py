@@ -16,7 +16,7 @@ from .cells import Column, Floats, Notes, Tables, Values
 
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
-    r"|^(t|ms|s|us|ns|sec|secs|seconds|date|datum|uhr|x_value|ticks)$|^t[ _/\[(]"
+    r"|(^|\.)(t|ms|s|us|ns|sec|secs|seconds|date|datum|uhr|x_value|ticks)$|^t[ _/\[(]"
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
@@ -57,10 +57,10 @@ def describe_clock(columns: Columns, notes: Notes, stated: Sequence[str] = ()) -
     """
     names = [*stated] or clock_columns(columns, notes)
     clock = [columns[name] for name in names if name in columns]
-    odd = [c for c in columns.values() if NAME.search(c.name) and c.is_text and not c.fixed]
-    if not clock and odd and not odd[0].are_numbers:
-        text = f"{odd[0].name} has times of no known form; state time.format, or time.column=[]"
-        notes["time.column"] = text
+    texts = [c for c in columns.values() if NAME.search(c.name) and c.odd and not c.fixed]
+    if not clock and texts and not texts[0].time_forms:
+        text = f"{texts[0].name} has cells of no known form, like {listed([*texts[0].odd][:3])}:"
+        notes["time.column"] = f"{text} state time.format or text.drop, or time.column=[]"
         return {"time.column": UNKNOWN}
     if not clock:
         notes["time.rate_hz"] = "unknown, for no clock was found; state it if you know it"

@@ -23,7 +23,7 @@ GOOD = (
     *("accepted", "合格"),
 )
 BAD = (
-    *("nok", "not ok", "not_ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
+    *("nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
     *("n.i.o.", "n.i.o", "n_i_o", "nio", "ng", "reject", "rejected", "不合格"),
 )
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
@@ -38,7 +38,13 @@ BAD_NAME = re.compile(
 GOOD_NAME = re.compile(
     r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
 )
-NO_NOT = r"(?<!(?i:not))(?<!(?i:nicht))(?<!(?-i:[-_ .]n))"  # before a verdict in a name
+WORD = "|".join(sorted(map(re.escape, (*GOOD, *BAD)), key=len, reverse=True))
+NEGATED = re.compile(rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})")
+PATHS = (  # of verdicts in folders, and at the end or beginning of names
+    rf"(?:^|/)({WORD})/",
+    rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
+    rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
+)
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
 Sources = list[LabelSource]
@@ -82,7 +88,8 @@ class Candidate:
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     """Return a source with the meanings of its words; `?` for those that are not known.
 
-    Plain verdicts mean the same everywhere; `io` is one only beside `nio`. True, yes and 1 mean
+    Plain verdicts mean the same everywhere; `io` is one only beside `nio`, and in a path each is
+    one only if some part is good and some bad: `pass_1.csv` may be anything. True, yes and 1 mean
     what the column's name says: good for `success`, bad for `failed`; of other names nothing.
     """
     words = sorted({*words})
@@ -96,7 +103,8 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
             good, bad = {*NO}, {*YES}
     kinds = {"good": good, "bad": bad, "unchecked": {*UNCHECKED}}
     meanings = {key: [w for w in words if w.lower() in some] for key, some in kinds.items()}
-    if {*words} - {word for some in meanings.values() for word in some}:
+    is_one_sided = source.path and not (meanings["good"] and meanings["bad"])
+    if is_one_sided or {*words} - {word for some in meanings.values() for word in some}:
         meanings |= {key: meanings[key] or [UNKNOWN] for key in ("good", "bad")}
     return replace(
         source, **{key: getattr(source, key) or tuple(some) for key, some in meanings.items()}
@@ -145,20 +153,14 @@ class Labels:
 
 
 def in_paths(paths: Names) -> Sources:
-    """Return the expressions for verdicts in folders, and at the end or beginning of names."""
+    """Return the expressions that find verdicts in most paths; none if a not stands before one."""
     stems = [SUFFIX.sub("", path) for path in paths]
-    word = "|".join(sorted(map(re.escape, (*GOOD, *BAD)), key=len, reverse=True))
-    patterns = (
-        rf"(?:^|/)({word})/",
-        rf"(?:^|{NO_NOT}[-_ ./(=+\[])({word})[-_ \d()\]]*$",
-        rf"(?:^|/)({word})(?=[-_ ][^/]*$)",
-    )
     sources: Sources = []
-    for pattern in patterns:
+    for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
         found = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
         if len(found) > len(stems) / 2:
             used = sorted({*found}, key=lambda text: (-len(text), text))
-            sources.append(LabelSource(path=pattern.replace(word, "|".join(map(re.escape, used)))))
+            sources.append(LabelSource(path=pattern.replace(WORD, "|".join(map(re.escape, used)))))
     return sources
 
 

@@ -34,7 +34,7 @@ FORCES = (
     re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
     re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
 )
-VALUE = re.compile(r"(?i)_?f\b.*|_?value")
+VALUE = re.compile(r"(?i)(.*\.)?_?(f\b.*|value)")
 Units = Mapping[str, str]
 
 
@@ -151,7 +151,8 @@ class Roles:
         if self.is_used(name) or not ((is_named or is_text) and varies and has_rows):
             return False
         sources = [labels.with_meanings(source, words) for source in labels.in_columns([column])]
-        return len(words) <= FEW_WORDS and not any(source.good + source.bad for source in sources)
+        verdicts = {word for source in sources for word in source.good + source.bad} - {UNKNOWN}
+        return len(words) <= FEW_WORDS and not verdicts
 
     def find_part(self) -> None:
         """Find the column or line with the part's number, if exactly one has its name."""
