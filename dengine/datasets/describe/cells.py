@@ -57,7 +57,7 @@ class Column:
     @cached_property
     def counts(self) -> Counter[str]:
         """How often each word comes."""
-        return sum((Counter(words.tolist()) for words in self.words), Counter())
+        return Counter(np.concatenate(self.words).tolist())
 
     @cached_property
     def is_text(self) -> bool:
