@@ -24,7 +24,7 @@ from .bags import describe_bag
 from .cells import Notes, Stated, Tables
 from .layout import layout_of, part_columns, places_of
 from .roles import Roles
-from .text_form import Look, describe_form, look
+from .text_form import describe_form, look
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -46,8 +46,7 @@ NO_RECORDING = re.compile(
 MOST_FILES = 60  # that are read
 MOST_BYTES = 4_000_000  # of all files that are read, and of one
 MOST_ROWS = 200_000
-MOST_FORMS = 20  # of first lines, of which one file each is looked at
-NUMBERS = re.compile(r"[-+]?\d[\d.,]*([eE][-+]?\d+)?")
+NUMBERS = re.compile(r"\d+")
 Names = Sequence[str]
 
 
@@ -67,9 +66,15 @@ class Sample:
     notes: Notes = field(default_factory=dict)
 
     def contents(self) -> dict[str, bytes]:
-        """Return the content of some files, evenly spread, as far as the budget goes."""
+        """Return the content of some files, as far as the budget goes.
+
+        They are those whose names are like no other but for numbers, and others evenly spread.
+        """
+        shapes = Counter(NUMBERS.sub("0", name) for name in self.names)
+        rare = [name for name in self.names if shapes[NUMBERS.sub("0", name)] == 1][:MOST_FILES]
+        step = max(1, len(self.names) // MOST_FILES)
         contents = dict[str, bytes]()
-        for name in self.names[:: max(1, len(self.names) // MOST_FILES)][:MOST_FILES]:
+        for name in sorted({*rare, *self.names[::step][:MOST_FILES]}, key=natural_key):
             if sum(map(len, contents.values())) < MOST_BYTES:
                 with suppress(UnreadableError):
                     contents[name] = read_file(self.base / name)
@@ -98,30 +103,6 @@ class Sample:
         """Return the first rows of large tables."""
         self.is_cut |= any(len(table.lines) > MOST_ROWS for table in tables)
         return [table.take(slice(0, MOST_ROWS)) for table in tables]
-
-    def look(self, name: str) -> Look | None:
-        """Return how a file is written; None if it cannot be read, or is no text."""
-        with suppress(UnreadableError):
-            return look(read_file(self.base / name), self.stated)
-        return None
-
-    def odd_names(self) -> list[str]:
-        """Return the files that are written in another form than most.
-
-        Of the files whose first lines are equal but for numbers one is looked at. It is odd if it
-        has another delimiter, another number of columns, or no column in common with most.
-        """
-        groups: dict[str, list[str]] = {}
-        for name in self.names:
-            with (self.base / name).open("rb") as file:
-                line = file.readline(4000).decode("utf-8", "replace")
-            groups.setdefault(NUMBERS.sub("0", line.strip()), []).append(name)
-        usual, *others = sorted(groups.values(), key=len, reverse=True)
-        form = self.look(usual[0])
-        if form is None or len(others) > MOST_FORMS:
-            return []
-        looks = [(names, self.look(names[0])) for names in others]
-        return [n for names, found in looks if found and form.differs(found) for n in names]
 
 
 def describe(source: Any, stated: Stated | None = None) -> Description:
@@ -167,9 +148,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     if kind == "mcap":
         bags = [sample.base / name for name in sample.names]
         return describe_bag(bags, sample.stated)  # type: ignore[no-any-return, no-untyped-call]
-    odd = sample.odd_names() if kind == "text" else []
-    sample.others = [*(name for names in groups.values() for name in names), *odd]
-    sample.names = [name for name in sample.names if name not in odd]
+    sample.others = [name for names in groups.values() for name in names]
     return _describe_files(sample)
 
 
@@ -178,10 +157,14 @@ def _describe_files(sample: Sample) -> Description:
     contents = sample.contents()
     start = Description().with_values(sample.stated)
     if start.format == "text":
-        looks = [one for c in contents.values() if (one := look(c, sample.stated))]
+        found = ((name, look(content, sample.stated)) for name, content in contents.items())
+        looks = {name: one for name, one in found if one is not None}
         if not looks:
             raise DataError(f"Expected a text with numbers in {listed(sample.names)}, found none.")
-        form = describe_form(looks, sample.notes)
+        form, odd = describe_form(looks, sample.notes)
+        sample.others = [*sample.others, *odd]
+        sample.names = [name for name in sample.names if name not in odd]
+        contents = {name: content for name, content in contents.items() if name not in odd}
         start = start.with_values({**form, **sample.stated})
     files: list[Tables] = []
     for name, content in contents.items():

@@ -19,7 +19,15 @@ from ..units import bare
 DAY_FORMS = ("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y")
 TIME_FORMS = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%I:%M:%S.%f %p", "%I:%M:%S %p")
 FORMS = (
-    *(ISO, "%Y-%m-%d", *DAY_FORMS, *TIME_FORMS, "%M:%S.%f", "%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f"),
+    *(
+        ISO,
+        "%Y-%m-%d",
+        *DAY_FORMS,
+        *TIME_FORMS,
+        "%M:%S.%f",
+        "%Y-%m-%d %H:%M:%S.%f UTC",
+        "%Y-%m-%d %H:%M:%S.%f",
+    ),
     *(f"{day} {time}" for day in DAY_FORMS for time in TIME_FORMS),
 )
 LIKE_A_TIME = r"^\d+[:\-./T](?:\d+|[A-Za-z]{3})[:\-./T]\d|^\d+:\d+\.\d|^\d{8}T\d{6}"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from ...errors import DataError, listed
 from ..description import UNKNOWN, LabelSource, TextForm
-from ..read.places import SUFFIX, Place, listing_table, read_labels
+from ..read.places import SUFFIX, LabelReader, Place, listing_table, read_labels
 from ..table import UnreadableError
 from .cells import MOST_WORDS, Column, Notes, columns_of, counts_of
 
@@ -59,11 +59,21 @@ class Candidate:
     words: Mapping[str, str]
 
     @property
+    def kind(self) -> str:
+        """What kind of place it is."""
+        return next(kind for kind in KINDS if getattr(self.source, kind))
+
+    @property
+    def labels(self) -> dict[str, int | None]:
+        """The label of each recording whose word has a known meaning."""
+        reader = LabelReader(self.source)
+        known = {*self.source.good, *self.source.bad, *self.source.unchecked}
+        return {name: reader.meaning(w) for name, w in self.words.items() if w in known}
+
+    @property
     def is_known(self) -> bool:
         """Whether the meaning of every word is known, and some word is a label."""
-        source = self.source
-        labels = {*source.good, *source.bad} - {UNKNOWN}
-        return bool(labels) and {*self.words.values()} <= {*labels, *source.unchecked}
+        return len(self.labels) == len(self.words) and {*self.labels.values()} != {None}
 
     @property
     def title(self) -> str:
@@ -72,17 +82,10 @@ class Candidate:
         stated = [f"label.{key}={value}" for key in keys if (value := getattr(self.source, key))]
         return f"{' '.join(stated)} ({counts_of(self.words.values())})"
 
-    @property
-    def labels(self) -> dict[str, bool]:
-        """Whether each recording that was checked is good."""
-        source = self.source
-        checked = {name: w for name, w in self.words.items() if w not in source.unchecked}
-        return {name: word in source.good for name, word in checked.items()}
-
     def disagreements(self, other: "Candidate") -> int:
-        """Return for how many recordings another candidate has another label."""
-        labels, others = self.labels, other.labels
-        return sum(labels[name] != others[name] for name in labels.keys() & others.keys())
+        """Return for how many recordings that were checked another candidate has another label."""
+        pairs = [(label, other.labels.get(name)) for name, label in self.labels.items()]
+        return sum({*pair} == {0, 1} for pair in pairs)
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -96,19 +99,16 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     lower = {word.lower() for word in words}
     name = source.column or source.line
     good, bad = {*GOOD} - ({"io"} if "nio" not in lower else set()), {*BAD}
-    if lower <= {*YES, *NO, *UNCHECKED} and name:
+    if name and lower <= {*YES, *NO, *UNCHECKED}:
         is_good = GOOD_NAME.search(name) or (lower & {"true", "false"} and NAME.search(name))
         good, bad = ({*YES}, {*NO}) if is_good else (set(), set())
-        if BAD_NAME.search(name):
-            good, bad = {*NO}, {*YES}
+        good, bad = ({*NO}, {*YES}) if BAD_NAME.search(name) else (good, bad)
     kinds = {"good": good, "bad": bad, "unchecked": {*UNCHECKED}}
-    meanings = {key: [w for w in words if w.lower() in some] for key, some in kinds.items()}
-    is_one_sided = source.path and not (meanings["good"] and meanings["bad"])
-    if is_one_sided or {*words} - {word for some in meanings.values() for word in some}:
-        meanings |= {key: meanings[key] or [UNKNOWN] for key in ("good", "bad")}
-    return replace(
-        source, **{key: getattr(source, key) or tuple(some) for key, some in meanings.items()}
-    )
+    found = {key: tuple(w for w in words if w.lower() in some) for key, some in kinds.items()}
+    is_one_sided = source.path and not (found["good"] and found["bad"])
+    if is_one_sided or len(words) > sum(map(len, found.values())):
+        found |= {key: found[key] or (UNKNOWN,) for key in ("good", "bad")}
+    return replace(source, **{key: getattr(source, key) or some for key, some in found.items()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,21 +175,12 @@ def in_columns(columns: Iterable[Column]) -> Sources:
         is_named = NAME.search(column.name) or BAD_NAME.search(column.name)
         if not is_named or not all(map(len, column.words)):
             continue
-        last = [str(words[-1]) for words in column.words]
-        above = (
-            {
-                word
-                for words, end in zip(column.words, last, strict=True)
-                for word in words
-                if word != end
-            }
-            if not column.fixed
-            else set[str]()
-        )
-        different = {*last}
-        known = with_meanings(LabelSource(column=column.name), different)
-        is_label = len(different) > 1 or known.good or known.bad
-        if {w.lower() for w in above} <= {*UNCHECKED} and len(different) <= MOST_WORDS and is_label:
+        last = {str(words[-1]) for words in column.words}
+        above = {word for words in column.words for word in {*words} - {words[-1]}}
+        known = with_meanings(LabelSource(column=column.name), last)
+        is_label = len(last) > 1 or known.good or known.bad
+        is_last = {word.lower() for word in above} <= {*UNCHECKED}
+        if is_last and is_label and len(last) <= MOST_WORDS:
             sources.append(LabelSource(column=column.name, at="same" if column.fixed else "last"))
     return sources
 
@@ -215,27 +206,23 @@ def choose(
     hints : columns that may hold labels under other names. n : recordings that were looked at.
     """
     known = [candidate for candidate in candidates if candidate.is_known]
-    pairs = [(a.disagreements(b), a, b) for a, b in combinations(known, 2)]
-    count, *pair = max(pairs, key=lambda pair: pair[0], default=(0,))
-    if count:
-        titles = " and ".join(candidate.title for candidate in pair)
-        text = f"{titles} disagree on {count:,} of {n:,} recordings: which is right?"
-        notes["label.column"] = text
-        return LabelSource(column=UNKNOWN), []
     over = f"over {n:,} recordings"
+    for first, second in combinations(known, 2):
+        if count := first.disagreements(second):
+            text = f"{first.title} and {second.title} disagree on {count:,} of {n:,} recordings"
+            notes["label.column"] = f"{text}: which is right?"
+            return LabelSource(column=UNKNOWN), []
     if known or len(candidates) == 1:
         best, *checks = known or candidates
-        kind = next(kind for kind in KINDS if getattr(best.source, kind))
-        others = [one.title for one in candidates if one not in (best, *checks)]
-        also = f"; its meaning is not known: {listed(others)}" if others else ""
-        notes[f"label.{kind}"] = f"{counts_of(best.words.values())}, {over}{also}"
-        if UNKNOWN in (*best.source.good, *best.source.bad):
-            text = f"which of the words? {counts_of(best.words.values())}"
-            notes |= {"label.good": text, "label.bad": text}
+        counts = counts_of(best.words.values())
+        others = listed(other.title for other in candidates if other not in (best, *checks))
+        also = f"; of unknown meaning: {others}" if others else ""
+        notes[f"label.{best.kind}"] = f"{counts}, {over}{also}"
+        if UNKNOWN in best.source.good + best.source.bad:
+            notes["label.good"] = notes["label.bad"] = f"which of the words? {counts}"
         return best.source, [check.source for check in checks]
-    text = "; ".join(candidate.title for candidate in candidates)
-    text = f"one of {text}" if text else "none was found: state label.column, path, line or listing"
-    columns = listed(hints)
-    text += f"; columns of few words: {columns}" if columns else ""
-    notes["label.column"] = f"{text}; {over}"
+    titles = "; ".join([candidate.title for candidate in candidates])
+    text = titles or "none was found: state label.column, path, line or listing"
+    few = f"; columns of few words: {columns}" if (columns := listed(hints)) else ""
+    notes["label.column"] = f"{text}{few}; {over}"
     return LabelSource(column=UNKNOWN), []

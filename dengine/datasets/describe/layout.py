@@ -141,4 +141,3 @@ def places_of(files: Files, description: Description, is_cut: bool) -> dict[str,
         for source, path, table in found[: MOST_PARTS - len(places)]:
             places[source] = Place(path, table)
     return places
-

@@ -245,7 +245,9 @@ class Roles:
     def find_lengths(self) -> None:
         """Find how many samples the traces have, and what happens to those of other lengths."""
         names = [channel.column for channel in self.description.channels]
-        found = [len(words) for n in names[:1] if n in self.columns for words in self.columns[n].words]
+        found = [
+            len(words) for n in names[:1] if n in self.columns for words in self.columns[n].words
+        ]
         lengths = [n for n in found if n]
         if not lengths:
             return

@@ -5,7 +5,7 @@ Each value follows from a count over the lines that were looked at; where two fi
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -63,12 +63,6 @@ class Look:
     def rows(self) -> list[list[str]]:
         """The cells of the lines of samples."""
         return [split_line(line, self.delimiter) for line in self.lines[self.places[2] - 1 :]]
-
-    def differs(self, other: "Look") -> bool:
-        """Return whether another file has another delimiter or width, or no column in common."""
-        names = {*self.names}
-        is_same = (self.delimiter, self.width) == (other.delimiter, other.width)
-        return not is_same or (bool(names) and names.isdisjoint(other.names))
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
@@ -139,28 +133,34 @@ def _are_units(row: Row) -> bool:
     return all(is_unit(cell) or UNIT_WORDS.fullmatch(cell) for cell in cells)
 
 
-def describe_form(looks: Sequence[Look], notes: Notes) -> Values:
-    """Return the keys of `[text]` for most of the files, and put the evidence into `notes`."""
-    form = Counter((look.delimiter, look.width) for look in looks).most_common(1)[0][0]
-    looks = [look for look in looks if (look.delimiter, look.width) == form]
-    places = Counter(look.places for look in looks)
+def describe_form(looks: Mapping[str, Look], notes: Notes) -> tuple[Values, list[str]]:
+    """Return the keys of `[text]` for most of the files, and the files of another form.
+
+    These have another delimiter, another number of columns, or no column in common with most.
+    """
+    forms = Counter((look.delimiter, look.width) for look in looks.values())
+    same = [x for x in looks.values() if (x.delimiter, x.width) == forms.most_common(1)[0][0]]
+    places = Counter(look.places for look in same)
     header, units, data = places.most_common(1)[0][0]
-    usual = next(look for look in looks if look.places == (header, units, data))
-    encoding = min({look.encoding for look in looks} - {"utf-8"}, default="utf-8")
+    usual = next(look for look in same if look.places == (header, units, data))
+    names = {*usual.names}
+    same = [look for look in same if not names or not names.isdisjoint(look.names)]
+    encoding = min({look.encoding for look in same} - {"utf-8"}, default="utf-8")
     if encoding == "cp1252":
         notes["text.encoding"] = "not UTF-8; cp1252 reads any text: look at the letters below"
     values: Values = {"text.encoding": encoding, "text.delimiter": usual.delimiter}
     values |= {"text.header": header, "text.units": units, "text.data": data}
-    if len(places) > 1 and header:
+    if len({look.places for look in same}) > 1 and header:
         notes["text.header"] = "it stands at another line in each file"
         first, mark, _ = usual.lines[header - 1].partition(usual.delimiter)
         values |= {"text.header": first + mark, "text.data": data - header}
         values["text.units"] = units and units - header
-    if names := _missing_names(usual):
-        values["text.names"] = names
+    if missing := _missing_names(usual):
+        values["text.names"] = missing
         notes["text.names"] = "no header names each column"
-    cells = {cell.strip() for look in looks for row in look.rows for cell in row}
-    return values | marks([cell for cell in cells if NUMBER.fullmatch(cell)], notes)
+    cells = {cell.strip() for look in same for row in look.rows for cell in row}
+    values |= marks([cell for cell in cells if NUMBER.fullmatch(cell)], notes)
+    return values, [name for name, look in looks.items() if look not in same]
 
 
 def _missing_names(usual: Look) -> list[str]:
