@@ -15,7 +15,7 @@ from typing import Any
 from ...errors import DataError, listed
 from ..description import UNKNOWN, Description
 from ..read.files import natural_key, read_file
-from ..read.frames import part_tables, read_frame
+from ..read.frames import MOST_CHANNELS, part_tables, read_frame
 from ..read.places import Place
 from ..read.split import tables_of
 from ..read.text import read_text
@@ -88,7 +88,9 @@ class Sample:
         kind = start.format
         if kind == "npz" and self.stated.get("layout", "npz") == "npz":
             parts = part_tables(content, name)
-            if "layout" in self.stated or any(len(c) > 1 for c in parts[0].columns.values()):
+            has_many = len(self.names) == 1 or len(parts) > MOST_CHANNELS
+            is_curve = has_many and any(len(c) > 1 for c in parts[0].columns.values())
+            if "layout" in self.stated or is_curve:
                 return parts
         if kind in ("text", "jsonl") and len(content) > MOST_BYTES:
             content = content[: content.rfind(b"\n", 0, MOST_BYTES)]
@@ -140,9 +142,10 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         counts = listed(f"{' '.join(globs(n))} ({len(n)} files)" for n in groups.values())
         notes = {"files": f"one of {counts}", "channels": "they follow from files"}
         return Description(files=(UNKNOWN,), notes=notes)
-    suffix = max(groups, key=lambda suffix: len(groups[suffix]))
+    base = sample.base = root if root.is_dir() else root.parent
+    sizes = {s: sum((base / name).stat().st_size for name in names) for s, names in groups.items()}
+    suffix = max(groups, key=lambda suffix: (len(groups[suffix]), sizes[suffix]))
     sample.names = groups.pop(suffix)
-    sample.base = root if root.is_dir() else root.parent
     kind = sample.stated.setdefault("format", SUFFIXES.get(suffix, "text"))
     sample.stated.setdefault("files", globs(sample.names))
     if kind == "mcap":
@@ -168,7 +171,7 @@ def _describe_files(sample: Sample) -> Description:
         start = start.with_values({**form, **sample.stated})
     files: list[Tables] = []
     for name, content in contents.items():
-        with suppress(DataError) if len(contents) > 1 else suppress():
+        with suppress(DataError if len(contents) > 1 else ()):
             files.append(sample.tables(content, name, start))
     heads = Counter(tuple(t.columns) for tables in files for t in tables[:1]).most_common(1)
     files = [tables for tables in files if tables and tuple(tables[0].columns) == heads[0][0]]

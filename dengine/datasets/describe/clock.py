@@ -102,10 +102,11 @@ def clock_columns(columns: Columns, notes: Notes) -> list[str]:
 
 def is_rising(column: Column) -> bool:
     """Return whether numbers rise in most recordings, and fall at most as a counter that wraps."""
-    votes = []
+    votes = list[bool]()
     for values in column.numbers:
         steps = np.diff(values)
-        votes.append((steps > 0).any() and (steps < 0).sum() <= max(1, len(steps) // 50))
+        n_back = int((steps < 0).sum())
+        votes.append(bool((steps > 0).any()) and n_back <= max(1, len(steps) // 50))
     return sum(votes) > len(votes) / 2
 
 

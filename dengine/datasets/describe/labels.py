@@ -5,7 +5,6 @@ the end of a name, a folder, a cell of a column, or a line, whose name is a verd
 """
 
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from ...errors import DataError, listed
 from ..description import UNKNOWN, LabelSource, TextForm
 from ..read.places import SUFFIX, LabelReader, Place, listing_table, read_labels
 from ..table import UnreadableError
-from .cells import MOST_WORDS, Column, Notes, columns_of, counts_of
+from .cells import MOST_WORDS, Column, Notes, Values, columns_of, counts_of
 
 GOOD = (
     *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
@@ -108,7 +107,8 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     is_one_sided = source.path and not (found["good"] and found["bad"])
     if is_one_sided or len(words) > sum(map(len, found.values())):
         found |= {key: found[key] or (UNKNOWN,) for key in ("good", "bad")}
-    return replace(source, **{key: getattr(source, key) or some for key, some in found.items()})
+    stated: Values = {key: getattr(source, key) or some for key, some in found.items()}
+    return replace(source, **stated)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...errors import DataError, listed
 from ..dataset import Fault
-from ..description import ANY, UNKNOWN, Channel, Description, TextForm
+from ..description import ANY, UNKNOWN, Channel, Description, LabelSource, TextForm
 from ..read.frames import join
 from ..read.places import Place
 from ..read.split import split
@@ -91,7 +91,7 @@ def _refuse_results(table: Table) -> None:
     """Raise DataError for a table with a row for each result, and no samples."""
     for column in columns_of([table], TextForm()).values():
         few = column.is_text and len(column.counts) < MOST_WORDS
-        source = labels.with_meanings(labels.LabelSource(), column.counts if few else ())
+        source = labels.with_meanings(LabelSource(), column.counts if few else ())
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1]) if few else np.empty(0)
         in_runs = len(edges) > 1 and int(np.gcd.reduce(np.diff(edges))) >= LEAST_RUN
         if source.good and source.bad and UNKNOWN not in source.good + source.bad and not in_runs:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, Description, LabelSource, RowWords, split_key
+from ..description import ANY, UNKNOWN, Channel, Description, LabelSource, RowWords
 from ..read.files import natural_key
 from ..read.places import LabelReader, Place, part_of
 from ..read.recordings import Reader
@@ -280,7 +280,8 @@ def likely_channels(units: Units) -> list[str]:
 
     A column is a force by its name, or by a unit of force or torque.
     """
-    rules = [pattern.search for pattern in FORCES]
-    rules += [lambda name: (quantity_of(units[name]) or " ")[0] in ("force", "torque")]
-    found = ([*filter(rule, units)] for rule in (*rules, VALUE.fullmatch))
+    by_name = [[*filter(pattern.search, units)] for pattern in FORCES]
+    quantities = {name: quantity_of(unit) for name, unit in units.items()}
+    by_unit = [n for n, found in quantities.items() if found and found[0] in ("force", "torque")]
+    found = (*by_name, by_unit, [*filter(VALUE.fullmatch, units)])
     return next(filter(None, found), [])

@@ -123,7 +123,7 @@ def _count_numbers(cells: Row) -> int:
 def _first_row(rows: Sequence[Row], width: int) -> int:
     """Return the first row of samples: as many numbers as usual, as have those behind it."""
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
-    least = max(0.6 * np.median(counts[len(counts) // 3 :]), 1)
+    least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
