@@ -6,7 +6,7 @@ candidates. `load_dataset` then reads exactly what the description says.
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -46,6 +46,7 @@ NO_RECORDING = re.compile(
 MOST_FILES = 60  # that are read
 MOST_BYTES = 4_000_000  # of all files that are read, and of one
 MOST_ROWS = 200_000
+MUCH_LARGER = 5
 NUMBERS = re.compile(r"\d+")
 Names = Sequence[str]
 
@@ -64,6 +65,20 @@ class Sample:
     others: Names = ()
     is_cut: bool = False
     notes: Notes = field(default_factory=dict)
+
+    def largest(self, groups: Mapping[str, Names]) -> str:
+        """Return the suffix of the recordings, of which there are most files; `?` if it is unclear.
+
+        So it is if two suffixes have several files, or each has one, and none is much larger.
+        """
+        sizes = dict[str, tuple[int, int]]()
+        for suffix, names in groups.items():
+            size = sum((self.base / name).stat().st_size for name in names)
+            sizes[suffix] = (len(names), size)
+        first, *rest = sorted(sizes, key=lambda suffix: sizes[suffix], reverse=True)
+        (n, size), (n_second, second) = sizes[first], sizes[rest[0]] if rest else (0, 0)
+        is_unclear = n_second > 1 or (n == n_second and size < MUCH_LARGER * second)
+        return UNKNOWN if is_unclear else first
 
     def contents(self) -> dict[str, bytes]:
         """Return the content of some files, as far as the budget goes.
@@ -138,20 +153,20 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     groups = group_files(root, sample.stated.get("files"))
     if not groups:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}; found none in {root}.")
-    if sum(len(names) > 1 for names in groups.values()) > 1 and "files" not in sample.stated:
+    sample.base = root if root.is_dir() else root.parent
+    suffix = sample.largest(groups)
+    if suffix == UNKNOWN and "files" not in sample.stated:
         counts = listed(f"{' '.join(globs(n))} ({len(n)} files)" for n in groups.values())
         notes = {"files": f"one of {counts}", "channels": "they follow from files"}
         return Description(files=(UNKNOWN,), notes=notes)
-    base = sample.base = root if root.is_dir() else root.parent
-    sizes = {s: sum((base / name).stat().st_size for name in names) for s, names in groups.items()}
-    suffix = max(groups, key=lambda suffix: (len(groups[suffix]), sizes[suffix]))
-    sample.names = groups.pop(suffix)
+    sample.names = groups.get(suffix) or [name for names in groups.values() for name in names]
+    beside = group_files(root, None).values()
+    sample.others = [n for names in beside for n in names if n not in {*sample.names}]
     kind = sample.stated.setdefault("format", SUFFIXES.get(suffix, "text"))
     sample.stated.setdefault("files", globs(sample.names))
     if kind == "mcap":
         bags = [sample.base / name for name in sample.names]
         return describe_bag(bags, sample.stated)  # type: ignore[no-any-return, no-untyped-call]
-    sample.others = [name for names in groups.values() for name in names]
     return _describe_files(sample)
 
 
@@ -171,7 +186,7 @@ def _describe_files(sample: Sample) -> Description:
         start = start.with_values({**form, **sample.stated})
     files: list[Tables] = []
     for name, content in contents.items():
-        with suppress(DataError if len(contents) > 1 else ()):
+        with suppress(*([DataError] if len(contents) > 1 else [])):
             files.append(sample.tables(content, name, start))
     heads = Counter(tuple(t.columns) for tables in files for t in tables[:1]).most_common(1)
     files = [tables for tables in files if tables and tuple(tables[0].columns) == heads[0][0]]

@@ -78,7 +78,7 @@ def run_columns(tables: Tables) -> list[str]:
         n_runs = [int((words[1:] != words[:-1]).sum()) + 1 for words in column.words]
         n_rows = sum(map(len, column.words))
         is_part = PART_NAME.search(column.name) is not None
-        is_clock = CLOCK_NAME.search(column.name) and not is_part
+        is_clock = (CLOCK_NAME.search(column.name) and not is_part) or column.time_forms
         is_fraction = any(re.search(r"\d[.,]\d", word) for word in [*column.counts][:3])
         is_unique = len(column.counts) == sum(n_runs) and "" not in column.counts
         is_long = n_rows >= LEAST_RUN * sum(n_runs) and sum(n > 1 for n in n_runs) > len(tables) / 2

@@ -59,13 +59,15 @@ class Roles:
     def assign(self) -> Description:
         """Return the description with all roles."""
         self.columns = columns_of(self.tables, self.description.text)
-        self.qualify_rows()
+        if UNKNOWN not in self.description.part.column:
+            self.qualify_rows()
         self.put(describe_clock(self.columns, self.notes, self.description.time.column))
         self.find_part()
         self.find_label()
         self.find_channels()
         clock = self.description.time
-        if clock.column and UNKNOWN not in clock.column + clock.format:
+        needed = clock.column + clock.format + self.description.part.column
+        if clock.column and UNKNOWN not in needed:
             tables = [*map(self.kept_rows, self.tables)]
             self.put(describe_rate(tables, clock, self.description.text, self.notes))
         self.find_lengths()
@@ -235,9 +237,8 @@ class Roles:
             n = counts.total()
             strange = [w for w, k in odd.items() if w.lower() not in LOST and k > STRANGE * n]
             is_clock = CLOCK_NAME.search(name) and is_rising(column)
-            is_fixed = column.fixed and len(column.words[0]) > 1
             is_number = len(counts) - len(odd) > 1 and odd.total() <= MOST_FREQUENT * n
-            is_other = is_used(name) or COUNTER_NAME.fullmatch(name) or is_clock or is_fixed
+            is_other = is_used(name) or COUNTER_NAME.fullmatch(name) or is_clock or column.fixed
             if is_number and not strange and not is_other:
                 units[name] = column.unit or unit_in(name.rstrip(ANY))
         return units
