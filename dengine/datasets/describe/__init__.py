@@ -45,7 +45,7 @@ NO_RECORDING = re.compile(
 )
 MOST_FILES = 60  # that are read
 MOST_BYTES = 4_000_000  # of all files that are read, and of one
-MOST_ROWS = 200_000
+MOST_ROWS = 50_000
 MUCH_LARGER = 5
 NUMBERS = re.compile(r"\d+")
 Names = Sequence[str]
