@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,12 @@ class Sample:
         (n, size), (n_second, second) = sizes[first], sizes[rest[0]] if rest else (0, 0)
         is_unclear = n_second > 1 or (n == n_second and size < MUCH_LARGER * second)
         return UNKNOWN if is_unclear else first
+
+    def choose(self, names: Names, groups: Mapping[str, Names]) -> None:
+        """Set the names of the recordings, and of the files beside them."""
+        self.names = names
+        self.others = [name for name in chain(*groups.values()) if name not in {*names}]
+        self.stated.setdefault("files", globs(names))
 
     def contents(self) -> dict[str, bytes]:
         """Return the content of some files, as far as the budget goes.
@@ -159,12 +166,10 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         counts = listed(f"{' '.join(globs(n))} ({len(n)} files)" for n in groups.values())
         notes = {"files": f"one of {counts}", "channels": "they follow from files"}
         return Description(files=(UNKNOWN,), notes=notes)
-    sample.names = groups.get(suffix) or [name for names in groups.values() for name in names]
-    beside = group_files(root, None).values()
-    sample.others = [n for names in beside for n in names if n not in {*sample.names}]
-    kind = sample.stated.setdefault("format", SUFFIXES.get(suffix, "text"))
-    sample.stated.setdefault("files", globs(sample.names))
-    if kind == "mcap":
+    names = groups.get(suffix) or [*chain(*groups.values())]
+    sample.choose(names, group_files(root, None))
+    sample.stated.setdefault("format", SUFFIXES.get(suffix, "text"))
+    if sample.stated["format"] == "mcap":
         bags = [sample.base / name for name in sample.names]
         return describe_bag(bags, sample.stated)  # type: ignore[no-any-return, no-untyped-call]
     return _describe_files(sample)
@@ -212,7 +217,7 @@ def _describe_tables(start: Description, files: Sequence[Tables], sample: Sample
     return Roles(start, stated, places, whole, sample.base, sample.others, notes).assign()
 
 
-def group_files(root: Path, stated: Any) -> dict[str, Names]:
+def group_files(root: Path, stated: Any) -> dict[str, list[str]]:
     """Return the files of a folder by their suffix, each as seen from it, in their natural order.
 
     Left out are hidden files, descriptions, pages for people, and files of other suffixes.
@@ -222,7 +227,7 @@ def group_files(root: Path, stated: Any) -> dict[str, Names]:
     patterns = [stated] if isinstance(stated, str) else stated or ["**/*"]
     paths = {path for pattern in patterns for path in root.glob(pattern) if path.is_file()}
     names = [root.name] if root.is_file() else [p.relative_to(root).as_posix() for p in paths]
-    groups: dict[str, Names] = {}
+    groups: dict[str, list[str]] = {}
     for name in sorted(names, key=natural_key):
         suffix = Path(name.lower().removesuffix(".gz")).suffix
         is_known = suffix in SUFFIXES or stated or root.is_file()

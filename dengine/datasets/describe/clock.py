@@ -1,6 +1,7 @@
 """Which columns are the clock, in which form, and at which rate they tick."""
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -11,7 +12,7 @@ from ...errors import listed
 from ..checks import LEAST_RATE_HZ, MOST_RATE_HZ
 from ..description import UNKNOWN, Clock, TextForm
 from ..read.clock import UNITS, scale_of, times_of
-from ..table import UnreadableError
+from ..table import Table, UnreadableError
 from .cells import Column, Floats, Notes, Tables, Values
 
 NAME = re.compile(
@@ -20,7 +21,7 @@ NAME = re.compile(
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
-UNNAMED = re.compile(r"c(olumn)?\d+")
+UNNAMED = re.compile(r"c0|column1")  # the first column without a name
 # Two columns beside each other that are whole seconds and nanoseconds.
 SECONDS = re.compile(r"(?i)(^|[^n])secs?(onds?)?$")
 NANOSECONDS = re.compile(r"(?i)(^|[^a-z])n(ano)?_?se|nsecs?$")
@@ -80,24 +81,30 @@ def clock_columns(columns: Columns, notes: Notes) -> list[str]:
     for first, second in pairwise(columns):
         if SECONDS.search(first) and NANOSECONDS.search(second):
             return [first, second]
-    named = [column for column in columns.values() if NAME.search(column.name)]
-    dated = [column for column in named if column.time_forms]
-    numbers = [c.name for c in named if c not in dated and is_rising(c)]
-    whole = [column.name for column in dated if column.tells_day and column.tells_time]
-    days = [column.name for column in dated if not column.tells_time]
-    of_day = [column.name for column in dated if not column.tells_day]
-    for candidates in (whole, of_day, numbers):
-        if len(candidates) > 1:
-            notes["time.column"] = f"one of {listed(candidates)}"
-        if candidates:
-            break
-    if whole or of_day:
-        fractions = [c.name for c in named if c not in dated and FRACTIONS.search(c.name)]
-        return [*(whole[:1] or [*days[:1], *of_day[:1]]), *fractions[:1]]
-    unnamed = [] if numbers else [c for c in columns.values() if c not in named]
-    texts = [c.name for c in unnamed if c.tells_time]
-    even = [c.name for c in unnamed[:1] if UNNAMED.fullmatch(c.name) and is_even(c)]
-    return (numbers or texts or even)[:1]
+    kinds = defaultdict[str, list[str]](list)
+    for name, column in columns.items():
+        kinds[_kind_of(column)].append(name)
+    fractions = kinds["fraction"][:1]
+    rising = [name for name in fractions if is_rising(columns[name])]
+    found = kinds["moment"] or kinds["time"] or kinds["number"] or rising
+    notes |= {"time.column": f"one of {listed(found)}"} if len(found) > 1 else {}
+    if kinds["moment"] or kinds["time"]:
+        return [*([] if kinds["moment"] else kinds["day"][:1]), *found[:1], *fractions]
+    return (found or kinds["unnamed"])[:1]
+
+
+def _kind_of(column: Column) -> str:
+    """Return what a column tells of the times of samples; "" for nothing."""
+    day, time = column.tells_day, column.tells_time
+    if not NAME.search(column.name):
+        is_clock = time or (UNNAMED.fullmatch(column.name) and is_even(column))
+        return "unnamed" if is_clock else ""
+    if column.time_forms:
+        kind = {(True, True): "moment", (True, False): "day", (False, True): "time"}
+        return "" if time and column.fixed else kind.get((day, time), "")
+    if FRACTIONS.search(column.name):
+        return "fraction"
+    return "number" if is_rising(column) else ""
 
 
 def is_rising(column: Column) -> bool:
@@ -171,11 +178,7 @@ def is_rate(step: float) -> bool:
 
 def describe_rate(tables: Tables, clock: Clock, form: TextForm, notes: Notes) -> Values:
     """Return the rate of a clock, the longest step that is allowed, and what else it needs."""
-    recordings = []
-    for table in tables:
-        with suppress(UnreadableError):
-            recordings.append(np.diff(times_of(table, clock, form)[0]))
-    recordings = [steps for steps in recordings if len(steps)]
+    recordings = [steps for table in tables if len(steps := _steps(table, clock, form))]
     forward = [some for steps in recordings if len(some := steps[steps >= 0])]
     if not forward:
         notes["time.rate_hz"] = "the times do not rise"
@@ -183,27 +186,33 @@ def describe_rate(tables: Tables, clock: Clock, form: TextForm, notes: Notes) ->
     usual = float(np.median([np.median(steps) for steps in forward]))
     mean = float(np.median([steps.mean() for steps in forward]))
     values: Values = {}
-    n_coarse = sum((steps == 0).mean() > COARSE for steps in forward)
     n_back = sum((steps < 0).any() for steps in recordings)
     if n_back > FEW * len(recordings) and not clock.wrap:
         text = f"times fall in {n_back} of {len(recordings)} recordings: does the counter begin"
         values["time.wrap"] = UNKNOWN
         notes["time.wrap"] = f"{text} again (state time.wrap), or are rows in another order "
         notes["time.wrap"] += "(time.wrap=0 and time.sort=true)?"
-    elif n_coarse > len(recordings) / 2:
+    elif sum((steps == 0).mean() > COARSE for steps in forward) > len(recordings) / 2:
         usual = mean
         values["time.gap"] = 0.0
         notes["time.gap"] = "the clock is coarser than the samples, so its steps are not checked"
-    elif is_uneven(forward):
-        usual = mean
-        values |= {"traces.lengths": "resample", **_describe_gaps(forward, mean, notes)}
-        notes["traces.lengths"] = "the samples are not taken at even times"
     else:
+        if is_uneven(forward):
+            usual = mean
+            values["traces.lengths"] = "resample"
+            notes["traces.lengths"] = "the samples are not taken at even times"
         values |= _describe_gaps(forward, usual, notes)
-    if not is_rate(usual):
-        notes["time.rate_hz"] = f"steps of {usual:.6g} s are of no force: is time.format right?"
-        return {**values, "time.rate_hz": UNKNOWN}
-    return {**values, "time.rate_hz": round_rate(1 / usual)}
+    if is_rate(usual):
+        return {**values, "time.rate_hz": round_rate(1 / usual)}
+    notes["time.rate_hz"] = f"steps of {usual:.6g} s are of no force: is time.format right?"
+    return {**values, "time.rate_hz": UNKNOWN}
+
+
+def _steps(table: Table, clock: Clock, form: TextForm) -> Floats:
+    """Return the seconds between the samples of a recording; none if its times are damaged."""
+    with suppress(UnreadableError):
+        return np.diff(times_of(table, clock, form)[0])
+    return np.empty(0)
 
 
 def is_uneven(recordings: Sequence[Floats]) -> bool:

@@ -46,6 +46,7 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
 )
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
+Words = Sequence[str]
 Sources = list[LabelSource]
 Places = Mapping[str, Place]
 
@@ -95,20 +96,24 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     what the column's name says: good for `success`, bad for `failed`; of other names nothing.
     """
     words = sorted({*words})
-    lower = {word.lower() for word in words}
-    name = source.column or source.line
-    good, bad = {*GOOD} - ({"io"} if "nio" not in lower else set()), {*BAD}
-    if name and lower <= {*YES, *NO, *UNCHECKED}:
-        is_good = GOOD_NAME.search(name) or (lower & {"true", "false"} and NAME.search(name))
-        good, bad = ({*YES}, {*NO}) if is_good else (set(), set())
-        good, bad = ({*NO}, {*YES}) if BAD_NAME.search(name) else (good, bad)
-    kinds = {"good": good, "bad": bad, "unchecked": {*UNCHECKED}}
+    good, bad = _verdicts(source.column or source.line, {word.lower() for word in words})
+    kinds = {"good": good, "bad": bad, "unchecked": UNCHECKED}
     found = {key: tuple(w for w in words if w.lower() in some) for key, some in kinds.items()}
     is_one_sided = source.path and not (found["good"] and found["bad"])
     if is_one_sided or len(words) > sum(map(len, found.values())):
         found |= {key: found[key] or (UNKNOWN,) for key in ("good", "bad")}
     stated: Values = {key: getattr(source, key) or some for key, some in found.items()}
     return replace(source, **stated)
+
+
+def _verdicts(name: str, words: set[str]) -> tuple[Words, Words]:
+    """Return the words for good and for bad in a column or line of this name."""
+    if not name or not words <= {*YES, *NO, *UNCHECKED}:
+        return [word for word in GOOD if word != "io" or "nio" in words], BAD
+    if BAD_NAME.search(name):
+        return NO, YES
+    is_good = GOOD_NAME.search(name) or (words & {"true", "false"} and NAME.search(name))
+    return (YES, NO) if is_good else ((), ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,9 +220,8 @@ def choose(
     if known or len(candidates) == 1:
         best, *checks = known or candidates
         counts = counts_of(best.words.values())
-        others = listed(other.title for other in candidates if other not in (best, *checks))
-        also = f"; of unknown meaning: {others}" if others else ""
-        notes[f"label.{best.kind}"] = f"{counts}, {over}{also}"
+        others = [f"of unknown meaning: {c.title}" for c in candidates if c not in (best, *checks)]
+        notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *others])
         if UNKNOWN in best.source.good + best.source.bad:
             notes["label.good"] = notes["label.bad"] = f"which of the words? {counts}"
         return best.source, [check.source for check in checks]

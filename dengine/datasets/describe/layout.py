@@ -36,23 +36,27 @@ def layout_of(start: Description, files: Files) -> str:
     """
     first = files[0][0]
     kind = start.format
-    is_json = kind in ("json", "jsonl")
-    if is_json and (len(files) == 1 or len(files[0]) > 1):
-        return "wide" if any(len(cells) > 1 for cells in first.columns.values()) else "long"
+    if kind in ("json", "jsonl") and (len(files) == 1 or len(files[0]) > 1):
+        return "wide" if max(map(len, first.columns.values())) > 1 else "long"
     if kind == "ts" or numbered_columns(first) or _has_lists(first):
         return "wide"
-    stated_part = start.part.column
-    changes = any(len({*first.words(name)}) > 1 for name in stated_part if name in first.columns)
-    if changes or run_columns([tables[0] for tables in files]):
+    stated = [first.words(name) for name in start.part.column if name in first.columns]
+    if max(map(len, map(set, stated)), default=0) > 1 or run_columns(
+        [tables[0] for tables in files]
+    ):
         return "long"
     if len(files) > 1:
         return "files"
     _refuse_results(first)
-    names = [name for name in first.columns if not CLOCK_NAME.search(name)]
+    return "columns" if _has_curves(first) else "long"
+
+
+def _has_curves(table: Table) -> bool:
+    """Return whether most columns are parts: their names are alike but for numbers, or verdicts."""
+    names = [name for name in table.columns if not CLOCK_NAME.search(name)]
     shapes = Counter(re.sub(r"\d+", "0", name) for name in names)
-    alike = max(shapes.values(), default=0) > len(names) / 2
-    are_parts = len(names) >= LEAST_PARTS and (alike or labels.in_paths(names))
-    return "columns" if are_parts else "long"
+    are_alike = max(shapes.values(), default=0) > len(names) / 2
+    return len(names) >= LEAST_PARTS and (are_alike or bool(labels.in_paths(names)))
 
 
 def numbered_columns(table: Table) -> list[str]:
@@ -121,15 +125,14 @@ def places_of(files: Files, description: Description, is_cut: bool) -> dict[str,
 
     is_cut : whether files were read in part, so that the last part may be cut.
     """
-    names = [*files[0][0].columns]
     patterns = numbered_columns(files[0][0])
-    clock = [name for name in names if CLOCK_NAME.search(name)]
     if description.layout == "columns":
-        curves = [name for name in names if name not in clock]
-        stem = re.match(r"\D*", curves[0])
-        stems = {name[: len(stem[0])] for name in curves} if stem else set()
-        patterns = [f"{stems.pop()}{ANY}" if len(stems) == 1 else ANY]
+        clock = [name for name in files[0][0].columns if CLOCK_NAME.search(name)]
         description = description.with_values({"time.column": clock})
+        curves = [name for name in files[0][0].columns if name not in clock]
+        stem = curves[0].rstrip("0123456789")
+        is_common = all(name.startswith(stem) for name in curves)
+        patterns = [f"{stem}{ANY}" if is_common else ANY]
     if description.layout in ("wide", "columns") and not description.channels:
         description = replace(description, channels=tuple(map(Channel, patterns)))
     places = dict[str, Place]()

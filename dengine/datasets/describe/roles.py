@@ -174,53 +174,60 @@ class Roles:
 
     def find_label(self) -> None:
         """Find the source of the labels, and those that must agree with it."""
-        own, is_used = self.description.label, self.is_used
-        places = {name: Place(name, Table(name, {}, [])) for name in self.names} | {**self.places}
-        parts = dict[str, str]()
-        for name, place in places.items():
-            with suppress(DataError):
-                parts[name] = part_of(self.description.part, place)
-        finder = labels.Labels(self.base, places, parts, self.description.text)
+        own, is_used, finder = self.description.label, self.is_used, self.label_finder()
         columns = [column for name, column in self.columns.items() if not is_used(name)]
         is_stated = any(getattr(own, kind) for kind in labels.KINDS)
         sources = [own]
         if not is_stated:
             sources = finder.in_listings(self.others)
             if self.description.layout in ("files", "columns"):
-                sources += labels.in_paths(place.path for place in places.values())
+                sources += labels.in_paths(place.path for place in finder.places.values())
             sources += labels.in_columns(columns) + labels.in_lines(self.tables[0].above)
         found = [finder.candidate(source) for source in sources]
         found = [candidate for candidate in found if candidate.words or is_stated]
         few = [column for column in columns if 1 < len({*column.fixed}) <= FEW_WORDS]
         hints = [f"{column.name} ({counts_of(column.fixed)})" for column in few]
-        label, checks = labels.choose(found, self.notes, hints, len(places))
+        label, checks = labels.choose(found, self.notes, hints, len(finder.places))
         self.description = replace(self.description, label=label, check=tuple(checks))
         stated = {key: value for key, value in self.stated.items() if key.startswith("label.")}
         self.description = self.description.with_values(stated)
+
+    def label_finder(self) -> labels.Labels:
+        """Return what finds the sources of labels, of all files if each is a recording."""
+        places = {name: Place(name, Table(name, {}, [])) for name in self.names} | {**self.places}
+        parts = dict[str, str]()
+        for name, place in places.items():
+            with suppress(DataError):
+                parts[name] = part_of(self.description.part, place)
+        return labels.Labels(self.base, places, parts, self.description.text)
 
     def find_channels(self) -> None:
         """Choose the channel: the only column, or the only one that a rule for forces fits."""
         units = self.units()
         if not self.description.channels:
             best = [*units] if len(units) == 1 else likely_channels(units)
-            texts = {name: f"{name} [{unit}]" if unit else name for name, unit in units.items()}
             name = best[0] if len(best) == 1 else UNKNOWN
-            others = listed(text for other, text in texts.items() if other != name)
+            texts = [f"{n} [{unit}]" if unit else n for n, unit in units.items() if n != name]
+            others = listed(texts)
             note = f"one or several of: {others}" if units else "no column has numbers that change"
             if name != UNKNOWN:
                 self.description = replace(self.description, channels=(Channel(name, units[name]),))
                 note = f"others: {others}" if others else ""
             self.notes |= {f"channels.{name}": note, "channels": note}
+        self.find_lost()
+
+    def find_lost(self) -> None:
+        """Find the words for lost samples of the channels, and rows that have none of them."""
         rows = dict(self.description.rows)
         missing = {*self.description.text.missing}
-        names = [channel.column for channel in self.description.channels]
-        for column in (self.columns[name] for name in names if name in self.columns):
+        names = {channel.column for channel in self.description.channels} & {*self.columns}
+        for name in names:
+            column = self.columns[name]
             odd = {word for word in column.odd if word.lower() in LOST}
             is_sparse = column.counts[""] > SPARSE * column.counts.total()
-            if is_sparse and column.name not in rows:
-                rows[column.name] = RowWords((ANY,), ("",))
-                text = "rows without a value are no samples of it"
-                self.notes[f"rows.{column.name}.drop"] = text
+            if is_sparse:
+                rows.setdefault(name, RowWords((ANY,), ("",)))
+                self.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"
             missing |= odd - ({""} if is_sparse else set())
         self.set_rows(rows)
         self.put({"text.missing": sorted(missing)} if missing else {})

@@ -138,13 +138,8 @@ def describe_form(looks: Mapping[str, Look], notes: Notes) -> tuple[Values, list
 
     These have another delimiter, another number of columns, or no column in common with most.
     """
-    forms = Counter((look.delimiter, look.width) for look in looks.values())
-    same = [x for x in looks.values() if (x.delimiter, x.width) == forms.most_common(1)[0][0]]
-    places = Counter(look.places for look in same)
-    header, units, data = places.most_common(1)[0][0]
-    usual = next(look for look in same if look.places == (header, units, data))
-    names = {*usual.names}
-    same = [look for look in same if not names or not names.isdisjoint(look.names)]
+    usual, same = _usual(looks)
+    header, units, data = usual.places
     encoding = min({look.encoding for look in same} - {"utf-8"}, default="utf-8")
     if encoding == "cp1252":
         notes["text.encoding"] = "not UTF-8; cp1252 reads any text: look at the letters below"
@@ -161,6 +156,16 @@ def describe_form(looks: Mapping[str, Look], notes: Notes) -> tuple[Values, list
     cells = {cell.strip() for look in same for row in look.rows for cell in row}
     values |= marks([cell for cell in cells if NUMBER.fullmatch(cell)], notes)
     return values, [name for name, look in looks.items() if look not in same]
+
+
+def _usual(looks: Mapping[str, Look]) -> tuple[Look, list[Look]]:
+    """Return a file like most, and those that are written in its form."""
+    forms = Counter((look.delimiter, look.width) for look in looks.values())
+    same = [x for x in looks.values() if (x.delimiter, x.width) == forms.most_common(1)[0][0]]
+    places = Counter(look.places for look in same).most_common(1)[0][0]
+    usual = next(look for look in same if look.places == places)
+    names = {*usual.names}
+    return usual, [look for look in same if not names or not names.isdisjoint(look.names)]
 
 
 def _missing_names(usual: Look) -> list[str]:
@@ -184,16 +189,23 @@ def marks(cells: Iterable[str], notes: Notes) -> Values:
     three digits, or stands behind the other mark: `0,004` and `1.043,5` prove a comma, `1.043`
     proves nothing. Where both fit, the decimal mark is `?`.
     """
-    seen = {mark: [cell for cell in cells if mark in cell] for mark in ".,"}
-    proof = {mark: sum(map(bool, map(DECIMAL[mark].fullmatch, seen[mark]))) for mark in ".,"}
-    group = next((m for m in GROUPS if any(re.search(rf"\d{m}\d{{3}}", c) for c in cells)), "")
+    counts = {mark: _count_marks(cells, mark) for mark in ".,"}
+    text = "\n".join(cells)
+    group = next((mark for mark in GROUPS if re.search(rf"\d{mark}\d{{3}}", text)), "")
     for decimal, other in (".,", ",."):
-        repeats = any(cell.count(other) > 1 for cell in seen[other])
-        if proof[decimal] > 20 * proof[other] or (repeats and not proof[other]):
-            return {"text.decimal": decimal, "text.thousands": other if seen[other] else group}
-    examples = seen["."] or seen[","]
+        (_, proof, _), (n_other, against, repeats) = counts[decimal], counts[other]
+        if proof > 20 * against or (repeats and not against):
+            return {"text.decimal": decimal, "text.thousands": other if n_other else group}
+    example = min(filter(re.compile("[.,]").search, cells), default="")
     text = "both marks are used for decimals, in other files or columns"
-    if examples and not any(proof.values()):
-        text = f"'.' or ','; {min(examples)} may be a fraction or a thousand"
-    notes |= {"text.decimal": text} if examples else {}
-    return {"text.decimal": UNKNOWN if examples else ".", "text.thousands": group}
+    if not counts["."][1] and not counts[","][1]:
+        text = f"'.' or ','; {example} may be a fraction or a thousand"
+    notes |= {"text.decimal": text} if example else {}
+    return {"text.decimal": UNKNOWN if example else ".", "text.thousands": group}
+
+
+def _count_marks(cells: Iterable[str], mark: str) -> tuple[int, int, int]:
+    """Return how many numbers have a mark, prove that it is the decimal one, or have it twice."""
+    seen = [cell for cell in cells if mark in cell]
+    proofs = [cell for cell in seen if DECIMAL[mark].fullmatch(cell)]
+    return len(seen), len(proofs), sum(cell.count(mark) > 1 for cell in seen)
