@@ -130,7 +130,7 @@ def places_of(files: Files, description: Description, is_cut: bool) -> dict[str,
         clock = [name for name in files[0][0].columns if CLOCK_NAME.search(name)]
         description = description.with_values({"time.column": clock})
         curves = [name for name in files[0][0].columns if name not in clock]
-        stem = curves[0].rstrip("0123456789")
+        stem = re.split(r"\d", curves[0])[0]
         is_common = all(name.startswith(stem) for name in curves)
         patterns = [f"{stem}{ANY}" if is_common else ANY]
     if description.layout in ("wide", "columns") and not description.channels:
