@@ -23,7 +23,7 @@ from ..read.text import read_text
 from ..table import UnreadableError
 from .bags import describe_bag
 from .cells import Notes, Stated, Tables
-from .layout import layout_of, part_columns, places_of
+from .layout import LEAST_RUN, layout_of, part_columns, places_of
 from .roles import Roles
 from .text_form import describe_form, look
 
@@ -188,6 +188,11 @@ def _describe_files(sample: Sample) -> Description:
         sample.others = [*sample.others, *odd]
         sample.names = [name for name in sample.names if name not in odd]
         contents = {name: content for name, content in contents.items() if name not in odd}
+        forms = Counter(
+            (x.delimiter, x.width) for n in odd if len((x := looks[n]).rows) > LEAST_RUN
+        )
+        if max(forms.values(), default=0) > 1 and "exclude" not in sample.stated:
+            start = replace(start, exclude=(UNKNOWN,))
         start = start.with_values({**form, **sample.stated})
     files: list[Tables] = []
     for name, content in contents.items():

@@ -273,12 +273,15 @@ class Roles:
     def list_others(self) -> None:
         """List the columns without a role, and the files beside the recordings."""
         description, is_used = self.description, self.is_used
-        others = [name for name in self.columns if not is_used(name)]
-        units = {name: unit_in(name) or self.columns[name].unit for name in others}
+        columns = {name: c for name, c in self.columns.items() if not is_used(name)}
+        units = {name: unit_in(name) or column.unit for name, column in columns.items()}
         listings = {source.listing for source in (description.label, *description.check)}
-        exclude = sorted({*self.others} - listings, key=natural_key)
-        self.notes |= {"exclude": "files of another form, which are not read"} if exclude else {}
-        exclude = [*description.exclude, *exclude]
+        others = sorted({*self.others} - listings, key=natural_key)
+        text = f"not read, for they are of another form: {listed(others)}"
+        is_open = UNKNOWN in description.exclude
+        text = f"{text}; are these recordings? State files or exclude" if is_open else text
+        self.notes |= {"exclude": text} if others else {}
+        exclude = [*description.exclude, *([] if is_open else others)]
         ignored = units if description.layout != "columns" else {}
         self.description = replace(description, ignored=ignored, exclude=tuple(exclude))
 
