@@ -25,7 +25,7 @@ from .bags import describe_bag
 from .cells import Notes, Stated, Tables
 from .layout import LEAST_RUN, layout_of, part_columns, places_of
 from .roles import Roles
-from .text_form import describe_form, look
+from .text_form import Look, describe_form, look
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -101,6 +101,15 @@ class Sample:
                 with suppress(UnreadableError):
                     contents[name] = read_file(self.base / name)
         return contents
+
+    def leave_out(self, odd: Mapping[str, Look], start: Description) -> Description:
+        """Leave out files of another form; if several of one form have samples, it is asked why."""
+        self.others = [*self.others, *odd]
+        self.names = [name for name in self.names if name not in odd]
+        long = [look for look in odd.values() if len(look.rows) >= LEAST_RUN]
+        forms = Counter((look.delimiter, look.width) for look in long)
+        is_open = max(forms.values(), default=0) > 1 and "exclude" not in self.stated
+        return replace(start, exclude=(UNKNOWN,)) if is_open else start
 
     def tables(self, content: bytes, name: str, start: Description) -> Tables:
         """Return the first tables of a file, of a text with all cells as words.
@@ -185,14 +194,8 @@ def _describe_files(sample: Sample) -> Description:
         if not looks:
             raise DataError(f"Expected a text with numbers in {listed(sample.names)}, found none.")
         form, odd = describe_form(looks, sample.notes)
-        sample.others = [*sample.others, *odd]
-        sample.names = [name for name in sample.names if name not in odd]
+        start = sample.leave_out({name: looks[name] for name in odd}, start)
         contents = {name: content for name, content in contents.items() if name not in odd}
-        forms = Counter(
-            (x.delimiter, x.width) for n in odd if len((x := looks[n]).rows) > LEAST_RUN
-        )
-        if max(forms.values(), default=0) > 1 and "exclude" not in sample.stated:
-            start = replace(start, exclude=(UNKNOWN,))
         start = start.with_values({**form, **sample.stated})
     files: list[Tables] = []
     for name, content in contents.items():

@@ -67,16 +67,6 @@ class Column:
         """How often each word comes."""
         return Counter(np.concatenate(self.words).tolist())
 
-    @cached_property
-    def is_text(self) -> bool:
-        """Whether cells are texts, of which some may be numbers."""
-        return any(table.columns[self.name].dtype.kind in "OU" for table in self.tables)
-
-    @cached_property
-    def are_numbers(self) -> bool:
-        """Whether all words but empty ones are numbers."""
-        return not any(self.odd)
-
     @property
     def title(self) -> str:
         """How often each word comes, most frequent first."""

@@ -15,7 +15,7 @@ from ...errors import DataError, listed
 from ..description import UNKNOWN, LabelSource, TextForm
 from ..read.places import SUFFIX, LabelReader, Place, listing_table, read_labels
 from ..table import UnreadableError
-from .cells import MOST_WORDS, Column, Notes, Values, columns_of, counts_of
+from .cells import MOST_WORDS, Column, Notes, Values, counts_of
 
 GOOD = (
     *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
@@ -149,10 +149,8 @@ class Labels:
             for key in table.columns:
                 plain = LabelSource(listing=name, key=key, column=key)
                 if len(self.candidate(plain).words) > len(self.places) / 2:
-                    rows = [table.take(slice(i, i + 1)) for i in range(len(table.lines))]
-                    others = [c for c in columns_of(rows, self.form).values() if c.name != key]
-                    found = in_columns(others)
-                    sources += [replace(plain, column=source.column) for source in found]
+                    verdicts = [c for c in table.columns if is_verdict(c, table.words(c))]
+                    sources += [replace(plain, column=c) for c in verdicts if c != key]
                     break
         return sources
 
@@ -169,23 +167,26 @@ def in_paths(paths: Names) -> Sources:
     return sources
 
 
+def is_verdict(name: str, words: Names) -> bool:
+    """Return whether a column has the name of a verdict, and few words; a single one is plain."""
+    words = {*words}
+    known = with_meanings(LabelSource(column=name), words)
+    is_label = len(words) > 1 or bool(known.good or known.bad)
+    is_named = NAME.search(name) or BAD_NAME.search(name)
+    return is_named is not None and is_label and len(words) <= MOST_WORDS
+
+
 def in_columns(columns: Iterable[Column]) -> Sources:
-    """Return the columns whose name is a verdict's, and whose words are few.
+    """Return the columns of verdicts.
 
     A label that changes within a recording is that of its last row, if above it stand only words
     for not checked.
     """
     sources: Sources = []
     for column in columns:
-        is_named = NAME.search(column.name) or BAD_NAME.search(column.name)
-        if not is_named or not all(map(len, column.words)):
-            continue
-        last = {str(words[-1]) for words in column.words}
-        above = {word for words in column.words for word in {*words} - {words[-1]}}
-        known = with_meanings(LabelSource(column=column.name), last)
-        is_label = len(last) > 1 or known.good or known.bad
-        is_last = {word.lower() for word in above} <= {*UNCHECKED}
-        if is_last and is_label and len(last) <= MOST_WORDS:
+        last = [str(words[-1]) for words in column.words if len(words)]
+        above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
+        if above <= {*UNCHECKED} and is_verdict(column.name, last):
             sources.append(LabelSource(column=column.name, at="same" if column.fixed else "last"))
     return sources
 

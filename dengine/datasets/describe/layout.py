@@ -94,7 +94,7 @@ def run_columns(tables: Tables) -> list[str]:
 def _refuse_results(table: Table) -> None:
     """Raise DataError for a table with a row for each result, and no samples."""
     for column in columns_of([table], TextForm()).values():
-        few = column.is_text and len(column.counts) < MOST_WORDS
+        few = column.odd and len(column.counts) < MOST_WORDS
         source = labels.with_meanings(LabelSource(), column.counts if few else ())
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1]) if few else np.empty(0)
         in_runs = len(edges) > 1 and int(np.gcd.reduce(np.diff(edges))) >= LEAST_RUN

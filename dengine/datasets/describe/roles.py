@@ -1,5 +1,6 @@
 """The role of each column: of rows, of the clock, of parts, labels and channels, or ignored."""
 
+import fnmatch
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -111,7 +112,7 @@ class Roles:
 
     def set_rows(self, rows: Mapping[str, RowWords]) -> None:
         """Set what the words of columns mean for their rows, and leave out those that are none."""
-        if rows != self.description.rows or rows:
+        if rows:
             self.description = replace(self.description, rows=rows)
             kept = [*map(self.kept_rows, self.tables)]
             self.columns = columns_of(kept, self.description.text)
@@ -147,7 +148,7 @@ class Roles:
         """
         name, words = column.name, column.counts
         is_named = QUALIFIER_NAME.search(name) is not None
-        is_text = column.is_text and not column.are_numbers and not CLOCK_NAME.search(name)
+        is_text = any(column.odd) and not CLOCK_NAME.search(name)
         varies = not column.fixed or (is_named and len(words) == 1)
         has_rows = all(len(some) > 1 for some in column.words)
         if self.is_used(name) or not ((is_named or is_text) and varies and has_rows):
@@ -253,10 +254,8 @@ class Roles:
     def find_lengths(self) -> None:
         """Find how many samples the traces have, and what happens to those of other lengths."""
         names = [channel.column for channel in self.description.channels]
-        found = [
-            len(words) for n in names[:1] if n in self.columns for words in self.columns[n].words
-        ]
-        lengths = [n for n in found if n]
+        columns = [self.columns[name] for name in names[:1] if name in self.columns]
+        lengths = [len(words) for column in columns for words in column.words if len(words)]
         if not lengths:
             return
         usual = int(np.median(lengths))
@@ -276,7 +275,11 @@ class Roles:
         columns = {name: c for name, c in self.columns.items() if not is_used(name)}
         units = {name: unit_in(name) or column.unit for name, column in columns.items()}
         listings = {source.listing for source in (description.label, *description.check)}
-        others = sorted({*self.others} - listings, key=natural_key)
+        names = {*self.others} - listings
+        names -= {
+            name for pattern in description.exclude for name in fnmatch.filter(names, pattern)
+        }
+        others = sorted(names, key=natural_key)
         text = f"not read, for they are of another form: {listed(others)}"
         is_open = UNKNOWN in description.exclude
         text = f"{text}; are these recordings? State files or exclude" if is_open else text
