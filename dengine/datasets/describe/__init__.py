@@ -189,14 +189,14 @@ def _describe_files(sample: Sample) -> Description:
     contents = sample.contents()
     start = Description().with_values(sample.stated)
     if start.format == "text":
-        found = ((name, look(content, sample.stated)) for name, content in contents.items())
-        looks = {name: one for name, one in found if one is not None}
+        forms = {name: look(content, sample.stated) for name, content in contents.items()}
+        looks = {name: form for name, form in forms.items() if form is not None}
         if not looks:
             raise DataError(f"Expected a text with numbers in {listed(sample.names)}, found none.")
-        form, odd = describe_form(looks, sample.notes)
+        text_form, odd = describe_form(looks, sample.notes)
         start = sample.leave_out({name: looks[name] for name in odd}, start)
         contents = {name: content for name, content in contents.items() if name not in odd}
-        start = start.with_values({**form, **sample.stated})
+        start = start.with_values({**text_form, **sample.stated})
     files: list[Tables] = []
     for name, content in contents.items():
         with suppress(*([DataError] if len(contents) > 1 else [])):

@@ -84,10 +84,10 @@ class Column:
         if any(table.columns[self.name].dtype.kind in "SUMb" for table in self.tables):
             return []
         try:
-            found = [table.numbers(self.name, self.form) for table in self.tables]
+            numbers = [table.numbers(self.name, self.form) for table in self.tables]
         except DataError:
             return []
-        return [values for values in found if len(values) > 1]
+        return [values for values in numbers if len(values) > 1]
 
     @cached_property
     def fixed(self) -> list[str]:
@@ -111,8 +111,8 @@ class Column:
             return [ISO]
         if cells[0].dtype.kind != "O":
             return []
-        some = [[*column[:MOST_CELLS], *column[-1:]] for column in cells]
-        texts = pd.Series([cell for column in some for cell in column]).astype(str).str.strip()
+        samples = [[*column[:MOST_CELLS], *column[-1:]] for column in cells]
+        texts = pd.Series([cell for column in samples for cell in column]).astype(str).str.strip()
         if not texts.str.contains(LIKE_A_TIME, regex=True).all():
             return []
         has_comma = texts.str.contains(",").any()

@@ -86,11 +86,11 @@ def clock_columns(columns: Columns, notes: Notes) -> list[str]:
         kinds[_kind_of(column)].append(name)
     fractions = kinds["fraction"][:1]
     rising = [name for name in fractions if is_rising(columns[name])]
-    found = kinds["moment"] or kinds["time"] or kinds["number"] or rising
-    notes |= {"time.column": f"one of {listed(found)}"} if len(found) > 1 else {}
+    clocks = kinds["moment"] or kinds["time"] or kinds["number"] or rising
+    notes |= {"time.column": f"one of {listed(clocks)}"} if len(clocks) > 1 else {}
     if kinds["moment"] or kinds["time"]:
-        return [*([] if kinds["moment"] else kinds["day"][:1]), *found[:1], *fractions]
-    return (found or kinds["unnamed"])[:1]
+        return [*([] if kinds["moment"] else kinds["day"][:1]), *clocks[:1], *fractions]
+    return (clocks or kinds["unnamed"])[:1]
 
 
 def _kind_of(column: Column) -> str:
@@ -179,7 +179,7 @@ def is_rate(step: float) -> bool:
 def describe_rate(tables: Tables, clock: Clock, form: TextForm, notes: Notes) -> Values:
     """Return the rate of a clock, the longest step that is allowed, and what else it needs."""
     recordings = [steps for table in tables if len(steps := _steps(table, clock, form))]
-    forward = [some for steps in recordings if len(some := steps[steps >= 0])]
+    forward = [rising for steps in recordings if len(rising := steps[steps >= 0])]
     if not forward:
         notes["time.rate_hz"] = "the times do not rise"
         return {"time.rate_hz": UNKNOWN}

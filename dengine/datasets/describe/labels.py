@@ -65,10 +65,10 @@ class Candidate:
 
     @property
     def labels(self) -> dict[str, int | None]:
-        """The label of each recording whose word has a known meaning."""
+        """The label of each recording whose word has a meaning that is known."""
         reader = LabelReader(self.source)
-        known = {*self.source.good, *self.source.bad, *self.source.unchecked}
-        return {name: reader.meaning(w) for name, w in self.words.items() if w in known}
+        meanings = {*self.source.good, *self.source.bad, *self.source.unchecked}
+        return {name: reader.meaning(w) for name, w in self.words.items() if w in meanings}
 
     @property
     def is_known(self) -> bool:
@@ -98,11 +98,13 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     words = sorted({*words})
     good, bad = _verdicts(source.column or source.line, {word.lower() for word in words})
     kinds = {"good": good, "bad": bad, "unchecked": UNCHECKED}
-    found = {key: tuple(w for w in words if w.lower() in some) for key, some in kinds.items()}
-    is_one_sided = source.path and not (found["good"] and found["bad"])
-    if is_one_sided or len(words) > sum(map(len, found.values())):
-        found |= {key: found[key] or (UNKNOWN,) for key in ("good", "bad")}
-    stated: Values = {key: getattr(source, key) or some for key, some in found.items()}
+    meanings = {
+        key: tuple(w for w in words if w.lower() in verdicts) for key, verdicts in kinds.items()
+    }
+    is_one_sided = source.path and not (meanings["good"] and meanings["bad"])
+    if is_one_sided or len(words) > sum(map(len, meanings.values())):
+        meanings |= {key: meanings[key] or (UNKNOWN,) for key in ("good", "bad")}
+    stated: Values = {key: getattr(source, key) or meanings[key] for key in kinds}
     return replace(source, **stated)
 
 
@@ -160,9 +162,9 @@ def in_paths(paths: Names) -> Sources:
     stems = [SUFFIX.sub("", path) for path in paths]
     sources: Sources = []
     for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
-        found = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
-        if len(found) > len(stems) / 2:
-            used = sorted({*found}, key=lambda text: (-len(text), text))
+        words = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
+        if len(words) > len(stems) / 2:
+            used = sorted({*words}, key=lambda text: (-len(text), text))
             sources.append(LabelSource(path=pattern.replace(WORD, "|".join(map(re.escape, used)))))
     return sources
 
@@ -170,8 +172,8 @@ def in_paths(paths: Names) -> Sources:
 def is_verdict(name: str, words: Names) -> bool:
     """Return whether a column has the name of a verdict, and few words; a single one is plain."""
     words = {*words}
-    known = with_meanings(LabelSource(column=name), words)
-    is_label = len(words) > 1 or bool(known.good or known.bad)
+    source = with_meanings(LabelSource(column=name), words)
+    is_label = len(words) > 1 or bool(source.good or source.bad)
     is_named = NAME.search(name) or BAD_NAME.search(name)
     return is_named is not None and is_label and len(words) <= MOST_WORDS
 
@@ -211,15 +213,15 @@ def choose(
 
     hints : columns that may hold labels under other names. n : recordings that were looked at.
     """
-    known = [candidate for candidate in candidates if candidate.is_known]
+    certain = [candidate for candidate in candidates if candidate.is_known]
     over = f"over {n:,} recordings"
-    for first, second in combinations(known, 2):
+    for first, second in combinations(certain, 2):
         if count := first.disagreements(second):
             text = f"{first.title} and {second.title} disagree on {count:,} of {n:,} recordings"
             notes["label.column"] = f"{text}: which is right?"
             return LabelSource(column=UNKNOWN), []
-    if known or len(candidates) == 1:
-        best, *checks = known or candidates
+    if certain or len(candidates) == 1:
+        best, *checks = certain or candidates
         counts = counts_of(best.words.values())
         others = [f"of unknown meaning: {c.title}" for c in candidates if c not in (best, *checks)]
         notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *others])

@@ -77,7 +77,7 @@ def run_columns(tables: Tables) -> list[str]:
     In a column of parts no word returns, also in another file, and its runs are of 8 rows or more
     in the mean. First stand those with the name of a part, then those with most runs.
     """
-    found = []
+    columns = []
     for column in columns_of(tables, TextForm()).values():
         n_runs = [int((words[1:] != words[:-1]).sum()) + 1 for words in column.words]
         n_rows = sum(map(len, column.words))
@@ -87,8 +87,8 @@ def run_columns(tables: Tables) -> list[str]:
         is_unique = len(column.counts) == sum(n_runs) and "" not in column.counts
         is_long = n_rows >= LEAST_RUN * sum(n_runs) and sum(n > 1 for n in n_runs) > len(tables) / 2
         if is_unique and is_long and not is_fraction and not is_clock:
-            found.append((not is_part, -sum(n_runs), column.name))
-    return [name for *_, name in sorted(found)]
+            columns.append((not is_part, -sum(n_runs), column.name))
+    return [name for *_, name in sorted(columns)]
 
 
 def _refuse_results(table: Table) -> None:
@@ -109,14 +109,14 @@ def part_columns(files: Files, notes: Notes) -> list[str]:
     It has the name of a part, or is the only one whose words have numbers in them.
     """
     tables = [tables[0] if len(tables) == 1 else join(tables) for tables in files]
-    found = run_columns(tables)
-    named = [name for name in found if PART_NAME.search(name)]
-    numbered = [name for name in found if re.search(r"\d", str(tables[0].words(name)[0]))]
+    candidates = run_columns(tables)
+    named = [name for name in candidates if PART_NAME.search(name)]
+    numbered = [name for name in candidates if re.search(r"\d", str(tables[0].words(name)[0]))]
     best = named[:1] or numbered
     if len(best) == 1:
         notes |= {"part.column": f"one of {listed(named)}"} if len(named) > 1 else {}
         return best
-    notes["part.column"] = f"one, or several, of {listed(found or tables[0].columns)}"
+    notes["part.column"] = f"one, or several, of {listed(candidates or tables[0].columns)}"
     return [UNKNOWN]
 
 
@@ -138,9 +138,9 @@ def places_of(files: Files, description: Description, is_cut: bool) -> dict[str,
     places = dict[str, Place]()
     faults: list[Fault] = []
     for tables in files:
-        found = list(split(tables, tables[0].source, description, faults))
-        is_long = description.layout == "long" and len(found) > 1
-        found = found[:-1] if is_cut and is_long else found
-        for source, path, table in found[: MOST_PARTS - len(places)]:
+        parts = list(split(tables, tables[0].source, description, faults))
+        is_long = description.layout == "long" and len(parts) > 1
+        parts = parts[:-1] if is_cut and is_long else parts
+        for source, path, table in parts[: MOST_PARTS - len(places)]:
             places[source] = Place(path, table)
     return places

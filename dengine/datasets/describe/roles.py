@@ -150,7 +150,7 @@ class Roles:
         is_named = QUALIFIER_NAME.search(name) is not None
         is_text = any(column.odd) and not CLOCK_NAME.search(name)
         varies = not column.fixed or (is_named and len(words) == 1)
-        has_rows = all(len(some) > 1 for some in column.words)
+        has_rows = all(len(cells) > 1 for cells in column.words)
         if self.is_used(name) or not ((is_named or is_text) and varies and has_rows):
             return False
         sources = [labels.with_meanings(source, words) for source in labels.in_columns([column])]
@@ -167,29 +167,33 @@ class Roles:
         for key in filter(PART_LINE.search, labels.line_keys(self.tables[0].above)):
             with suppress(UnreadableError):
                 words[key] = [place.line_word(key) for place in self.places.values()]
-        found = [name for name, some in words.items() if len({*some} - {""}) > len(self.places) / 2]
-        if len(found) == 1:
-            self.put({"part.column" if found[0] in self.columns else "part.line": found[0]})
-        elif found:
-            self.notes["part.column"] = f"may be one of {listed(found)}"
+        candidates = [
+            name for name, values in words.items() if len({*values} - {""}) > len(self.places) / 2
+        ]
+        if len(candidates) == 1:
+            self.put(
+                {"part.column" if candidates[0] in self.columns else "part.line": candidates[0]}
+            )
+        elif candidates:
+            self.notes["part.column"] = f"may be one of {listed(candidates)}"
 
     def find_label(self) -> None:
         """Find the source of the labels, and those that must agree with it."""
-        own, is_used, finder = self.description.label, self.is_used, self.label_finder()
+        label, is_used, finder = self.description.label, self.is_used, self.label_finder()
         columns = [column for name, column in self.columns.items() if not is_used(name)]
-        is_stated = any(getattr(own, kind) for kind in labels.KINDS)
-        sources = [own]
+        is_stated = any(getattr(label, kind) for kind in labels.KINDS)
+        sources = [label]
         if not is_stated:
             sources = finder.in_listings(self.others)
             if self.description.layout in ("files", "columns"):
                 sources += labels.in_paths(place.path for place in finder.places.values())
             sources += labels.in_columns(columns) + labels.in_lines(self.tables[0].above)
-        found = [finder.candidate(source) for source in sources]
-        found = [candidate for candidate in found if candidate.words or is_stated]
+        candidates = [finder.candidate(source) for source in sources]
+        candidates = [candidate for candidate in candidates if candidate.words or is_stated]
         few = [column for column in columns if 1 < len({*column.fixed}) <= FEW_WORDS]
         hints = [f"{column.name} ({counts_of(column.fixed)})" for column in few]
-        label, checks = labels.choose(found, self.notes, hints, len(finder.places))
-        self.description = replace(self.description, label=label, check=tuple(checks))
+        source, checks = labels.choose(candidates, self.notes, hints, len(finder.places))
+        self.description = replace(self.description, label=source, check=tuple(checks))
         stated = {key: value for key, value in self.stated.items() if key.startswith("label.")}
         self.description = self.description.with_values(stated)
 
@@ -296,6 +300,6 @@ def likely_channels(units: Units) -> list[str]:
     """
     by_name = [[*filter(pattern.search, units)] for pattern in FORCES]
     quantities = {name: quantity_of(unit) for name, unit in units.items()}
-    by_unit = [n for n, found in quantities.items() if found and found[0] in ("force", "torque")]
-    found = (*by_name, by_unit, [*filter(VALUE.fullmatch, units)])
-    return next(filter(None, found), [])
+    by_unit = [n for n, pair in quantities.items() if pair and pair[0] in ("force", "torque")]
+    rules = (*by_name, by_unit, [*filter(VALUE.fullmatch, units)])
+    return next(filter(None, rules), [])
