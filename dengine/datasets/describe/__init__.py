@@ -45,7 +45,7 @@ NO_RECORDING = re.compile(
     r"(?i)(^|/)(\.|(readme|licen[sc]e|notes|changelog)(\.[^/]*)?$|recordings\.toml$)"
 )
 MOST_FILES = 60  # that are read
-MOST_BYTES = 4_000_000  # of all files that are read, and of one
+MOST_BYTES = 2_000_000  # of all files that are read, and of one
 MOST_ROWS = 50_000
 MUCH_LARGER = 5
 NUMBERS = re.compile(r"\d+")

@@ -130,6 +130,7 @@ class Roles:
                 about = rows[name]
                 named = {*about.keep, *about.drop, *about.invalid}
                 rest = tuple(word for word in words if not named & {word, ANY})
+                rest = rest if len(rest) <= FEW_WORDS else (ANY,)
                 key = "drop" if about.keep else "keep"
                 rows[name] = replace(about, **{key: getattr(about, key) + rest})
             elif self.qualifies(column):
@@ -167,15 +168,13 @@ class Roles:
         for key in filter(PART_LINE.search, labels.line_keys(self.tables[0].above)):
             with suppress(UnreadableError):
                 words[key] = [place.line_word(key) for place in self.places.values()]
-        candidates = [
-            name for name, values in words.items() if len({*values} - {""}) > len(self.places) / 2
-        ]
-        if len(candidates) == 1:
-            self.put(
-                {"part.column" if candidates[0] in self.columns else "part.line": candidates[0]}
-            )
-        elif candidates:
-            self.notes["part.column"] = f"may be one of {listed(candidates)}"
+        least = len(self.places) / 2
+        names = [name for name, values in words.items() if len({*values} - {""}) > least]
+        if len(names) == 1:
+            key = "part.column" if names[0] in self.columns else "part.line"
+            self.put({key: names[0]})
+        elif names:
+            self.notes["part.column"] = f"may be one of {listed(names)}"
 
     def find_label(self) -> None:
         """Find the source of the labels, and those that must agree with it."""
@@ -280,9 +279,8 @@ class Roles:
         units = {name: unit_in(name) or column.unit for name, column in columns.items()}
         listings = {source.listing for source in (description.label, *description.check)}
         names = {*self.others} - listings
-        names -= {
-            name for pattern in description.exclude for name in fnmatch.filter(names, pattern)
-        }
+        for pattern in description.exclude:
+            names -= {*fnmatch.filter(names, pattern)}
         others = sorted(names, key=natural_key)
         text = f"not read, for they are of another form: {listed(others)}"
         is_open = UNKNOWN in description.exclude
