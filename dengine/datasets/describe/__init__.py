@@ -84,7 +84,8 @@ class Sample:
     def choose(self, names: Names, groups: Mapping[str, Names]) -> None:
         """Set the names of the recordings, and of the files beside them."""
         self.names = names
-        self.others = [name for name in chain(*groups.values()) if name not in {*names}]
+        recordings = {*names}
+        self.others = [name for name in chain(*groups.values()) if name not in recordings]
         self.stated.setdefault("files", globs(names))
 
     def contents(self) -> dict[str, bytes]:
@@ -96,11 +97,11 @@ class Sample:
         rare = [name for name in self.names if shapes[NUMBERS.sub("0", name)] == 1][:MOST_FILES]
         step = max(1, len(self.names) // MOST_FILES)
         contents = dict[str, bytes]()
-        for name in sorted({*rare, *self.names[::step][:MOST_FILES]}, key=natural_key):
+        for name in dict.fromkeys([*rare, *self.names[::step][:MOST_FILES]]):
             if sum(map(len, contents.values())) < MOST_BYTES:
                 with suppress(UnreadableError):
                     contents[name] = read_file(self.base / name)
-        return contents
+        return {name: contents[name] for name in self.names if name in contents}
 
     def leave_out(self, odd: Mapping[str, Look], start: Description) -> Description:
         """Leave out files of another form; if several of one form have samples, it is asked why."""
