@@ -224,7 +224,8 @@ def choose(
     if certain or len(candidates) == 1:
         best, *checks = certain or candidates
         counts = counts_of(best.words.values())
-        others = [f"of unknown meaning: {c.title}" for c in candidates if c not in (best, *checks)]
+        kinds = {True: "agrees", False: "of unknown meaning"}
+        others = [f"{kinds[c in checks]}: {c.title}" for c in candidates if c is not best]
         notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *others])
         if UNKNOWN in best.source.good + best.source.bad:
             notes["label.good"] = notes["label.bad"] = f"which of the words? {counts}"
