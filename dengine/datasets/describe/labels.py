@@ -210,7 +210,7 @@ def choose(
     """Return the source of the labels, and those that must agree with it.
 
     The first candidate whose words are known is the label if all such agree, and the others are
-    checks. If two disagree, or there is none, the label is `?`, and the note lists them all.
+    checks, if they have a word for each recording. If two disagree, or there is none, the label is `?`, and the note lists them all.
 
     hints : columns that may hold labels under other names. n : recordings that were looked at.
     """
@@ -222,11 +222,12 @@ def choose(
             notes["label.column"] = f"{text}: which is right?"
             return LabelSource(column=UNKNOWN), []
     if certain or len(candidates) == 1:
-        best, *checks = certain or candidates
+        best, *others = certain or candidates
+        checks = [other for other in others if other.words.keys() >= best.words.keys()]
         counts = counts_of(best.words.values())
         kinds = {True: "agrees", False: "of unknown meaning"}
-        others = [f"{kinds[c in checks]}: {c.title}" for c in candidates if c is not best]
-        notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *others])
+        also = [f"{kinds[c in certain]}: {c.title}" for c in candidates if c is not best]
+        notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *also])
         if UNKNOWN in best.source.good + best.source.bad:
             notes["label.good"] = notes["label.bad"] = f"which of the words? {counts}"
         return best.source, [check.source for check in checks]
