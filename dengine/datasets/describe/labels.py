@@ -210,17 +210,16 @@ def choose(
     """Return the source of the labels, and those that must agree with it.
 
     The first candidate whose words are known is the label if all such agree, and the others are
-    checks, if they have a word for each recording. If two disagree, or there is none, the label is `?`, and the note lists them all.
+    checks if they have a word for each recording. If two disagree, or there is none, the label is
+    `?`, and the note lists them all.
 
     hints : columns that may hold labels under other names. n : recordings that were looked at.
     """
     certain = [candidate for candidate in candidates if candidate.is_known]
     over = f"over {n:,} recordings"
-    for first, second in combinations(certain, 2):
-        if count := first.disagreements(second):
-            text = f"{first.title} and {second.title} disagree on {count:,} of {n:,} recordings"
-            notes["label.column"] = f"{text}: which is right?"
-            return LabelSource(column=UNKNOWN), []
+    if text := _disagreement(certain):
+        notes["label.column"] = f"{text} of {n:,} recordings: which is right?"
+        return LabelSource(column=UNKNOWN), []
     if certain or len(candidates) == 1:
         best, *others = certain or candidates
         checks = [other for other in others if other.words.keys() >= best.words.keys()]
@@ -236,3 +235,11 @@ def choose(
     few = f"; columns of few words: {columns}" if (columns := listed(hints)) else ""
     notes["label.column"] = f"{text}{few}; {over}"
     return LabelSource(column=UNKNOWN), []
+
+
+def _disagreement(candidates: Sequence[Candidate]) -> str:
+    """Return which two candidates disagree, and on how many recordings; "" if all agree."""
+    for first, second in combinations(candidates, 2):
+        if count := first.disagreements(second):
+            return f"{first.title} and {second.title} disagree on {count:,}"
+    return ""

@@ -56,7 +56,8 @@ def _has_curves(table: Table) -> bool:
     names = [name for name in table.columns if not CLOCK_NAME.search(name)]
     shapes = Counter(re.sub(r"\d+", "0", name) for name in names)
     are_alike = max(shapes.values(), default=0) > len(names) / 2
-    return len(names) >= LEAST_PARTS and (are_alike or bool(labels.in_paths(names)))
+    are_verdicts = len(names) > 1 and bool(labels.in_paths(names))
+    return are_verdicts or (are_alike and len(names) >= LEAST_PARTS)
 
 
 def numbered_columns(table: Table) -> list[str]:
