@@ -13,12 +13,15 @@ from ..read.bags import LOG_TIME, STAMP, read_messages
 from ..read.clock import column_times
 from ..read.places import listing_table
 from . import labels
+from .cells import MOST_WORDS, counts_of
 from .clock import round_rate
-from .columns import likely_channels
+from .roles import likely_channels
 
 MOST_MESSAGES = 50_000
 SECONDS = 2.0  # of a part, if nothing else is known
 UNITS = {"force": "N", "torque": "Nm"}
+STARTS = ("start", "begin", "beginn", "von")
+ENDS = ("end", "ende", "stop", "bis")
 
 
 def describe_bag(paths: Sequence[Path], stated: Mapping[str, Any]) -> Description:
@@ -94,17 +97,12 @@ def _windows(
         if values and not any(key.startswith("windows.trigger") for key in stated):
             notes["windows.listing"] = "its columns say when each part began and ended"
             return values
-    verdicts = dict[str, LabelSource]()
-    for topic, cells in words.items():
-        source = labels.with_meanings(LabelSource(topic=topic, column=topic), cells)
-        is_known = (source.good or source.bad) and UNKNOWN not in source.good + source.bad
-        verdicts |= {topic: source} if is_known and len({*cells}) < labels.MOST_WORDS else {}
+    found_sources = {topic: _known(topic, cells) for topic, cells in words.items()}
+    verdicts = {topic: source for topic, source in found_sources.items() if source is not None}
     signals = [t for t, cells in words.items() if t not in verdicts and len({*cells}) == 2]
     values = {}
     for key, found in (("label.topic", [*verdicts]), ("windows.trigger", signals)):
-        counts = "; ".join(
-            f"{topic} ({labels.counts_of(words[topic])})" for topic in found or words
-        )
+        counts = "; ".join(f"{topic} ({counts_of(words[topic])})" for topic in found or words)
         notes[key] = counts if len(found) == 1 else f"one of {counts}"
         values[key] = found[0] if len(found) == 1 else UNKNOWN
     if len(verdicts) == 1:
@@ -124,32 +122,27 @@ def _listing(path: Path) -> dict[str, Any]:
     except DataError:
         return {}
     names = {name.lower(): name for name in table.columns}
-    start = next((names[name] for name in ("start", "begin", "beginn", "von") if name in names), "")
-    end = next((names[name] for name in ("end", "ende", "stop", "bis") if name in names), "")
-    views = {str(i): table.take(slice(i, i + 1)) for i in range(len(table.lines))}
-    others = [name for name in table.columns if name not in (start, end)]
-    sources = labels.column_sources(views, others)
-    keys = [name for name in others if len({*table.words(name)}) == len(table.lines)]
-    if not (start and end and sources and keys):
+    start, end = (next((names[n] for n in some if n in names), "") for some in (STARTS, ENDS))
+    words = {name: table.words(name) for name in table.columns if name not in (start, end)}
+    sources = [_known(name, cells) for name, cells in words.items()]
+    source = next(filter(None, sources), None)
+    key = next((name for name, cells in words.items() if len({*cells}) == len(cells)), "")
+    if not (start and end and source and key):
         return {}
-    source = labels.with_meanings(sources[0], table.words(sources[0].column))
     is_number = all(cell.replace(".", "", 1).isdigit() for cell in table.words(start))
-    windows = {"listing": path.name, "key": keys[0], "start": start, "end": end}
-    windows["format"] = "s" if is_number else "iso"
-    label: dict[str, Any] = {"listing": path.name, "key": keys[0], "column": source.column}
-    label |= {"good": source.good, "bad": source.bad}
-    pairs = [(f"windows.{k}", v) for k, v in windows.items()] + [
-        (f"label.{k}", v) for k, v in label.items()
-    ]
-    clock = Clock(column=(start, end), format=(windows["format"],) * 2)
-    times = [
-        first + relative
-        for relative, first in (
-            column_times(table, name, windows["format"], clock, form) for name in (start, end)
-        )
-    ]
-    return {
-        **dict(pairs),
-        "traces.lengths": "pad",
-        "seconds": float(np.median(times[1] - times[0])),
-    }
+    unit = "s" if is_number else "iso"
+    times = [column_times(table, name, unit, Clock(), form) for name in (start, end)]
+    seconds = np.median(times[1][0] + times[1][1] - times[0][0] - times[0][1])
+    listing = {"listing": path.name, "key": key}
+    windows = {**listing, "start": start, "end": end, "format": unit}
+    label = {**listing, "column": source.column, "good": source.good, "bad": source.bad}
+    values: dict[str, Any] = {f"windows.{name}": value for name, value in windows.items()}
+    values |= {f"label.{name}": value for name, value in label.items()}
+    return values | {"traces.lengths": "pad", "seconds": float(seconds)}
+
+
+def _known(name: str, words: Any) -> LabelSource | None:
+    """Return a column or topic as a source of labels, if all its words are plain verdicts."""
+    source = labels.with_meanings(LabelSource(column=name), words)
+    is_label = bool(source.good or source.bad) and UNKNOWN not in source.good + source.bad
+    return source if is_label and len({*words}) < MOST_WORDS else None

@@ -5,22 +5,27 @@ the end of a name, a folder, a cell of a column, or a line, whose name is a verd
 """
 
 import re
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 from ...errors import DataError, listed
 from ..description import UNKNOWN, LabelSource, TextForm
-from ..read.places import SUFFIX, Place, listing_table, read_labels
-from ..table import Table
+from ..read.places import SUFFIX, LabelReader, Place, listing_table, read_labels
+from ..table import UnreadableError
+from .cells import MOST_WORDS, Column, Notes, Values, counts_of
 
-GOOD = ("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "io", "accepted", "合格")
-BAD = (
-    *("nok", "not ok", "fail", "failed", "bad", "failure", "schlecht", "false", "n.i.o.", "nio"),
-    *("ng", "reject", "rejected", "不合格"),
+GOOD = (
+    *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
+    *("accepted", "合格"),
 )
-UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a", "?")
+BAD = (
+    *("nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
+    *("n.i.o.", "n.i.o", "n_i_o", "nio", "ng", "reject", "rejected", "不合格"),
+)
+UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
 YES, NO = ("1", "true", "yes", "ja"), ("0", "false", "no", "nein")
 NAME = re.compile(
     r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
@@ -32,8 +37,19 @@ BAD_NAME = re.compile(
 GOOD_NAME = re.compile(
     r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
 )
-MOST_WORDS = 12
+IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
+WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
+NEGATED = re.compile(rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})")
+PATHS = (  # of verdicts in folders, and at the end or beginning of names
+    rf"(?:^|/)({WORD})/",
+    rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
+    rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
+)
+KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
+Words = Sequence[str]
+Sources = list[LabelSource]
+Places = Mapping[str, Place]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,187 +60,186 @@ class Candidate:
     words: Mapping[str, str]
 
     @property
+    def kind(self) -> str:
+        """What kind of place it is."""
+        return next(kind for kind in KINDS if getattr(self.source, kind))
+
+    @property
+    def labels(self) -> dict[str, int | None]:
+        """The label of each recording whose word has a meaning that is known."""
+        reader = LabelReader(self.source)
+        meanings = {*self.source.good, *self.source.bad, *self.source.unchecked}
+        return {name: reader.meaning(w) for name, w in self.words.items() if w in meanings}
+
+    @property
     def is_known(self) -> bool:
         """Whether the meaning of every word is known, and some word is a label."""
-        source = self.source
-        labels = {*source.good, *source.bad} - {UNKNOWN}
-        return bool(labels) and {*self.words.values()} <= {*labels, *source.unchecked}
+        return len(self.labels) == len(self.words) and {*self.labels.values()} != {None}
 
     @property
     def title(self) -> str:
         """What to type for it, with the counts of its words."""
-        source = self.source
         keys = ("listing", "key", "column", "path", "line")
-        stated = [f"label.{key}={getattr(source, key)}" for key in keys if getattr(source, key)]
+        stated = [f"label.{key}={value}" for key in keys if (value := getattr(self.source, key))]
         return f"{' '.join(stated)} ({counts_of(self.words.values())})"
 
     def disagreements(self, other: "Candidate") -> int:
-        """Return for how many recordings another candidate has another label."""
-        good = [
-            {name: word in one.source.good for name, word in one.words.items()}
-            for one in (self, other)
-        ]
-        open_ = [
-            {n for n, w in one.words.items() if w in one.source.unchecked} for one in (self, other)
-        ]
-        both = good[0].keys() & good[1].keys() - open_[0] - open_[1]
-        return sum(good[0][name] != good[1][name] for name in both)
-
-
-def counts_of(words: Names) -> str:
-    """Return how often each word comes, most frequent first."""
-    return ", ".join(f"{w or 'empty'}: {n:,}" for w, n in Counter(words).most_common(MOST_WORDS))
+        """Return for how many recordings that were checked another candidate has another label."""
+        pairs = [(label, other.labels.get(name)) for name, label in self.labels.items()]
+        return sum({*pair} == {0, 1} for pair in pairs)
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     """Return a source with the meanings of its words; `?` for those that are not known.
 
-    Plain verdicts mean the same everywhere; `io` is one only beside `nio`. True, yes and 1 mean
+    Plain verdicts mean the same everywhere; `io` is one only beside `nio`, and in a path each is
+    one only if some part is good and some bad: `pass_1.csv` may be anything. True, yes and 1 mean
     what the column's name says: good for `success`, bad for `failed`; of other names nothing.
     """
     words = sorted({*words})
-    lower = {word.lower() for word in words}
-    name = source.column or source.line
-    verdicts = {*GOOD} - ({"io"} if "nio" not in lower else set())
-    good, bad = verdicts, {*BAD}
-    if lower <= {*YES, *NO, *UNCHECKED} and name:
-        is_good = GOOD_NAME.search(name) or (lower & {"true", "false"} and NAME.search(name))
-        good, bad = ({*YES}, {*NO}) if is_good else (set(), set())
-        if BAD_NAME.search(name):
-            good, bad = {*NO}, {*YES}
+    good, bad = _verdicts(source.column or source.line, {word.lower() for word in words})
+    kinds = {"good": good, "bad": bad, "unchecked": UNCHECKED}
     meanings = {
-        "good": [word for word in words if word.lower() in good],
-        "bad": [word for word in words if word.lower() in bad],
-        "unchecked": [word for word in words if word.lower() in UNCHECKED],
+        key: tuple(w for w in words if w.lower() in verdicts) for key, verdicts in kinds.items()
     }
-    if {*words} - {*meanings["good"], *meanings["bad"], *meanings["unchecked"]}:
-        meanings |= {key: meanings[key] or [UNKNOWN] for key in ("good", "bad")}
-    return replace(
-        source, **{key: getattr(source, key) or tuple(some) for key, some in meanings.items()}
-    )
+    is_one_sided = source.path and not (meanings["good"] and meanings["bad"])
+    if is_one_sided or len(words) > sum(map(len, meanings.values())):
+        meanings |= {key: meanings[key] or (UNKNOWN,) for key in ("good", "bad")}
+    stated: Values = {key: getattr(source, key) or meanings[key] for key in kinds}
+    return replace(source, **stated)
 
 
-def candidate(
-    base: Path,
-    source: LabelSource,
-    places: Mapping[str, Place],
-    parts: Mapping[str, str],
-    form: TextForm,
-) -> Candidate:
-    """Return a source with the word of each recording that has one, and what the words mean."""
-    words = dict[str, str]()
-    try:
-        reader = read_labels(base, source, form)
-    except DataError:
-        reader = None
-    for name, place in places.items() if reader else ():
-        try:
-            words[name] = reader.words(place, parts.get(name, ""))[0]  # type: ignore[union-attr]
-        except DataError:
-            continue
-    return Candidate(with_meanings(source, words.values()), words)
+def _verdicts(name: str, words: set[str]) -> tuple[Words, Words]:
+    """Return the words for good and for bad in a column or line of this name."""
+    if not name or not words <= {*YES, *NO, *UNCHECKED}:
+        return [word for word in GOOD if word != "io" or "nio" in words], BAD
+    if BAD_NAME.search(name):
+        return NO, YES
+    is_good = GOOD_NAME.search(name) or (words & {"true", "false"} and NAME.search(name))
+    return (YES, NO) if is_good else ((), ())
 
 
-def path_sources(paths: Names) -> list[LabelSource]:
-    """Return the expressions for verdicts in folders, and at the end or beginning of names."""
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """Finds the sources of labels of some recordings.
+
+    base : folder with the listings. places, parts : where each recording stands, and its part.
+    """
+
+    base: Path
+    places: Places
+    parts: Mapping[str, str]
+    form: TextForm
+
+    def candidate(self, source: LabelSource) -> Candidate:
+        """Return a source with the word of each recording that has one, and their meanings."""
+        words = dict[str, str]()
+        with suppress(DataError):
+            reader = read_labels(self.base, source, self.form)
+            for name, place in self.places.items():
+                with suppress(UnreadableError):
+                    words[name] = reader.words(place, self.parts.get(name, ""))[0]
+        return Candidate(with_meanings(source, words.values()), words)
+
+    def in_listings(self, names: Names) -> Sources:
+        """Return the columns of verdicts in files that list most recordings, with their key."""
+        sources: Sources = []
+        for name in names:
+            try:
+                table = listing_table(self.base / name, (), self.form)
+            except (DataError, ValueError):
+                continue
+            for key in table.columns:
+                plain = LabelSource(listing=name, key=key, column=key)
+                if len(self.candidate(plain).words) > len(self.places) / 2:
+                    verdicts = [c for c in table.columns if is_verdict(c, table.words(c))]
+                    sources += [replace(plain, column=c) for c in verdicts if c != key]
+                    break
+        return sources
+
+
+def in_paths(paths: Names) -> Sources:
+    """Return the expressions that find verdicts in most paths; none if a not stands before one."""
     stems = [SUFFIX.sub("", path) for path in paths]
-    word = "|".join(sorted(map(re.escape, (*GOOD, *BAD)), key=len, reverse=True))
-    patterns = (
-        rf"(?:^|/)({word})/",
-        rf"(?:^|[-_ ./])({word})(?:[-_ ]?\d+)?$",
-        rf"(?:^|/)({word})(?=[-_ ][^/]*$)",
-    )
-    sources = []
-    for pattern in patterns:
-        found = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
-        if len(found) > len(stems) / 2:
-            used = sorted({*found}, key=lambda text: (-len(text), text))
-            sources.append(LabelSource(path=pattern.replace(word, "|".join(map(re.escape, used)))))
+    sources: Sources = []
+    for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
+        words = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
+        if len(words) > len(stems) / 2:
+            used = sorted({*words}, key=lambda text: (-len(text), text))
+            sources.append(LabelSource(path=pattern.replace(WORD, "|".join(map(re.escape, used)))))
     return sources
 
 
-def column_sources(views: Mapping[str, Table], columns: Names) -> list[LabelSource]:
-    """Return the columns whose name is a verdict's, and whose words are few.
+def is_verdict(name: str, words: Names) -> bool:
+    """Return whether a column has the name of a verdict, and few words; a single one is plain."""
+    words = {*words}
+    source = with_meanings(LabelSource(column=name), words)
+    is_label = len(words) > 1 or bool(source.good or source.bad)
+    is_named = NAME.search(name) or BAD_NAME.search(name)
+    return is_named is not None and is_label and len(words) <= MOST_WORDS
+
+
+def in_columns(columns: Iterable[Column]) -> Sources:
+    """Return the columns of verdicts.
 
     A label that changes within a recording is that of its last row, if above it stand only words
     for not checked.
     """
-    sources = []
-    for name in columns:
-        words = [view.words(name) for view in views.values() if name in view.columns]
-        if not (NAME.search(name) or BAD_NAME.search(name)) or not all(map(len, words)):
-            continue
-        changes = [{*cells} - {cells[-1]} for cells in words if len({*cells}) > 1]
-        is_last = all(word.lower() in UNCHECKED for some in changes for word in some)
-        different = {cells[-1] for cells in words}
-        known = with_meanings(LabelSource(column=name), different)
-        if (
-            is_last
-            and len(different) <= MOST_WORDS
-            and (len(different) > 1 or known.good or known.bad)
-        ):
-            sources.append(LabelSource(column=name, at="last" if changes else "same"))
+    sources: Sources = []
+    for column in columns:
+        last = [str(words[-1]) for words in column.words if len(words)]
+        above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
+        if above <= {*UNCHECKED} and is_verdict(column.name, last):
+            sources.append(LabelSource(column=column.name, at="same" if column.fixed else "last"))
     return sources
 
 
-def line_sources(above: Sequence[str]) -> list[LabelSource]:
+def line_keys(above: Sequence[str]) -> list[str]:
+    """Return the beginnings of lines above a header, before the first mark."""
+    return [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0].strip(" \"'") for line in above]
+
+
+def in_lines(above: Sequence[str]) -> Sources:
     """Return the beginnings of lines above a header that are the name of a verdict."""
-    keys = [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0].strip(" \"'") for line in above]
-    return [LabelSource(line=key) for key in keys if NAME.search(key)]
-
-
-def listing_sources(
-    base: Path, names: Names, places: Mapping[str, Place], parts: Mapping[str, str], form: TextForm
-) -> list[LabelSource]:
-    """Return the columns of verdicts in files that list most of the recordings, with their key."""
-    sources = []
-    for name in names:
-        try:
-            table = listing_table(base / name, (), form)
-        except (DataError, ValueError):
-            continue
-        for key in table.columns:
-            plain = LabelSource(listing=name, key=key, column=key)
-            found = candidate(base, plain, places, parts, form).words
-            if len(found) > len(places) / 2:
-                columns = [column for column in table.columns if column != key]
-                view = {
-                    row: table.take(slice(i, i + 1)) for i, row in enumerate(map(str, table.lines))
-                }
-                some = column_sources(view, columns)
-                sources += [replace(plain, column=source.column) for source in some]
-                break
-    return sources
+    return [LabelSource(line=key) for key in line_keys(above) if NAME.search(key)]
 
 
 def choose(
-    candidates: Sequence[Candidate], notes: dict[str, str], hints: Sequence[str], n: int
-) -> tuple[LabelSource, list[LabelSource]]:
+    candidates: Sequence[Candidate], notes: Notes, hints: Names, n: int
+) -> tuple[LabelSource, Sources]:
     """Return the source of the labels, and those that must agree with it.
 
     The first candidate whose words are known is the label if all such agree, and the others are
-    checks. If two disagree, or there is none, the label is `?`, and the note lists them all.
+    checks if they have a word for each recording. If two disagree, or there is none, the label is
+    `?`, and the note lists them all.
 
     hints : columns that may hold labels under other names. n : recordings that were looked at.
     """
-    known = [one for one in candidates if one.is_known]
-    pairs = [(a, b, a.disagreements(b)) for i, a in enumerate(known) for b in known[i + 1 :]]
-    first, second, count = max(pairs, key=lambda pair: pair[2], default=(None, None, 0))
-    if first is not None and second is not None and count:
-        text = f"{first.title} and {second.title} disagree on {count:,} of {n:,} recordings"
-        notes["label.column"] = f"{text}: which is right?"
+    certain = [candidate for candidate in candidates if candidate.is_known]
+    over = f"over {n:,} recordings"
+    if text := _disagreement(certain):
+        notes["label.column"] = f"{text} of {n:,} recordings: which is right?"
         return LabelSource(column=UNKNOWN), []
-    if known or len(candidates) == 1:
-        best, *others = known or candidates
-        kind = next(
-            key for key in ("listing", "column", "path", "line") if getattr(best.source, key)
-        )
-        notes[f"label.{kind}"] = f"{counts_of(best.words.values())}, over {n:,} recordings"
-        if not best.is_known:
-            notes["label.good"] = f"which of the words? {counts_of(best.words.values())}"
-        return best.source, [other.source for other in others]
-    text = "; ".join(one.title for one in candidates)
-    text = f"one of {text}" if text else "none was found: state label.column, path, line or listing"
-    text += f"; columns of few words: {listed(hints)}" if hints else ""
-    notes["label.column"] = f"{text}; over {n:,} recordings"
+    if certain or len(candidates) == 1:
+        best, *others = certain or candidates
+        checks = [other for other in others if other.words.keys() >= best.words.keys()]
+        counts = counts_of(best.words.values())
+        kinds = {True: "agrees", False: "of unknown meaning"}
+        also = [f"{kinds[c in certain]}: {c.title}" for c in candidates if c is not best]
+        notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *also])
+        if UNKNOWN in best.source.good + best.source.bad:
+            notes["label.good"] = notes["label.bad"] = f"which of the words? {counts}"
+        return best.source, [check.source for check in checks]
+    titles = "; ".join([candidate.title for candidate in candidates])
+    text = titles or "none was found: state label.column, path, line or listing"
+    few = f"; columns of few words: {columns}" if (columns := listed(hints)) else ""
+    notes["label.column"] = f"{text}{few}; {over}"
     return LabelSource(column=UNKNOWN), []
+
+
+def _disagreement(candidates: Sequence[Candidate]) -> str:
+    """Return which two candidates disagree, and on how many recordings; "" if all agree."""
+    for first, second in combinations(candidates, 2):
+        if count := first.disagreements(second):
+            return f"{first.title} and {second.title} disagree on {count:,}"
+    return ""

@@ -102,7 +102,10 @@ def _is_whole(cell: object) -> bool:
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> tuple[NDArray[np.float64], float]:
-    """Return the times of a column of dates or times of day; a time of day may pass midnight."""
+    """Return the times of a column of dates or times of day.
+
+    A time of day may pass midnight, unless another column tells the day.
+    """
     import pandas as pd
 
     cells = table.column(name)
@@ -133,7 +136,7 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> tuple[NDArray[np
         raise UnreadableError(message, table.line(i), name)
     zero = pd.Timestamp("1970-01-01" if has_date else "1900-01-01", tz="UTC")
     values = ((times - times.iloc[0]) / pd.Timedelta(1, "s")).to_numpy(np.float64)
-    if not has_date:
+    if not any(form == ISO or DATES.search(form) for form in clock.format):
         values = values + DAY * np.cumsum(np.diff(values, prepend=0.0) < -DAY / 2)
     return values, float((times.iloc[0] - zero) / pd.Timedelta(1, "s"))
 

@@ -75,7 +75,7 @@ def join(tables: Sequence[Table]) -> Table:
     """Return one table of tables with a row each, in the columns of the first."""
     first = tables[0]
     columns = {
-        name: as_cells([t.columns[name][0] if name in t.columns else None for t in tables])
+        name: as_cells([next(iter(t.columns.get(name, ())), None) for t in tables])
         for name in first.columns
     }
     return Table(first.source, columns, [table.line(0) for table in tables])

@@ -16,6 +16,7 @@ from . import frames
 from .files import natural_key
 from .text import read_text
 
+NUMBER = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 Parts = Iterator[tuple[str, str, Table]]  # the source, the path by which it is named, the table
 
 
@@ -55,9 +56,9 @@ def column_kinds(description: Description) -> tuple[Any, Any]:
     return is_number, words.__contains__
 
 
-def pattern_of(column: str) -> re.Pattern[str]:
+def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
     """Return the pattern of a channel's columns, in which `*` stands for any text."""
-    return re.compile(".*".join(map(re.escape, column.split(ANY))))
+    return re.compile(any_text.join(map(re.escape, column.split(ANY))))
 
 
 def split(
@@ -112,7 +113,8 @@ def _split_rows(table: Table, name: str, description: Description, faults: list[
 
 def _split_wide(table: Table, name: str, description: Description) -> Parts:
     """Yield each row."""
-    patterns = {c.column: pattern_of(c.column) for c in description.channels if ANY in c.column}
+    names = [channel.column for channel in description.channels if ANY in channel.column]
+    patterns = {name: pattern_of(name, NUMBER) for name in names}
     groups = {
         pattern: sorted(filter(matcher.fullmatch, table.columns), key=natural_key)
         for pattern, matcher in patterns.items()
@@ -124,7 +126,7 @@ def _split_wide(table: Table, name: str, description: Description) -> Parts:
     }
     units = {key: table.units.get(names[0], "") for key, names in groups.items() if names}
     used = {column for names in groups.values() for column in names}
-    others = [column for column in table.columns if column not in used]
+    others = [name for name, cells in table.columns.items() if name not in used and len(cells)]
     for i, line in enumerate(table.lines):
         columns = {key: without_empty_end(rows[i]) for key, rows in cells.items()}
         for column in others:
