@@ -338,7 +338,9 @@ def played(service: CellService, data: Dataset, n: int = 70, broken: int | None 
 def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> None:
     tokens = Token("a-viewer-s-password", False, "Line display"), Token(TOKEN, True, "Kim")
     file = tmp_path / "cell.db"
-    with a_service(file) as service, served(create_app(service, Access(tokens, rate=0.0))) as port:
+    trace = TraceSpec(60, rate_hz=500.0)  # which limits in seconds need
+    access = Access(tokens, rate=0.0)
+    with a_service(file, trace=trace) as service, served(create_app(service, access)) as port:
         demo, part = DemoCell(f"http://127.0.0.1:{port}", file), played(service, stream).part
         with (
             pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"),

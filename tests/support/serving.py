@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from dengine import DataEngine, Recipe
+from dengine import DataEngine, Recipe, TraceSpec
 from dengine.errors import DataError
 from dengine.serve.service import CellService
 from tests.support.command_line import example_of
@@ -31,12 +31,19 @@ WAIT = 60.0  # seconds, for what takes a fraction of one: a machine may be busy
 
 
 def a_service(
-    file: Path | None = None, recipe: Recipe = RECIPE, deadline: float = WAIT, **options: Any
+    file: Path | None = None,
+    recipe: Recipe = RECIPE,
+    deadline: float = WAIT,
+    trace: TraceSpec | None = None,
+    **options: Any,
 ) -> Any:
     """A service in memory, or in a file, as long as the context lasts."""
     return closing(
         CellService(
-            lambda: DataEngine.open_or_create(file, recipe=recipe), file, deadline, **options
+            lambda: DataEngine.open_or_create(file, recipe=recipe, trace=trace),
+            file,
+            deadline,
+            **options,
         )
     )
 
