@@ -15,13 +15,19 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, listed, percent
 from ..folds import content_hash
-from .dataset import Dataset, Fault
+from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault
 from .description import Description
 from .table import Recording
 
+__all__ = [
+    "LEAST_RATE_HZ",
+    "MOST_RATE_HZ",
+    "check_description",
+    "finished_notes",
+    "tolerance_note",
+    "without_repeats",
+]
 Fitted = tuple[Recording, NDArray[np.float32]]
-MOST_RATE_HZ = 1e6
-LEAST_RATE_HZ = 1.0
 
 
 def check_description(description: Description) -> None:

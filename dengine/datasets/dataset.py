@@ -18,6 +18,7 @@ from ..traces import as_traces
 if TYPE_CHECKING:
     import pandas as pd
 
+LEAST_RATE_HZ, MOST_RATE_HZ = 1.0, 1e6  # of anything that a cell samples
 OWN = "dengine"  # key of the metadata by which a table of ours is known
 expect_data = partial(expect, error=DataError)
 
@@ -215,32 +216,43 @@ def make_dataset(
     except TraceError as error:
         raise DataError(str(error)) from error
     y = np.asarray(y)
-    shapes = (X.shape, y.shape)
-    expect_data(y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", shapes)
-    expect_data(len(y) > 0, "at least one trace", 0)
-    is_transposed = X.ndim == 3 and X.shape[1] > X.shape[2]
-    do = "it looks transposed; pass X.transpose(0, 2, 1)"
-    expect_data(not is_transposed, "X (n, channels, samples)", X.shape, do)
-    labels = sorted(set(map(str, y.tolist())))
-    expect_data(bool(np.isin(y, (0, 1)).all()), "labels 1 (success) and 0 (failure)", labels)
-    expect_data(rate_hz is None or 0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
     n_channels = 1 if X.ndim == 2 else X.shape[1]
-    one_each = not channels or len(channels) == n_channels
-    expect_data(one_each, f"a name for each of {n_channels} channels", channels)
-    if part is not None:
-        part = np.asarray(part)
-        valid = part.shape == y.shape and part.dtype.kind in "iuUS"
-        wanted = f"{len(y)} parts' numbers, texts or integers"
-        expect_data(valid, wanted, (part.shape, part.dtype))
-        part = part.astype(np.str_)
-    valid = cause is None or np.shape(cause) == y.shape
-    expect_data(valid, f"{len(y)} causes, one a trace", np.shape(cause))
+    part = None if part is None else np.asarray(part)
+    is_word = part is None or (part.shape == y.shape and part.dtype.kind in "iuUS")
+    shapes, transpose = (X.shape, y.shape), "it looks transposed; pass X.transpose(0, 2, 1)"
+    is_rate = rate_hz is None or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
+    for valid, wanted, actual, do in (
+        (y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", shapes, ""),
+        (len(y) > 0, "at least one trace", 0, ""),
+        (n_channels <= X.shape[-1], "X (n, channels, samples)", X.shape, transpose),
+        (
+            np.isin(y, (0, 1)).all(),
+            "labels 1 (success) and 0 (failure)",
+            sorted({*map(str, y)}),
+            "",
+        ),
+        (is_rate, "a rate of 1 Hz to 1 MHz", rate_hz, ""),
+        (
+            len(channels) in (0, n_channels),
+            f"a name for each of {n_channels} channels",
+            channels,
+            "",
+        ),
+        (is_word, f"{len(y)} parts' numbers, texts or integers", np.shape(part), ""),
+        (
+            cause is None or np.shape(cause) == y.shape,
+            "a cause for each trace",
+            np.shape(cause),
+            "",
+        ),
+    ):
+        expect_data(bool(valid), wanted, actual, do)
     return Dataset(
         X,
         y.astype(np.int8),
         rate_hz=rate_hz,
         channels=channels,
-        part=part,
+        part=None if part is None else part.astype(np.str_),
         cause=cause,
         **about,
     )

@@ -33,8 +33,10 @@ LENGTHS = ("strict", "cut", "pad", "pad-all", "resample")
 PLACES = ("same", "first", "last")  # of a label in a recording's rows
 Words = tuple[str, ...]
 TYPES: dict[type, tuple[Any, str]] = {
-    **{float: (int | float, "a number"), int: (int, "a whole number")},
-    **{bool: (bool, "true or false"), str: (str, "a text")},
+    float: (int | float, "a number"),
+    int: (int, "a whole number"),
+    bool: (bool, "true or false"),
+    str: (str, "a text"),
 }
 Stated = Mapping[str, Any]
 
@@ -266,7 +268,8 @@ class Description:
 
     def to_toml(self) -> str:
         """Return the text of the TOML file, with `notes` as comments."""
-        values = {"version": self.version, "channels": {UNKNOWN: ""}} | self.to_dict()
+        values: dict[str, Any] = {"version": self.version, "channels": {UNKNOWN: ""}}
+        values |= self.to_dict()
         lines = self._lines("", values, KEYS[""])
         for name in SECTIONS:
             table = values.get(name, {})
@@ -287,7 +290,8 @@ class Description:
         """Return a line for each key that is stated or has a note, with the note as a comment."""
         result = []
         for name in names:
-            note = "".join(c if c.isprintable() else " " for c in self.notes.get(prefix + name, ""))
+            note = self.notes.get(prefix + name, "")
+            note = "".join(c if c.isprintable() else " " for c in note)
             line = f"{_toml_key(name)} = {_toml_value(table[name])}" if name in table else ""
             if not line:
                 result += [f"# {name}: {note}"] if note else []
@@ -299,7 +303,7 @@ class Description:
 
     @property
     def open_keys(self) -> Words:
-        """The keys whose value is still `?`, like `label.column`; `channels` without any channel."""
+        """The keys whose value is still `?`, like `label.column`; `channels` if there is none."""
         values = self.to_dict()
         values.pop("ignored", None)
         found = tuple(name for name, value in _leaves(values) if value == UNKNOWN)
@@ -440,7 +444,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
         items = [*map(_plain, value)]
         return items[0] if len(items) == 1 and isinstance(items[0], str) else items
-    if not is_dataclass(value):
+    if not is_dataclass(value) or isinstance(value, type):
         return value
     default = type(value)()
     names = [about.name for about in fields(value) if about.compare]

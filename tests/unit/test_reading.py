@@ -34,6 +34,7 @@ WORDS = {0: "NOK", 1: "OK"}
 RATE = 500.0
 CHANNELS = ("FZ", "Weg ü", "M [x]")
 LABEL = LabelSource(good=("OK",), bad=("NOK",))
+FORM = TextForm()
 Columns = dict[str, Sequence[Any]]
 Cells = list[str]
 
@@ -42,7 +43,7 @@ Cells = list[str]
 class Style:
     """How a test writes its recordings."""
 
-    form: TextForm = TextForm()
+    form: TextForm = FORM
     above: int = 0
     is_packed: bool = False
     has_clock: bool = True
@@ -143,7 +144,7 @@ def write(
     parts = part_columns(X, y, style, names)
     edit(parts[2 % len(X)])
     suffix = "csv.gz" if kind == "text" and style.is_packed else {"text": "csv"}.get(kind, kind)
-    words = [p["verdict"][0] if style.label_column else WORDS[i] for i, p in zip(y, parts)]
+    words = [p["verdict"][0] if style.label_column else WORDS[i] for i, p in zip(y, parts, strict=True)]
     about = {"part": [str(i) for i in range(len(X))], "verdict": words}
     single = folder / f"all.{suffix}"
     description = Description(
@@ -160,7 +161,7 @@ def write(
     in_path = replace(LABEL, path="_([A-Z]+)$")
     row = style.above + 1 + (form.units > 0)
     if (layout, kind) == ("files", "jsonl"):
-        rows = [{"verdict": w, **p, "part": i} for p, w, i in zip(parts, words, about["part"])]
+        rows = [{"verdict": w, **p, "part": i} for p, w, i in zip(parts, words, about["part"], strict=True)]
         single.write_text("\n".join(map(json.dumps, rows)))
         return Written(single, description, X, y, single, 2)
     if layout == "files":

@@ -9,10 +9,8 @@ from ...errors import DataError, instead
 from ..description import Clock, TextForm
 from ..table import Floats, Recording, Table, UnreadableError
 
-UNITS = {
-    **{"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
-    **{"min": 60.0, "h": 3600.0, "d": 86400.0},
-}
+UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
 ISO = "iso"
 DAY = UNITS["d"]
 RATE_TOLERANCE = 0.03  # by which the rate of a recording's own times may differ from the stated one

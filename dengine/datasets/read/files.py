@@ -29,8 +29,9 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """
     if root.is_file():
         return [(root, root.name)]
-    sources = (description.label, *description.check, description.windows)
-    others = {FOLDER_FILE, *(Path(source.listing).as_posix() for source in sources)}
+    listings = [source.listing for source in (description.label, *description.check)]
+    listings += [description.windows.listing, FOLDER_FILE]
+    others = {Path(listing).as_posix() for listing in listings}
     names: dict[str, Path] = {}
     for pattern in description.files:
         with instead(DataError, f"Expected patterns below a folder in files, got {pattern}", *BAD):

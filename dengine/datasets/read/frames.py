@@ -56,12 +56,12 @@ def columns_of(prefix: str, value: Any) -> Columns:
         if len(forms) > 1:
             message = f"Expected lists or objects of one length in {prefix}, got others"
             raise UnreadableError(message, column=prefix)
+        rows: Mapping[Any, Any]
         if isinstance(first, Mapping):
             rows = {name: [item.get(name) for item in value] for name in first}
         else:
-            rows = dict(
-                enumerate(value if len(value) <= MOST_CHANNELS else zip(*value, strict=True))
-            )
+            is_wide = len(value) <= MOST_CHANNELS
+            rows = dict(enumerate(value if is_wide else [*zip(*value, strict=True)]))
         items = {f"{prefix}.{name}": [*row] for name, row in rows.items()}
     else:
         return {prefix: as_cells(value if isinstance(value, list) else [value])}

@@ -283,7 +283,7 @@ def to_dataset(
         source=sources,
         fit="strict" if is_grid else lengths,
         lengths=np.array([recording.samples.shape[1] for recording in recordings]),
-        notes=(*notes, *finished_notes(traces, sources)),
+        notes=(*notes, *finished_notes(traces, sources.tolist())),
         unlabelled=n_unlabelled,
         ordered=int((np.diff(labels) != 0).sum()) != 1,
     )

@@ -137,12 +137,13 @@ def _damaged_parts(table: Table, codes: Cells) -> dict[int, int]:
 
 def _split_wide(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
     """Yield each row."""
-    groups = {}
+    groups: dict[str, list[str]] = {}
     for key in (channel.column for channel in description.channels if ANY in channel.column):
         names = sorted(filter(pattern_of(key).fullmatch, table.columns), key=natural_key)
         groups |= {key: names} if names else {}
     cells = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
-    units = table.units | {key: table.units.get(names[0], "") for key, names in groups.items()}
+    units = {key: table.units.get(names[0], "") for key, names in groups.items()}
+    units = {**table.units, **units}
     others = {*table.columns}.difference(*groups.values())
     for i, line in enumerate(table.lines):
         source = f"{name}, row {line}"
@@ -165,7 +166,7 @@ def _split_columns(table: Table, name: str, description: Description) -> Parts:
             samples = without_empty_end(table.columns[column])
             n = len(samples)
             columns = {key: table.columns[key][:n] for key in shared} | {channel: samples}
-            units = table.units | {channel: table.units.get(column, "")}
+            units = {**table.units, channel: table.units.get(column, "")}
             origin = {channel: [column] * n}
             part = replace(
                 table, columns=columns, lines=table.lines[:n], units=units, origin=origin
