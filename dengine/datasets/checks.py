@@ -45,6 +45,7 @@ def check_description(description: Description) -> None:
         "a rate of 1 Hz to 1 MHz in time.rate_hz": (
             not rate_hz or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
         ),
+        "time.column, since the order is time": clock.column or description.order != "time",
         "one limit for all channels": len({c.limit for c in description.channels}) == 1,
         f"an encoding in text.encoding, got {text.encoding!r}": encoding,
         f"one character in text.delimiter, got {text.delimiter!r}": len(text.delimiter) == 1,

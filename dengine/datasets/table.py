@@ -107,18 +107,18 @@ class Table:
             values = cells.astype(np.float64)
         else:
             values = np.array([_number(cell, form) for cell in cells.tolist()], dtype=np.float64)
-        is_bad = np.abs(values) > LARGEST
-        if is_bad.any():
-            marks = f"the decimal mark {form.decimal}"
-            marks += f" and groups by {form.thousands!r}" if form.thousands else ""
-            raise self.error(f"Expected a number with {marks}", int(is_bad.argmax()), name)
+        groups = f" and groups by {form.thousands!r}" if form.thousands else ""
+        wanted = f"a number with the decimal mark {form.decimal}{groups}"
+        self.refuse(np.abs(values) > LARGEST, wanted, name)
         return values
 
-    def error(self, wanted: str, row: int, name: str, found: str = "") -> UnreadableError:
-        """Return the error for a cell, which is what was found if nothing else is named."""
-        found = found or shortened(self.columns[name][row : row + 1].tolist()[0])
-        column = self.origin[name][row] if name in self.origin else name
-        return UnreadableError(f"{wanted}, got {found}", self.line(row), column)
+    def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:
+        """Raise UnreadableError for the first cell of a column that is bad, if one is."""
+        if is_bad.any():
+            row = int(is_bad.argmax())
+            found = shortened(self.columns[name][row : row + 1].tolist()[0])
+            column = self.origin[name][row] if name in self.origin else name
+            raise UnreadableError(f"Expected {wanted}, got {found}", self.line(row), column)
 
     def line(self, row: int) -> int:
         """Return the line of a row; 0 if it is not known."""
@@ -135,10 +135,7 @@ class Table:
             raise UnreadableError(f"Expected a word in column {name}, got no rows", column=name)
         if at == "same" and (cells != cells[0]).any():
             words = self.words(name)
-            if (words != words[0]).any():
-                row = int((words != words[0]).argmax())
-                found = f"{words[0]!r} and {words[row]!r}"
-                raise self.error("Expected one word in all rows", row, name, found)
+            self.refuse(words != words[0], f"one word in all rows, {words[0]!r}", name)
         return as_word(cells[-1 if at == "last" else 0])
 
 

@@ -144,7 +144,9 @@ def write(
     parts = part_columns(X, y, style, names)
     edit(parts[2 % len(X)])
     suffix = "csv.gz" if kind == "text" and style.is_packed else {"text": "csv"}.get(kind, kind)
-    words = [p["verdict"][0] if style.label_column else WORDS[i] for i, p in zip(y, parts, strict=True)]
+    words = [
+        p["verdict"][0] if style.label_column else WORDS[i] for i, p in zip(y, parts, strict=True)
+    ]
     about = {"part": [str(i) for i in range(len(X))], "verdict": words}
     single = folder / f"all.{suffix}"
     description = Description(
@@ -161,7 +163,10 @@ def write(
     in_path = replace(LABEL, path="_([A-Z]+)$")
     row = style.above + 1 + (form.units > 0)
     if (layout, kind) == ("files", "jsonl"):
-        rows = [{"verdict": w, **p, "part": i} for p, w, i in zip(parts, words, about["part"], strict=True)]
+        rows = [
+            {"verdict": w, **p, "part": i}
+            for p, w, i in zip(parts, words, about["part"], strict=True)
+        ]
         single.write_text("\n".join(map(json.dumps, rows)))
         return Written(single, description, X, y, single, 2)
     if layout == "files":

@@ -24,6 +24,11 @@ def is_dated(unit: str) -> bool:
     return unit == ISO or "%" in unit
 
 
+def has_day(unit: str) -> bool:
+    """Return whether the cells of a clock's column tell the day."""
+    return unit == ISO or DATES.search(unit) is not None
+
+
 def scale_of(unit: str) -> float:
     """Return the seconds of a unit of time, `ms` or `0.001 ms`; DataError for another text."""
     match = re.fullmatch(r"(\d*\.?\d*)\s*([^\d.]+)", unit.strip())
@@ -76,8 +81,7 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
         cells = cells.astype(np.int64)
     else:
         cells = table.numbers(name, form)
-        if np.isnan(cells).any():
-            raise table.error("Expected a time", int(np.isnan(cells).argmax()), name, "none")
+        table.refuse(np.isnan(cells), "a time", name)
     values = (cells - cells[0]).astype(np.float64) * scale
     if clock.wrap:
         values = values + np.cumsum(np.diff(values, prepend=0.0) < 0) * clock.wrap * scale
@@ -85,27 +89,26 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
-    """Return the times of a column of dates or times of day; a time of day may pass midnight."""
+    """Return the times of a column of dates, or times of day, which pass midnight without dates."""
     import pandas as pd
 
     texts = pd.Series(table.column(name))
-    form = None if texts.dtype.kind == "M" else "ISO8601" if unit == ISO else unit
-    if form is not None:
+    is_date = texts.dtype.kind == "M"
+    if not is_date:
         texts = texts.astype(str).str.strip()
-        if "%f" in form:
+        if "%f" in unit:
             texts = texts.str.replace(",", ".", regex=False)
-    has_date = not is_dated(unit) or unit == ISO or form is None or bool(DATES.search(form))
+    has_date = is_date or has_day(unit)
+    form = None if is_date else "ISO8601" if unit == ISO else unit
     with instead(UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError):
         times = pd.to_datetime(texts, format=form, errors="coerce")
         if times.dt.tz is None:
             zone = ZoneInfo(clock.zone) if clock.zone and has_date else "UTC"
             times = times.dt.tz_localize(zone, ambiguous="infer")
-    is_lost = times.isna().to_numpy()
-    if is_lost.any():
-        raise table.error(f"Expected a time of the form {unit}", int(is_lost.argmax()), name)
+    table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
     zero = pd.Timestamp("1970-01-01" if has_date else "1900-01-01", tz="UTC")
     values = (times - times.iloc[0]).dt.total_seconds().to_numpy(np.float64)
-    if not has_date:
+    if not has_date and not any(map(has_day, clock.format)):
         values = values + DAY * np.cumsum(np.diff(values, prepend=0.0) < -DAY / 2)
     return values, (times.iloc[0] - zero).total_seconds()
 

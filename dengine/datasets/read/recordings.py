@@ -128,9 +128,8 @@ class Reader:
             words = table.words(column)
             known = {*about.keep, *about.drop, *about.invalid}
             is_other = ~np.isin(words, [*known])
-            if ANY not in known and is_other.any():
-                wanted = f"Expected one of the words {listed(sorted(known))}"
-                raise table.error(wanted, int(is_other.argmax()), column)
+            if ANY not in known:
+                table.refuse(is_other, f"one of the words {listed(sorted(known))}", column)
             invalid, drop = (
                 np.isin(words, [*some]) | (is_other & (ANY in some))
                 for some in (about.invalid, about.drop)
