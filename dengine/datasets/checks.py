@@ -22,6 +22,7 @@ from .table import Recording
 __all__ = [
     "LEAST_RATE_HZ",
     "MOST_RATE_HZ",
+    "Fitted",
     "check_description",
     "finished_notes",
     "tolerance_note",
@@ -72,21 +73,28 @@ def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]
     for i, hash_ in enumerate(content_hash(np.stack(traces)).tolist() if traces else ()):
         if np.ptp(traces[i]) > 0:
             groups[hash_].append(i)
-    faults = dict[int, str]()
+    messages = dict[int, str]()
     for group in groups.values():
-        first, second = (fitted[i][0] for i in (group[0], group[min(1, len(group) - 1)]))
-        is_one = len({fitted[i][0].label for i in group}) == 1
-        for i in group[is_one:]:
-            recording = fitted[i][0]
-            part = f" of another part, {first.part}" if recording.part != first.part else ""
-            other = second if recording is first else first
-            faults[i] = (
-                f"Expected other samples than those of {other.source}{part}, it repeats them"
-                if is_one
-                else f"Expected one label for equal samples, {other.source} has another one"
+        first, *others = [fitted[i][0] for i in group]
+        if {other.label for other in others} <= {first.label}:
+            messages |= dict(
+                zip(group[1:], (_repeat(first, other) for other in others), strict=True)
             )
-    kept = [item for i, item in enumerate(fitted) if i not in faults]
-    return kept, [Fault(fitted[i][0].source, 0, text) for i, text in sorted(faults.items())]
+        else:
+            near = [others[0], *[first] * len(others)]
+            wanted = "Expected one label for equal samples"
+            messages |= {
+                i: f"{wanted}, {other.source} has another one"
+                for i, other in zip(group, near, strict=True)
+            }
+    kept = [item for i, item in enumerate(fitted) if i not in messages]
+    return kept, [Fault(fitted[i][0].source, 0, text) for i, text in sorted(messages.items())]
+
+
+def _repeat(first: Recording, other: Recording) -> str:
+    """Return the message for a recording that repeats another one."""
+    part = f" of another part, {first.part}" if other.part != first.part else ""
+    return f"Expected other samples than those of {first.source}{part}, it repeats them"
 
 
 def finished_notes(traces: NDArray[np.float32], sources: Sequence[str]) -> list[str]:

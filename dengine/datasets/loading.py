@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -62,24 +63,22 @@ def load_dataset(
     DataError
         If there is no description, or an open one, with what to type; or if no recording is left.
     """
-    names = tuple(channels.split(",") if isinstance(channels, str) else channels or ())
-    names = tuple(name.strip() for name in names)
+    stated = channels.split(",") if isinstance(channels, str) else channels or ()
+    names = tuple(map(str.strip, stated))
     expect_data(samples is None or samples >= 1, "1 or more samples", samples)
     read = None if description is not None else own_reader(source)
     if read is not None:
         data = read()
         data = data.select(names) if names else data
-        return data.cut(samples) if samples else data
-    stated = description_of(source, description)
-    if names:
-        stated = stated.with_channels(names)
-    whole = stated.traces.samples
-    is_cut = samples is not None and samples < whole and stated.traces.lengths != "resample"
-    if samples is not None and not is_cut:
-        stated = stated.with_values({"traces.samples": samples})
-    place = Path(source) if isinstance(source, str | os.PathLike) else source
-    data = read_recordings(place, stated, progress)
-    return data.cut(samples) if samples is not None and is_cut else data
+    else:
+        about = description_of(source, description)
+        about = about.with_channels(names) if names else about
+        traces = about.traces
+        if samples and (samples > traces.samples or traces.lengths == "resample"):
+            about = replace(about, traces=replace(traces, samples=samples))
+        place = Path(source) if isinstance(source, str | os.PathLike) else source
+        data = read_recordings(place, about, progress)
+    return data.cut(samples) if samples else data
 
 
 def saved_description(source: str | os.PathLike[str]) -> Path:

@@ -48,24 +48,29 @@ def _parse(line: str, number: int) -> Any:
 def columns_of(prefix: str, value: Any) -> Columns:
     """Return the columns of a nested object, each with its cells; a scalar is a column of one."""
     value = value.tolist() if isinstance(value, np.ndarray) else value
-    first = value[0] if isinstance(value, list) and value else None
+    items = value if isinstance(value, list) else [value]
+    first = items[0] if items else None
+    nested: Mapping[Any, Any]
     if isinstance(value, Mapping):
-        items = {f"{prefix}.{name}" if prefix else str(name): item for name, item in value.items()}
+        nested = value
     elif isinstance(first, Mapping | list | np.ndarray):
-        forms = {len(item) if isinstance(item, type(first)) else -1 for item in value}
-        if len(forms) > 1:
-            message = f"Expected lists or objects of one length in {prefix}, got others"
-            raise UnreadableError(message, column=prefix)
-        rows: Mapping[Any, Any]
-        if isinstance(first, Mapping):
-            rows = {name: [item.get(name) for item in value] for name in first}
-        else:
-            is_wide = len(value) <= MOST_CHANNELS
-            rows = dict(enumerate(value if is_wide else [*zip(*value, strict=True)]))
-        items = {f"{prefix}.{name}": [*row] for name, row in rows.items()}
+        nested = _turned(prefix, items, first)
     else:
-        return {prefix: as_cells(value if isinstance(value, list) else [value])}
-    return _flat(columns_of(name, item) for name, item in items.items())
+        return {prefix: as_cells(items)}
+    stem = f"{prefix}." if prefix else ""
+    return _flat(columns_of(f"{stem}{name}", item) for name, item in nested.items())
+
+
+def _turned(prefix: str, items: Sequence[Any], first: Any) -> Mapping[Any, Any]:
+    """Return the lists of a list of objects by their keys, or of lists by their places."""
+    forms = {len(item) if isinstance(item, type(first)) else -1 for item in items}
+    if len(forms) > 1:
+        message = f"Expected lists or objects of one length in {prefix}, got others"
+        raise UnreadableError(message, column=prefix)
+    if isinstance(first, Mapping):
+        return {name: [item.get(name) for item in items] for name in first}
+    is_wide = len(items) <= MOST_CHANNELS
+    return dict(enumerate(map(list, items if is_wide else zip(*items, strict=True))))
 
 
 def _flat(columns: Iterable[Columns]) -> Columns:

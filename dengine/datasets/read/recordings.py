@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...errors import DataError, listed, shortened
 from ...records import FITS
 from ...traces import can_fit_length, fit_length
-from ..checks import check_description, finished_notes, without_repeats
+from ..checks import Fitted, check_description, finished_notes, without_repeats
 from ..dataset import Dataset, Fault
 from ..description import ANY, Channel, Description, LabelSource
 from ..table import Cells, Floats, Recording, Table, UnreadableError
@@ -233,20 +233,7 @@ def to_dataset(
 
     Raises DataError if none is left.
     """
-    faults: list[Fault] = []
-    fitted: list[tuple[Recording, NDArray[np.float32]]] = []
-    n_unlabelled = 0
-    for item in found:
-        if isinstance(item, Fault):
-            faults.append(item)
-            continue
-        try:
-            check_steps(item, description.time)
-            if item.label is not None:
-                fitted.append((item, fit(item, description)))
-            n_unlabelled += item.label is None
-        except UnreadableError as error:
-            faults.append(fault_of(error, item.source))
+    fitted, faults, n_unlabelled = _fitted(found, description)
     if description.order == "time":
         fitted.sort(key=lambda item: item[0].start)
     elif description.order != "name":
@@ -264,8 +251,8 @@ def to_dataset(
     traces = np.stack([trace for _, trace in fitted])
     recordings = [recording for recording, _ in fitted]
     labels = np.array([recording.label for recording in recordings], dtype=np.int8)
+    sources = [recording.source for recording in recordings]
     parts = np.array([recording.part for recording in recordings])
-    sources = np.array([recording.source for recording in recordings])
     channels, rate_hz = description.channels, description.time.rate_hz
     lengths = description.traces.lengths.removesuffix("-all")
     is_grid = lengths == "resample" and description.time.column and rate_hz
@@ -279,13 +266,35 @@ def to_dataset(
         part=parts if (parts != "").any() else None,
         faults=tuple(faults),
         channels=tuple(channel.column for channel in channels),
-        source=sources,
+        source=np.array(sources),
         fit="strict" if is_grid else lengths,
         lengths=np.array([recording.samples.shape[1] for recording in recordings]),
-        notes=(*notes, *finished_notes(traces, sources.tolist())),
+        notes=(*notes, *finished_notes(traces, sources)),
         unlabelled=n_unlabelled,
         ordered=int((np.diff(labels) != 0).sum()) != 1,
     )
+
+
+def _fitted(
+    found: Iterable[Recording | Fault], description: Description
+) -> tuple[list[Fitted], list[Fault], int]:
+    """Return the labelled recordings with their traces, the faults, and the number of others."""
+    fitted: list[Fitted] = []
+    faults: list[Fault] = []
+    n_unlabelled = 0
+    for item in found:
+        if isinstance(item, Fault):
+            faults.append(item)
+            continue
+        try:
+            check_steps(item, description.time)
+            if item.label is None:
+                n_unlabelled += 1
+            else:
+                fitted.append((item, fit(item, description)))
+        except UnreadableError as error:
+            faults.append(fault_of(error, item.source))
+    return fitted, faults, n_unlabelled
 
 
 def fit(recording: Recording, description: Description) -> NDArray[np.float32]:

@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -57,7 +58,36 @@ def read_text(
         If the file is empty, in another encoding, has no such header, or a row of another number
         of cells.
     """
-    content = to_utf8(content, form.encoding)
+    table, body = _parts(to_utf8(content, form.encoding), source, form)
+    numbers, words = ({*filter(test, body.names)} for test in (is_numeric, is_word))
+    columns = _read_plain(body, form, numbers, words)
+    if columns is not None:
+        return replace(table, columns=columns, lines=range(body.first, body.first + body.n))
+    rows = _rows(body, form)
+    n = len(body.names)
+    wanted = f"Expected {n} cells, as there are columns"
+    damage = {i: f"{wanted}, got {len(row)}" for i, row in rows if len(row) != n}
+    if damage and (not keep_damaged or len(damage) == len(rows)):
+        line, message = next(iter(damage.items()))
+        raise UnreadableError(message, line)
+    texts = np.array([[""] * n if i in damage else row for i, row in rows], dtype=object)
+    columns = dict(zip(body.names, texts.reshape(-1, n).T, strict=True))
+    return replace(table, columns=columns, lines=[i for i, _ in rows], damage=damage)
+
+
+class Body(NamedTuple):
+    """The n lines of samples in a file, `content[start:end]` from line `first` on."""
+
+    content: bytes
+    start: int
+    end: int
+    first: int
+    n: int
+    names: Sequence[str]
+
+
+def _parts(content: bytes, source: str, form: TextForm) -> tuple[Table, Body]:
+    """Return what stands above the samples, as a table without columns, and the samples."""
     if not content.strip():
         raise UnreadableError("Expected rows of samples, the file is empty")
     header, units, data = _places(content, form)
@@ -70,22 +100,7 @@ def read_text(
     cells = split_line(top[units - 1], form.delimiter) if 0 < units < data else ()
     stated = dict(zip(names, map(str.strip, cells), strict=False))
     table = Table(source, {}, (), stated, top[: (header or data) - 1], header)
-    numbers, words = ({*filter(test, names)} for test in (is_numeric, is_word))
-    n = content.count(b"\n", start, end) + 1
-    if not form.drop and not form.thousands and len({*names}) == len(names):
-        columns = _read_plain((content, start, end), n, names, form, numbers, words)
-        if columns is not None:
-            return replace(table, columns=columns, lines=range(data, data + n))
-    rows = _rows(content[start:end].decode(), data, form)
-    wanted = f"Expected {len(names)} cells, as there are columns"
-    damage = {i: f"{wanted}, got {len(row)}" for i, row in rows if len(row) != len(names)}
-    if damage and not keep_damaged:
-        line, message = next(iter(damage.items()))
-        raise UnreadableError(message, line)
-    empty = [""] * len(names)
-    texts = np.array([empty if i in damage else row for i, row in rows], dtype=object)
-    columns = dict(zip(names, texts.reshape(-1, len(names)).T, strict=True))
-    return replace(table, columns=columns, lines=[i for i, _ in rows], damage=damage)
+    return table, Body(content, start, end, data, content.count(b"\n", start, end) + 1, names)
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
@@ -154,18 +169,13 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     return [*names, *(f"{last[: -len(REST)]}{i}" for i in range(n))]
 
 
-def _read_plain(
-    place: tuple[bytes, int, int],
-    n: int,
-    names: Sequence[str],
-    form: TextForm,
-    numbers: set[str],
-    words: set[str],
-) -> Columns | None:
-    """Return the columns of n lines by pandas' parser; None if anything in them is not plain."""
+def _read_plain(body: Body, form: TextForm, numbers: set[str], words: set[str]) -> Columns | None:
+    """Return the columns by pandas' parser; None if anything in them is not plain."""
     import pandas as pd
 
-    content, start, end = place
+    content, start, end, _, n, names = body
+    if form.drop or form.thousands or len({*names}) < len(names):
+        return None
     file = io.BytesIO(content)
     file.seek(start)
     missing = {name: [*form.missing] for name in numbers} if form.missing else None
@@ -189,23 +199,27 @@ def _read_plain(
     else:
         n_marks = content.count(form.delimiter.encode(), start, end)
         is_cut = n_marks != n * (len(names) - 1)
-    if is_cut or len(frame) != n or not isinstance(frame.index, pd.RangeIndex):
-        return None
-    columns: Columns = dict.fromkeys(names, np.empty(0))
+    is_whole = len(frame) == n and isinstance(frame.index, pd.RangeIndex) and not is_cut
+    return _cells_of(frame, numbers - words, words, bool(missing)) if is_whole else None
+
+
+def _cells_of(frame: Any, numbers: set[str], words: set[str], may_miss: bool) -> Columns | None:
+    """Return the columns of a DataFrame; None if a number among them is none, or not finite."""
+    columns: Columns = dict.fromkeys(frame.columns, np.empty(0))
     for name in words:
         cells = frame.pop(name).array
         texts = np.array([*map(str.strip, cells.categories)], dtype=object)
         columns[name] = texts[cells.codes]
-    for name in numbers - words:
+    for name in numbers:
         values = columns[name] = frame.pop(name).to_numpy()
         is_number = values.dtype.kind in "iuf"
-        if not is_number or not (np.isfinite(values) | (np.isnan(values) & bool(missing))).all():
+        if not is_number or not (np.isfinite(values) | (np.isnan(values) & may_miss)).all():
             return None
     return columns
 
 
-def _rows(text: str, first: int, form: TextForm) -> list[tuple[int, list[str]]]:
+def _rows(body: Body, form: TextForm) -> list[tuple[int, list[str]]]:
     """Return the cells of each line with its number, without lines that are empty or dropped."""
-    lines = enumerate(text.split("\n"), first)
+    lines = enumerate(body.content[body.start : body.end].decode().split("\n"), body.first)
     kept = ((i, line) for i, line in lines if line.strip() and not line.startswith(form.drop))
     return [(i, split_line(line, form.delimiter)) for i, line in kept]
