@@ -76,23 +76,18 @@ def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]
     messages = dict[int, str]()
     for group in groups.values():
         first, *others = [fitted[i][0] for i in group]
-        if {other.label for other in others} <= {first.label}:
-            messages |= dict(
-                zip(group[1:], (_repeat(first, other) for other in others), strict=True)
-            )
-        else:
-            near = [others[0], *[first] * len(others)]
-            wanted = "Expected one label for equal samples"
-            messages |= {
-                i: f"{wanted}, {other.source} has another one"
-                for i, other in zip(group, near, strict=True)
-            }
+        is_one = all(other.label == first.label for other in others)
+        near = [first] * len(others) if is_one else [others[0], *[first] * len(others)]
+        for i, other in zip(group[is_one:], near, strict=True):
+            messages[i] = _repeat(other, fitted[i][0], is_one)
     kept = [item for i, item in enumerate(fitted) if i not in messages]
     return kept, [Fault(fitted[i][0].source, 0, text) for i, text in sorted(messages.items())]
 
 
-def _repeat(first: Recording, other: Recording) -> str:
-    """Return the message for a recording that repeats another one."""
+def _repeat(first: Recording, other: Recording, is_one: bool) -> str:
+    """Return the message for a recording that repeats another one, with the same label or not."""
+    if not is_one:
+        return f"Expected one label for equal samples, {first.source} has another one"
     part = f" of another part, {first.part}" if other.part != first.part else ""
     return f"Expected other samples than those of {first.source}{part}, it repeats them"
 

@@ -120,6 +120,11 @@ class Dataset:
     _repr_html_ = to_html
 
     @property
+    def cube(self) -> NDArray[np.float32]:
+        """The traces, shape (n, C, T) also for a single channel."""
+        return self.X if self.X.ndim == 3 else self.X[:, None]
+
+    @property
     def spec(self) -> TraceSpec:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
@@ -145,7 +150,7 @@ class Dataset:
         """
         import pandas as pd
 
-        X = self.X if self.X.ndim == 3 else self.X[:, None]
+        X = self.cube
         default = ["x"] if X.shape[1] == 1 else [f"x{c}" for c in range(X.shape[1])]
         names = [f"{name}_{i}" for name in self.channels or default for i in range(X.shape[2])]
         columns = {"label": self.y, "part": self.part, "cause": self.cause}
@@ -158,16 +163,14 @@ class Dataset:
 
     def select(self, channels: tuple[str, ...]) -> "Dataset":
         """Return a data set of some channels, in this order; DataError for unknown names."""
-        unknown = [name for name in channels if name not in self.channels]
         names = ", ".join(self.channels) or "none, its channels have no names"
-        expect_data(not unknown, f"channels of {self.name}, {names}", unknown)
+        wanted = f"channels of {self.name}, {names}"
+        expect_data({*channels} <= {*self.channels}, wanted, [*channels])
         places = [self.channels.index(name) for name in channels]
-        units = [unit.strip() for unit in self.unit.split(",")]
-        units = units * len(self.channels) if len(units) == 1 else units
-        X = self.X if self.X.ndim == 3 else self.X[:, None]
-        X = X[:, places[0]] if len(places) == 1 else X[:, places]
+        units = self.unit.split(", ") if ", " in self.unit else [self.unit] * len(self.channels)
+        X = np.ascontiguousarray(self.cube[:, places])
         unit = ", ".join(units[place] for place in places)
-        return replace(self, X=np.ascontiguousarray(X), channels=channels, unit=unit)
+        return replace(self, X=X if len(places) > 1 else X[:, 0], channels=channels, unit=unit)
 
     def cut(self, samples: int) -> "Dataset":
         """Return a data set of the first `samples` samples of every trace, to decide earlier.

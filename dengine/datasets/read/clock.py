@@ -124,19 +124,19 @@ def check_steps(recording: Recording, clock: Clock) -> None:
     steps = np.diff(seconds)
     span = float(seconds[-1] - seconds[0])
     usual = 1 / clock.rate_hz if clock.rate_hz else span / len(steps)
-    is_back = steps < 0 if clock.gap == 0 and span > 0 else steps <= 0
-    is_gap = (steps > clock.gap * usual) & (clock.gap > 0)
-    rate = len(steps) / span if span > 0 else np.inf
-    row, message = 0, ""
-    if is_back.any():
-        row = int(is_back.argmax()) + 1
-        message = f"a later time than before, got a step of {steps[row - 1]:.6g} s"
-    elif is_gap.any():
-        row = int(is_gap.argmax()) + 1
-        gap = f"a gap of {steps[row - 1]:.6g} s before row {row + 1}"
-        message = f"steps of {usual:.6g} s, got {gap}; see time.gap"
-    elif clock.rate_hz and abs(rate - clock.rate_hz) > RATE_TOLERANCE * clock.rate_hz:
-        message = f"{clock.rate_hz:g} Hz as time.rate_hz says, its times give {rate:.5g} Hz"
-    if message:
-        line = int(recording.lines[row]) if 0 < row < len(recording.lines) else 0
-        raise UnreadableError(f"Expected {message}", line, " + ".join(clock.column))
+    column = " + ".join(clock.column)
+    for is_bad, wanted in (
+        (steps < 0 if clock.gap == 0 and span > 0 else steps <= 0, "a later time than before"),
+        ((steps > clock.gap * usual) & (clock.gap > 0), f"at most time.gap steps of {usual:.6g} s"),
+    ):
+        if is_bad.any():
+            row = int(is_bad.argmax())
+            line = int(recording.lines[row + 1]) if len(recording.lines) else 0
+            message = f"Expected {wanted}, got {steps[row]:.6g} s before row {row + 2}"
+            raise UnreadableError(message, line, column)
+    rate = len(steps) / span
+    if clock.rate_hz and abs(rate - clock.rate_hz) > RATE_TOLERANCE * clock.rate_hz:
+        message = (
+            f"Expected {clock.rate_hz:g} Hz as time.rate_hz says, its times give {rate:.5g} Hz"
+        )
+        raise UnreadableError(message, column=column)

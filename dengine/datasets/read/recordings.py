@@ -4,7 +4,7 @@ Files are split into one table for each part, each table becomes a `Recording`, 
 a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -234,44 +234,52 @@ def to_dataset(
     Raises DataError if none is left.
     """
     fitted, faults, n_unlabelled = _fitted(found, description)
-    if description.order == "time":
-        fitted.sort(key=lambda item: item[0].start)
-    elif description.order != "name":
-        fitted.sort(key=lambda item: natural_key(item[0].order))
+    orders: Mapping[str, Callable[[Fitted], Any]] = {
+        "time": lambda item: item[0].start,
+        "name": lambda _: 0,  # as they were found
+    }
+    fitted.sort(key=orders.get(description.order, lambda item: natural_key(item[0].order)))
     fitted, repeats = without_repeats(fitted)
     faults += repeats
     if not fitted:
-        why = f" {faults[0]}." if faults else ""
         n = f"{len(faults)} have faults, {n_unlabelled} no label"
+        why = "".join(f" {fault}." for fault in faults[:1])
         raise DataError(f"Expected recordings in {name}, none is left: {n}.{why}")
     n_found, n_seen = len(fitted) + len(faults) + n_unlabelled, description.seen.recordings
     if n_found < n_seen:
         seen = f"The description was made for {n_seen} recordings, now there are {n_found}."
         notes = [*notes, seen]
+    return _joined(
+        fitted, description, name=name, faults=(*faults,), unlabelled=n_unlabelled, notes=notes
+    )
+
+
+def _joined(
+    fitted: Sequence[Fitted], description: Description, notes: Sequence[str], **others: Any
+) -> Dataset:
+    """Return the data set of recordings with their traces."""
     traces = np.stack([trace for _, trace in fitted])
-    recordings = [recording for recording, _ in fitted]
-    labels = np.array([recording.label for recording in recordings], dtype=np.int8)
-    sources = [recording.source for recording in recordings]
-    parts = np.array([recording.part for recording in recordings])
-    channels, rate_hz = description.channels, description.time.rate_hz
+    about = {
+        key: np.array([getattr(recording, key) for recording, _ in fitted])
+        for key in ("source", "part", "label")
+    }
+    channels, clock = description.channels, description.time
     lengths = description.traces.lengths.removesuffix("-all")
-    is_grid = lengths == "resample" and description.time.column and rate_hz
+    is_grid = lengths == "resample" and clock.column and clock.rate_hz
     return Dataset(
         traces[:, 0] if len(channels) == 1 else traces,
-        labels,
-        name=name,
-        rate_hz=rate_hz or None,
+        about["label"].astype(np.int8),
+        rate_hz=clock.rate_hz or None,
         unit=", ".join(channel.unit for channel in channels).strip(", "),
         limit=channels[0].limit or None,
-        part=parts if (parts != "").any() else None,
-        faults=tuple(faults),
+        part=about["part"] if (about["part"] != "").any() else None,
         channels=tuple(channel.column for channel in channels),
-        source=np.array(sources),
+        source=about["source"],
         fit="strict" if is_grid else lengths,
-        lengths=np.array([recording.samples.shape[1] for recording in recordings]),
-        notes=(*notes, *finished_notes(traces, sources)),
-        unlabelled=n_unlabelled,
-        ordered=int((np.diff(labels) != 0).sum()) != 1,
+        lengths=np.array([recording.samples.shape[1] for recording, _ in fitted]),
+        notes=(*notes, *finished_notes(traces, about["source"].tolist())),
+        ordered=np.count_nonzero(np.diff(about["label"])) != 1,
+        **others,
     )
 
 

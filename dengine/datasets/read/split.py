@@ -123,16 +123,12 @@ def _damaged_parts(table: Table, codes: Cells) -> dict[int, int]:
 
     These are the parts of the rows before and behind it.
     """
-    found: dict[int, int] = {}
-    if table.damage:
-        is_damaged = np.isin(table.lines, [*table.damage])
-        whole = np.flatnonzero(~is_damaged)
-        for row in np.flatnonzero(is_damaged).tolist():
-            at = int(np.searchsorted(whole, row))
-            for near in whole[max(at - 1, 0) : at + 1]:
-                found.setdefault(int(codes[near]), table.line(row))
-        codes[is_damaged] = -1
-    return found
+    if not table.damage:
+        return {}
+    codes[np.isin(table.lines, [*table.damage])] = -1
+    rows = np.flatnonzero(codes == -1)[::-1].tolist()  # the first one of a part is named
+    near = ((code, row) for row in rows for code in codes[max(row - 1, 0) : row + 2].tolist())
+    return {code: table.line(row) for code, row in near}
 
 
 def _split_wide(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
