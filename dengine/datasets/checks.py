@@ -71,7 +71,8 @@ def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]
     groups = defaultdict(list)
     traces = [trace for _, trace in fitted]
     for i, hash_ in enumerate(content_hash(np.stack(traces)).tolist() if traces else ()):
-        if np.ptp(traces[i]) > 0:
+        samples = traces[i][np.isfinite(traces[i])]
+        if (samples != samples[:1]).any():
             groups[hash_].append(i)
     messages = dict[int, str]()
     for group in groups.values():
