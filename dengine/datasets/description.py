@@ -257,19 +257,19 @@ class Description:
     def to_dict(self) -> dict[str, Any]:
         """Return nested dicts of TOML's types, without what has its default."""
         values: dict[str, Any] = _plain(self)
-        channels = {table.pop("column", ""): table for table in values.get("channels", ())}
-        if channels:
-            only_unit = {"unit"}
-            values["channels"] = {
-                column: table.get("unit", "") if {*table} <= only_unit else table
-                for column, table in channels.items()
-            }
+        if self.channels:
+            values["channels"] = {table.pop("column", ""): table for table in values["channels"]}
         return values
 
     def to_toml(self) -> str:
         """Return the text of the TOML file, with `notes` as comments."""
-        values: dict[str, Any] = {"version": self.version, "channels": {UNKNOWN: ""}}
+        values: dict[str, Any] = {"version": self.version, "channels": {UNKNOWN: {}}}
         values |= self.to_dict()
+        only_unit = {"unit"}
+        values["channels"] = {
+            column: table.get("unit", "") if {*table} <= only_unit else table
+            for column, table in values["channels"].items()
+        }
         lines = self._lines("", values, KEYS[""])
         for name in SECTIONS:
             table = values.get(name, {})
@@ -307,7 +307,8 @@ class Description:
         values = self.to_dict()
         values.pop("ignored", None)
         found = tuple(name for name, value in _leaves(values) if value == UNKNOWN)
-        return found if self.channels else (*found, "channels")
+        columns = [channel.column for channel in self.channels]
+        return found if columns and UNKNOWN not in columns else (*found, "channels")
 
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which keys, like `label.column`, have other values.

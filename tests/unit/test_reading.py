@@ -119,7 +119,7 @@ def write_parts(folder: Path, kind: str, stems: Cells, parts: list[Columns], sty
             (folder / stem).write_text(json.dumps(columns))
 
 
-def table_of(layout: str, objects: list[Columns], about: Columns) -> pd.DataFrame:
+def table_of(layout: str, objects: list[dict[str, Any]], about: Columns) -> pd.DataFrame:
     """Return the table of all parts in a layout."""
     if layout.startswith("long"):
         return pd.concat(map(pd.DataFrame, objects))
@@ -186,7 +186,7 @@ def write(
     edit(parts[2 % len(X)])
     written = [parts[i]["verdict"][0] if style.label_column else WORDS[k] for i, k in enumerate(y)]
     about = {"part": [str(i) for i in range(len(X))], "verdict": written}
-    objects = [
+    objects: list[dict[str, Any]] = [
         {"verdict": word, **p, "part": i}
         for p, word, i in zip(parts, written, about["part"], strict=True)
     ]
@@ -578,7 +578,15 @@ def test_rows_are_kept_or_lost_by_the_words_of_a_column(tmp_path: Path) -> None:
 # Descriptions.
 
 
-def of_field(about: Any) -> st.SearchStrategy[Any]:
+def test_a_stated_key_replaces_one_and_a_stated_source_the_others() -> None:
+    d = Description(channels=(Channel("F.z", "N"), Channel("?")), label=LabelSource("verdict"))
+    stated = d.with_values({"channels.F.z.limit": 100.0, "label.path": "(OK)"})
+    assert stated.channels == (Channel("F.z", "N", limit=100.0),)
+    assert stated.label == LabelSource(path="(OK)")
+    assert d.open_keys == ("channels",)
+
+
+def of_field(about: Any) -> Any:
     """Return what a key may be."""
     default, choices = about.default, about.metadata["choices"]
     if choices:
@@ -591,21 +599,20 @@ def of_field(about: Any) -> st.SearchStrategy[Any]:
     return kinds.get(type(default), st.just(1) if about.name == "version" else number)
 
 
-def of_class(cls: Any) -> st.SearchStrategy[Any]:
+def of_class(cls: Any) -> Any:
     """Return any instance of a section."""
     names = {f.name: of_field(f) for f in fields(cls) if "doc" in f.metadata}
     return st.builds(cls, **names)
 
 
-def of_section(name: str, cls: Any) -> st.SearchStrategy[Any]:
+def of_section(name: str, cls: Any) -> Any:
     """Return what a section may be."""
     one = of_class(cls) if cls else st.text(max_size=5)
     several = st.lists(one, max_size=3, unique_by=lambda item: getattr(item, "column", ""))
     if name in ("channels", "check"):
         return several.map(tuple)
     named = st.dictionaries(st.text(max_size=8), one, max_size=3)
-    strategy: st.SearchStrategy[Any] = named if name in ("rows", "ignored") else one
-    return strategy
+    return named if name in ("rows", "ignored") else one
 
 
 KEYS_ = {f.name: of_field(f) for f in fields(Description) if f.name in KEYS[""]}

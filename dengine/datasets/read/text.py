@@ -174,7 +174,8 @@ def _read_plain(body: Body, form: TextForm, numbers: set[str], words: set[str]) 
     import pandas as pd
 
     content, start, end, _, n, names = body
-    if form.drop or form.thousands or len({*names}) < len(names):
+    has_groups = form.thousands and content.find(form.thousands.encode(), start) >= 0
+    if form.drop or has_groups or len({*names}) < len(names):
         return None
     file = io.BytesIO(content)
     file.seek(start)
