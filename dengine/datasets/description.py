@@ -303,9 +303,11 @@ class Description:
 
     @property
     def open_keys(self) -> Words:
-        """The keys whose value is still `?`, like `label.column`; `channels` if there is none."""
-        values = self.to_dict()
-        values.pop("ignored", None)
+        """The keys whose value is still `?`, like `label.column`; `channels` if there is none.
+
+        A word `?` of a check is none of them: it fits no recording, so others are its faults.
+        """
+        values = {k: v for k, v in self.to_dict().items() if k not in ("ignored", "check")}
         found = tuple(name for name, value in _leaves(values) if value == UNKNOWN)
         columns = [channel.column for channel in self.channels]
         return found if columns and UNKNOWN not in columns else (*found, "channels")

@@ -138,7 +138,7 @@ def table_of(layout: str, objects: list[dict[str, Any]], about: Columns) -> pd.D
         }
         for part in objects
     ]
-    return pd.concat([pd.DataFrame(about), pd.DataFrame(cells)], axis=1)
+    return pd.concat([pd.DataFrame(about), pd.DataFrame(cells)], axis=1).assign(FZ_max=0.5)
 
 
 def described(layout: str, X: np.ndarray, style: Style, names: Cells, kind: str) -> Description:

@@ -89,9 +89,8 @@ def as_cells(values: Sequence[Any]) -> Cells:
 
 def join(tables: Sequence[Table]) -> Table:
     """Return one table of tables with a row each, in the columns of the first."""
-    none = (None,)
     columns = {
-        name: as_cells([table.columns.get(name, none)[0] for table in tables])
+        name: as_cells([next(iter(table.columns.get(name, ())), None) for table in tables])
         for name in tables[0].columns
     }
     return Table(tables[0].source, columns, [table.line(0) for table in tables])

@@ -181,17 +181,23 @@ class LabelReader:
         word : of a topic, if that is the source.
         """
         source = self.source
-        kinds = ((None, source.unchecked), (0, source.bad), (1, source.good))
-        meanings = {word: meaning for meaning, words in kinds for word in words}
         words = self.words(place, part) if word is None else [word]
-        found = {meanings.get(word, meanings.get(ANY, ANY)) for word in words}
-        wanted = f"one label for {part or place.path}"
-        if ANY in found:
-            wanted = f"a label among {listed(source.good)} (good), {listed(source.bad)} (bad)"
-        elif len(found) == 1:
-            return found.pop()  # type: ignore[return-value]
         line = 0 if self.listing or source.path else place.table.line(0)
-        message = f"Expected {wanted}, got {', '.join(map(shortened, sorted({*words})))}"
+        meanings = {self.meaning(text, line) for text in words}
+        if len(meanings) > 1:
+            message = f"Expected one label for {part or place.path}, got {listed(sorted(words))}"
+            raise UnreadableError(message, line, source.column)
+        return meanings.pop()
+
+    def meaning(self, word: str, line: int = 0) -> int | None:
+        """Return what a word means; raise UnreadableError for an unknown one."""
+        source = self.source
+        for mark in (word, ANY):
+            for label, words in ((1, source.good), (0, source.bad), (None, source.unchecked)):
+                if mark in words:
+                    return label
+        known = f"{listed(source.good)} (good), {listed(source.bad)} (bad)"
+        message = f"Expected a label among {known}, got {shortened(word)}"
         raise UnreadableError(message, line, source.column)
 
     def unused_note(self) -> str:

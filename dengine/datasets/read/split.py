@@ -18,6 +18,7 @@ from .files import natural_key
 from .text import Test, read_text
 
 Parts = Iterator[tuple[str, str, Table]]  # the source, the path by which it is named, the table
+NUMBER = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = {"json": frames.read_objects, "jsonl": frames.read_objects, "ts": frames.read_ts}
 TABLES = {"parquet": frames.read_parquet, "npz": frames.read_npz}
 
@@ -61,9 +62,9 @@ def signals_of(description: Description) -> Sequence[str]:
     return as_trigger(trigger).signals if trigger else ()
 
 
-def pattern_of(column: str) -> re.Pattern[str]:
+def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
     """Return the pattern of a channel's columns, in which `*` stands for any text."""
-    return re.compile(".*".join(map(re.escape, column.split(ANY))), re.DOTALL)
+    return re.compile(any_text.join(map(re.escape, column.split(ANY))), re.DOTALL)
 
 
 def split(
@@ -97,7 +98,7 @@ def _split_rows(table: Table, name: str, description: Description, faults: list[
     words = [table.words(column) for column in description.part.column]
     if not words:
         raise DataError("Expected part.column, the column that tells the parts apart.")
-    keys = [*map("\0".join, zip(*words, strict=True))] if len(words) > 1 else words[0]
+    keys = [*map("\x1f".join, zip(*words, strict=True))] if len(words) > 1 else words[0]
     codes, _ = pd.factorize(np.asarray(keys, dtype=object))
     damage = _damaged_parts(table, codes)
     order = np.argsort(codes, kind="stable")
@@ -135,12 +136,13 @@ def _split_wide(table: Table, name: str, description: Description, faults: list[
     """Yield each row."""
     groups: dict[str, list[str]] = {}
     for key in (channel.column for channel in description.channels if ANY in channel.column):
-        names = sorted(filter(pattern_of(key).fullmatch, table.columns), key=natural_key)
+        names = sorted(filter(pattern_of(key, NUMBER).fullmatch, table.columns), key=natural_key)
         groups |= {key: names} if names else {}
     cells = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     units = {key: table.units.get(names[0], "") for key, names in groups.items()}
     units = {**table.units, **units}
-    others = {*table.columns}.difference(*groups.values())
+    used = {name for names in groups.values() for name in names}
+    others = [name for name, column in table.columns.items() if name not in used and len(column)]
     for i, line in enumerate(table.lines):
         source = f"{name}, row {line}"
         if line in table.damage:
