@@ -264,16 +264,17 @@ def _joined(
         for key in ("source", "part", "label")
     }
     channels, clock = description.channels, description.time
+    names, units = zip(*((channel.column, channel.unit) for channel in channels), strict=True)
     lengths = description.traces.lengths.removesuffix("-all")
     is_grid = lengths == "resample" and clock.column and clock.rate_hz
     return Dataset(
         traces[:, 0] if len(channels) == 1 else traces,
         about["label"].astype(np.int8),
         rate_hz=clock.rate_hz or None,
-        unit=", ".join(channel.unit for channel in channels).strip(", "),
+        unit=", ".join(units).strip(", "),
         limit=channels[0].limit or None,
         part=about["part"] if (about["part"] != "").any() else None,
-        channels=tuple(channel.column for channel in channels),
+        channels=names,
         source=about["source"],
         fit="strict" if is_grid else lengths,
         lengths=np.array([recording.samples.shape[1] for recording, _ in fitted]),

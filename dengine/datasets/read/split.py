@@ -134,22 +134,20 @@ def _damaged_parts(table: Table, codes: Cells) -> dict[int, int]:
 
 def _split_wide(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
     """Yield each row."""
-    groups: dict[str, list[str]] = {}
-    for key in (channel.column for channel in description.channels if ANY in channel.column):
-        names = sorted(filter(pattern_of(key, NUMBER).fullmatch, table.columns), key=natural_key)
-        groups |= {key: names} if names else {}
+    keys = [channel.column for channel in description.channels if ANY in channel.column]
+    found = {key: [*filter(pattern_of(key, NUMBER).fullmatch, table.columns)] for key in keys}
+    groups = {key: sorted(names, key=natural_key) for key, names in found.items() if names}
     cells = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     units = {key: table.units.get(names[0], "") for key, names in groups.items()}
     units = {**table.units, **units}
-    used = {name for names in groups.values() for name in names}
-    others = [name for name, column in table.columns.items() if name not in used and len(column)]
+    others = {*table.columns}.difference(*groups.values())
     for i, line in enumerate(table.lines):
         source = f"{name}, row {line}"
         if line in table.damage:
             faults.append(Fault(source, line, table.damage[line]))
             continue
         columns = {key: without_empty_end(rows[i]) for key, rows in cells.items()}
-        for column in others:
+        for column in filter(lambda name: len(table.columns[name]), others):
             columns |= frames.columns_of(column, table.columns[column][i])
         row = replace(table, columns=columns, lines=[line], units=units, origin=groups)
         yield source, name, row

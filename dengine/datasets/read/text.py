@@ -173,7 +173,7 @@ def _read_plain(body: Body, form: TextForm, numbers: set[str], words: set[str]) 
     """Return the columns by pandas' parser; None if anything in them is not plain."""
     import pandas as pd
 
-    content, start, end, _, n, names = body
+    content, start, _, _, n, names = body
     has_groups = form.thousands and content.find(form.thousands.encode(), start) >= 0
     if form.drop or has_groups or len({*names}) < len(names):
         return None
@@ -195,13 +195,18 @@ def _read_plain(body: Body, form: TextForm, numbers: set[str], words: set[str]) 
             )
     except (ValueError, OverflowError):  # a row of too many cells, among others
         return None
-    if form.delimiter == BLANK or b'"' in content:  # a row that is cut short has no last cell
-        is_cut = frame[names[-1]].isin(["", np.nan]).any()
-    else:
-        n_marks = content.count(form.delimiter.encode(), start, end)
-        is_cut = n_marks != n * (len(names) - 1)
-    is_whole = len(frame) == n and isinstance(frame.index, pd.RangeIndex) and not is_cut
-    return _cells_of(frame, numbers - words, words, bool(missing)) if is_whole else None
+    is_whole = len(frame) == n and isinstance(frame.index, pd.RangeIndex)
+    if not is_whole or _is_cut(body, frame, form.delimiter):
+        return None
+    return _cells_of(frame, numbers - words, words, bool(missing))
+
+
+def _is_cut(body: Body, frame: Any, delimiter: str) -> bool:
+    """Return whether a line may have fewer cells than there are columns."""
+    if delimiter == BLANK or b'"' in body.content:
+        return bool(frame[body.names[-1]].isin(["", np.nan]).any())
+    n_marks = body.content.count(delimiter.encode(), body.start, body.end)
+    return n_marks != body.n * (len(body.names) - 1)
 
 
 def _cells_of(frame: Any, numbers: set[str], words: set[str], may_miss: bool) -> Columns | None:
