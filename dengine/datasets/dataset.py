@@ -18,6 +18,7 @@ from ..traces import as_traces
 if TYPE_CHECKING:
     import pandas as pd
 
+LEAST_RATE_HZ, MOST_RATE_HZ = 1.0, 1e6  # of anything that a cell samples
 OWN = "dengine"  # key of the metadata by which a table of ours is known
 expect_data = partial(expect, error=DataError)
 
@@ -119,6 +120,11 @@ class Dataset:
     _repr_html_ = to_html
 
     @property
+    def cube(self) -> NDArray[np.float32]:
+        """The traces, shape (n, C, T) also for a single channel."""
+        return self.X if self.X.ndim == 3 else self.X[:, None]
+
+    @property
     def spec(self) -> TraceSpec:
         """The `TraceSpec` of live traces of the same shape, for `DataEngine(trace=data.spec)`.
 
@@ -144,7 +150,7 @@ class Dataset:
         """
         import pandas as pd
 
-        X = self.X if self.X.ndim == 3 else self.X[:, None]
+        X = self.cube
         default = ["x"] if X.shape[1] == 1 else [f"x{c}" for c in range(X.shape[1])]
         names = [f"{name}_{i}" for name in self.channels or default for i in range(X.shape[2])]
         columns = {"label": self.y, "part": self.part, "cause": self.cause}
@@ -157,16 +163,14 @@ class Dataset:
 
     def select(self, channels: tuple[str, ...]) -> "Dataset":
         """Return a data set of some channels, in this order; DataError for unknown names."""
-        unknown = [name for name in channels if name not in self.channels]
         names = ", ".join(self.channels) or "none, its channels have no names"
-        expect_data(not unknown, f"channels of {self.name}, {names}", unknown)
+        wanted = f"channels of {self.name}, {names}"
+        expect_data({*channels} <= {*self.channels}, wanted, [*channels])
         places = [self.channels.index(name) for name in channels]
-        units = [unit.strip() for unit in self.unit.split(",")]
-        units = units * len(self.channels) if len(units) == 1 else units
-        X = self.X if self.X.ndim == 3 else self.X[:, None]
-        X = X[:, places[0]] if len(places) == 1 else X[:, places]
+        units = self.unit.split(", ") if ", " in self.unit else [self.unit] * len(self.channels)
+        X = np.ascontiguousarray(self.cube[:, places])
         unit = ", ".join(units[place] for place in places)
-        return replace(self, X=np.ascontiguousarray(X), channels=channels, unit=unit)
+        return replace(self, X=X if len(places) > 1 else X[:, 0], channels=channels, unit=unit)
 
     def cut(self, samples: int) -> "Dataset":
         """Return a data set of the first `samples` samples of every trace, to decide earlier.
@@ -215,32 +219,43 @@ def make_dataset(
     except TraceError as error:
         raise DataError(str(error)) from error
     y = np.asarray(y)
-    shapes = (X.shape, y.shape)
-    expect_data(y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", shapes)
-    expect_data(len(y) > 0, "at least one trace", 0)
-    is_transposed = X.ndim == 3 and X.shape[1] > X.shape[2]
-    do = "it looks transposed; pass X.transpose(0, 2, 1)"
-    expect_data(not is_transposed, "X (n, channels, samples)", X.shape, do)
-    labels = sorted(set(map(str, y.tolist())))
-    expect_data(bool(np.isin(y, (0, 1)).all()), "labels 1 (success) and 0 (failure)", labels)
-    expect_data(rate_hz is None or 0 < rate_hz < np.inf, "a rate above 0 Hz", rate_hz)
     n_channels = 1 if X.ndim == 2 else X.shape[1]
-    one_each = not channels or len(channels) == n_channels
-    expect_data(one_each, f"a name for each of {n_channels} channels", channels)
-    if part is not None:
-        part = np.asarray(part)
-        valid = part.shape == y.shape and part.dtype.kind in "iuUS"
-        wanted = f"{len(y)} parts' numbers, texts or integers"
-        expect_data(valid, wanted, (part.shape, part.dtype))
-        part = part.astype(np.str_)
-    valid = cause is None or np.shape(cause) == y.shape
-    expect_data(valid, f"{len(y)} causes, one a trace", np.shape(cause))
+    part = None if part is None else np.asarray(part)
+    is_word = part is None or (part.shape == y.shape and part.dtype.kind in "iuUS")
+    shapes, transpose = (X.shape, y.shape), "it looks transposed; pass X.transpose(0, 2, 1)"
+    is_rate = rate_hz is None or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
+    for valid, wanted, actual, do in (
+        (y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", shapes, ""),
+        (len(y) > 0, "at least one trace", 0, ""),
+        (n_channels <= X.shape[-1], "X (n, channels, samples)", X.shape, transpose),
+        (
+            np.isin(y, (0, 1)).all(),
+            "labels 1 (success) and 0 (failure)",
+            sorted({*map(str, y)}),
+            "",
+        ),
+        (is_rate, "a rate of 1 Hz to 1 MHz", rate_hz, ""),
+        (
+            len(channels) in (0, n_channels),
+            f"a name for each of {n_channels} channels",
+            channels,
+            "",
+        ),
+        (is_word, f"{len(y)} parts' numbers, texts or integers", np.shape(part), ""),
+        (
+            cause is None or np.shape(cause) == y.shape,
+            "a cause for each trace",
+            np.shape(cause),
+            "",
+        ),
+    ):
+        expect_data(bool(valid), wanted, actual, do)
     return Dataset(
         X,
         y.astype(np.int8),
         rate_hz=rate_hz,
         channels=channels,
-        part=part,
+        part=None if part is None else part.astype(np.str_),
         cause=cause,
         **about,
     )

@@ -10,10 +10,11 @@ page is made of these.
 
 import difflib
 import json
+import math
 import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,12 @@ LAYOUTS = ("files", "long", "wide", "columns", "npz", "mcap")
 LENGTHS = ("strict", "cut", "pad", "pad-all", "resample")
 PLACES = ("same", "first", "last")  # of a label in a recording's rows
 Words = tuple[str, ...]
+TYPES: dict[type, tuple[Any, str]] = {
+    float: (int | float, "a number"),
+    int: (int, "a whole number"),
+    bool: (bool, "true or false"),
+    str: (str, "a text"),
+}
 Stated = Mapping[str, Any]
 
 
@@ -225,13 +232,14 @@ class Description:
         is_older = isinstance(version, int) and version <= VERSION
         do = "install a newer dengine"
         expect(is_older, f"version {VERSION} of {where}", version, do, DataError)
-        return _make(cls, values, where)  # type: ignore[no-any-return]
+        return _made(cls, values, where)  # type: ignore[no-any-return]
 
     @classmethod
     def from_toml(cls, text: str, where: str = FOLDER_FILE) -> "Description":
         """Return the description that a TOML text states; raise DataError if it is damaged."""
-        with instead(DataError, f"Expected TOML in {where}", tomllib.TOMLDecodeError):
-            return cls.from_dict(tomllib.loads(text), where)
+        with instead(DataError, f"Expected TOML in {where}", ValueError, RecursionError):
+            values = tomllib.loads(text)
+        return cls.from_dict(values, where)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> "Description":
@@ -240,7 +248,7 @@ class Description:
         with instead(DataError, f"Expected a description in {path}", OSError, UnicodeDecodeError):
             size = path.stat().st_size
             expect(size <= MOST_BYTES, f"{path} of at most 1 MB", f"{size} bytes", "", DataError)
-            return cls.from_toml(path.read_text("utf-8"), str(path))
+            return cls.from_toml(path.read_text("utf-8-sig"), str(path))
 
     def save(self, path: str | os.PathLike[str], force: bool = False) -> Path:
         """Write the TOML file, over an existing one only with `force`; return its path."""
@@ -248,48 +256,61 @@ class Description:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested dicts of TOML's types, without what has its default."""
-        return _plain(self)  # type: ignore[no-any-return]
+        values: dict[str, Any] = _plain(self)
+        if self.channels:
+            values["channels"] = {table.pop("column", ""): table for table in values["channels"]}
+        return values
 
     def to_toml(self) -> str:
         """Return the text of the TOML file, with `notes` as comments."""
-        values = {"version": self.version} | self.to_dict()
-        lines = self._lines(values, "", [name for name in KEYS[""] if name not in KEYS])
-        for name, section in SECTIONS.items():
+        values: dict[str, Any] = {"version": self.version, "channels": {UNKNOWN: {}}}
+        values |= self.to_dict()
+        only_unit = {"unit"}
+        values["channels"] = {
+            column: table.get("unit", "") if {*table} <= only_unit else table
+            for column, table in values["channels"].items()
+        }
+        lines = self._lines("", values, KEYS[""])
+        for name in SECTIONS:
             table = values.get(name, {})
             if name == "rows":
                 for column, words in table.items():
                     lines += ["", f"[rows.{_toml_key(column)}]"]
-                    lines += self._lines(words, f"rows.{column}.", words)
+                    lines += self._lines(f"rows.{column}.", words, KEYS["rows"])
             elif name == "check":
-                for i, source in enumerate(table or ()):
-                    lines += ["", "[[check]]", *self._lines(source, f"check.{i}.", source)]
+                for i, source in enumerate(table):
+                    lines += ["", "[[check]]", *self._lines(f"check.{i}.", source, KEYS["check"])]
             else:
-                table = table or ({UNKNOWN: ""} if name == "channels" else {})
-                known = table if section in (Channel, None) else KEYS[name]
-                body = self._lines(table, f"{name}.", known)
+                names = table if name in NAMED else KEYS[name]
+                body = self._lines(f"{name}.", table, names)
                 lines += ["", f"[{name}]", *body] if body else []
         return "\n".join(lines) + "\n"
 
-    def _lines(self, table: Stated, prefix: str, names: Iterable[str]) -> list[str]:
+    def _lines(self, prefix: str, table: Stated, names: Iterable[str]) -> list[str]:
         """Return a line for each key that is stated or has a note, with the note as a comment."""
         result = []
         for name in names:
             note = self.notes.get(prefix + name, "")
-            if name not in table:
+            note = "".join(c if c.isprintable() else " " for c in note)
+            line = f"{_toml_key(name)} = {_toml_value(table[name])}" if name in table else ""
+            if not line:
                 result += [f"# {name}: {note}"] if note else []
-                continue
-            line = f"{_toml_key(name)} = {_toml_value(table[name])}"
-            is_short = len(line) + len(note) + 4 <= MOST_LINE
-            result += [f"# {note}"] if note and not is_short else []
-            result.append(f"{line}  # {note}" if note and is_short else line)
+            elif note and len(line) + len(note) + 4 <= MOST_LINE:
+                result.append(f"{line}  # {note}")
+            else:
+                result += [f"# {note}", line] if note else [line]
         return result
 
     @property
     def open_keys(self) -> Words:
-        """The keys whose value is still `?`, like `label.column`; `channels` without any channel."""
-        values = {name: table for name, table in self.to_dict().items() if name != "ignored"}
-        found = tuple(name for name, value in _leaves(values) if UNKNOWN in (value, name[-1]))
-        return found if self.channels else (*found, "channels")
+        """The keys whose value is still `?`, like `label.column`; `channels` if there is none.
+
+        A word `?` of a check is none of them: it fits no recording, so others are its faults.
+        """
+        values = {k: v for k, v in self.to_dict().items() if k not in ("ignored", "check")}
+        found = tuple(name for name, value in _leaves(values) if value == UNKNOWN)
+        columns = [channel.column for channel in self.channels]
+        return found if columns and UNKNOWN not in columns else (*found, "channels")
 
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which keys, like `label.column`, have other values.
@@ -348,32 +369,46 @@ SOURCES = {
 }
 
 
-def _make(cls: type, values: Any, where: str) -> Any:
+# Sections of any columns, each with its unit or its table.
+NAMED = ("channels", "ignored")
+
+
+def _made(cls: Any, values: Any, where: str) -> Any:
     """Return a dataclass of nested dicts; raise DataError for an unknown key or a wrong type."""
-    expect(isinstance(values, Mapping), f"{where} to be a table", values, "", DataError)
-    known = {f.name: f for f in fields(cls) if f.name != "notes"}
-    for name in values:
+    known = {about.name: about for about in fields(cls) if about.compare}
+    for name in _table(values, where):
         if name not in known:
             raise DataError(f"Expected {_one_of(known, name)} in {where}, got {name!r}.")
     return cls(**{name: _value(known[name], v, f"{where}, {name}") for name, v in values.items()})
 
 
+def _table(values: Any, where: str) -> Stated:
+    """Return a table; raise DataError for something else."""
+    expect(isinstance(values, Mapping), f"{where} to be a table", values, "", DataError)
+    return values  # type: ignore[no-any-return]
+
+
 def _value(about: Any, value: Any, where: str) -> Any:
     """Return the value of a field in its type; raise DataError for another one."""
-    section = SECTIONS.get(about.name)
-    if "doc" in about.metadata:
+    name, section = about.name, SECTIONS.get(about.name)
+    if name not in SECTIONS:
         return _as_type(about, value, where)
-    if about.name == "check":
+    if name == "check":
         expect(isinstance(value, list), f"tables in {where}", value, "", DataError)
-        return tuple(_make(section, table, where) for table in value)
-    expect(isinstance(value, Mapping), f"{where} to be a table", value, "", DataError)
-    if about.name == "channels":
-        tables = {k: v if isinstance(v, Mapping) else {"unit": v} for k, v in value.items()}
-        items = tables.items()
-        return tuple(_make(section, {"column": k, **v}, f"{where}.{k}") for k, v in items)
-    if about.name == "rows":
-        return {k: _make(section, v, f"{where}.{k}") for k, v in value.items()}
-    return dict(value) if section is None else _make(section, value, where)
+        return tuple(_made(section, table, where) for table in value)
+    items = _table(value, where).items()
+    if name == "rows":
+        return {key: _made(section, table, f"{where}.{key}") for key, table in items}
+    if name not in NAMED:
+        return _made(section, value, where)
+    tables = {key: item if isinstance(item, Mapping) else {"unit": item} for key, item in items}
+    channels = [
+        _made(Channel, {"column": key, **table}, f"{where}.{key}")
+        for key, table in tables.items()
+        if (name, key) != ("channels", UNKNOWN)
+    ]
+    is_ignored = name == "ignored"
+    return {c.column: c.unit for c in channels} if is_ignored else tuple(channels)
 
 
 def _as_type(about: Any, value: Any, where: str) -> Any:
@@ -382,15 +417,18 @@ def _as_type(about: Any, value: Any, where: str) -> Any:
     `?` passes for every key.
     """
     default, choices = about.default, about.metadata["choices"]
+    items = value if isinstance(value, list | tuple) else [value]
     if isinstance(default, tuple):
-        return tuple(map(str, value)) if isinstance(value, list | tuple) else (str(value),)
+        valid = all(isinstance(item, str | int | float) for item in items)
+        expect(valid, f"texts in {where}", value, "", DataError)
+        return tuple(map(str, items))
     if value == UNKNOWN:
         return value
-    kinds = {float: int | float, int: int | str if about.metadata["may_be_text"] else int}
-    is_bool = isinstance(value, bool) and not isinstance(default, bool)
-    valid = isinstance(value, kinds.get(type(default), type(default))) and not is_bool
-    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a text"}
-    expect(valid, f"{names[type(default)]} in {where}", value, "", DataError)
+    kind, wanted = TYPES[type(default)]
+    kind = int | str if about.metadata["may_be_text"] else kind
+    valid = isinstance(value, kind) and isinstance(value, bool) == isinstance(default, bool)
+    valid = valid and (not isinstance(value, float) or math.isfinite(value))
+    expect(valid, f"{wanted} in {where}", value, "", DataError)
     if choices and value not in choices:
         raise DataError(f"Expected {_one_of(choices, value)} in {where}, got {value!r}.")
     return float(value) if isinstance(default, float) else value
@@ -404,33 +442,29 @@ def _one_of(known: Iterable[str], name: str) -> str:
 
 def _plain(value: Any) -> Any:
     """Return dataclasses, and what they hold, in TOML's types, without fields of their defaults."""
-    if isinstance(value, Channel) and value == Channel(value.column, value.unit):
-        return value.unit
     if isinstance(value, Mapping):
         return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, tuple) and value and isinstance(value[0], Channel):
-        tables = {channel.column: _plain(replace(channel, column="")) for channel in value}
-        return {column: table or "" for column, table in tables.items()}
     if isinstance(value, tuple):
-        return (
-            [*map(_plain, value)] if len(value) != 1 or not isinstance(value[0], str) else value[0]
-        )
-    if not hasattr(value, "__dataclass_fields__"):
+        items = [*map(_plain, value)]
+        return items[0] if len(items) == 1 and isinstance(items[0], str) else items
+    if not is_dataclass(value) or isinstance(value, type):
         return value
-    items = {f: getattr(value, f.name) for f in fields(value) if f.name != "notes"}
-    plain = {f.name: _plain(v) for f, v in items.items() if f.default is MISSING or v != f.default}
-    return {name: item for name, item in plain.items() if item not in ({}, [])}
+    default = type(value)()
+    names = [about.name for about in fields(value) if about.compare]
+    values = {name: getattr(value, name) for name in names}
+    return {k: _plain(v) for k, v in values.items() if v != getattr(default, k)}
 
 
-def _leaves(table: Stated, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
     """Yield each key of nested dicts, like `label.column`, with its values."""
-    for name, value in table.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield from (
-                (prefix + name, item) for item in (value if isinstance(value, list) else [value])
-            )
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _leaves(item, f"{name}.{key}" if name else key)
+    elif isinstance(value, list):
+        for item in value:
+            yield from _leaves(item, name)
+    else:
+        yield name, value
 
 
 def split_key(name: str) -> list[str]:
@@ -458,5 +492,7 @@ def _toml_value(value: Any) -> str:
         return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_toml_value, value))}]"
-    # JSON's numbers, booleans and texts are TOML's, but for DEL, which TOML wants escaped.
+    if isinstance(value, float):
+        return repr(value)
+    # JSON's texts and booleans are TOML's, but for DEL, which TOML wants escaped.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

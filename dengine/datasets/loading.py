@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.resources import files
 from pathlib import Path
@@ -62,24 +63,22 @@ def load_dataset(
     DataError
         If there is no description, or an open one, with what to type; or if no recording is left.
     """
-    names = tuple(channels.split(",") if isinstance(channels, str) else channels or ())
-    names = tuple(name.strip() for name in names)
+    stated = channels.split(",") if isinstance(channels, str) else channels or ()
+    names = tuple(map(str.strip, stated))
     expect_data(samples is None or samples >= 1, "1 or more samples", samples)
     read = None if description is not None else own_reader(source)
     if read is not None:
         data = read()
         data = data.select(names) if names else data
-        return data.cut(samples) if samples else data
-    stated = description_of(source, description)
-    if names:
-        stated = stated.with_channels(names)
-    whole = stated.traces.samples
-    is_cut = samples is not None and samples < whole and stated.traces.lengths != "resample"
-    if samples is not None and not is_cut:
-        stated = stated.with_values({"traces.samples": samples})
-    place = Path(source) if isinstance(source, str | os.PathLike) else source
-    data = read_recordings(place, stated, progress)
-    return data.cut(samples) if samples is not None and is_cut else data
+    else:
+        about = description_of(source, description)
+        about = about.with_channels(names) if names else about
+        traces = about.traces
+        if samples and (samples > traces.samples or traces.lengths == "resample"):
+            about = replace(about, traces=replace(traces, samples=samples))
+        place = Path(source) if isinstance(source, str | os.PathLike) else source
+        data = read_recordings(place, about, progress)
+    return data.cut(samples) if samples else data
 
 
 def saved_description(source: str | os.PathLike[str]) -> Path:
@@ -117,13 +116,14 @@ def count_files(source: str, description: Description | None) -> int:
 
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the message for recordings without a description: what is open, and what to type."""
-    command = f"dengine data {path} --save"
     open_keys = proposal.open_keys
     questions = "".join(f"\n  {key}: {proposal.notes.get(key, '')}" for key in open_keys)
     state = "".join(f" --set {key}=..." for key in open_keys)
-    text = f"Expected the description {saved_description(path)}, found none. Look at the proposal "
-    text += f"with `dengine data {path}`, and write it with `{command}{state}`."
-    return f"{text} Still open:{questions}" if questions else text
+    return (
+        f"Expected the description {saved_description(path)}, found none. Look at the proposal "
+        f"with `dengine data {path}`, and write it with `dengine data {path} --save{state}`."
+        f"{questions and ' Still open:'}{questions}"
+    )
 
 
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
@@ -136,32 +136,25 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
     if isinstance(source, tuple) and len(source) == 2:
         return lambda: make_dataset(*source)
     if hasattr(source, "columns"):
-        return partial(_from_own_frame, source, "table") if _is_own_frame(source.attrs) else None
+        return partial(_from_own_frame, source, "table") if OWN in source.attrs else None
     if not isinstance(source, str | os.PathLike):
         wanted = "a name, a path, a Dataset, a DataFrame or a pair (X, y)"
         raise DataError(f"Expected {wanted}, got {type(source).__name__}.")
     if str(source) in BUNDLED:
-        path = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
-        return partial(_read_npz, path, str(source))
+        bundled = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
+        return partial(_read_npz, bundled, str(source))
     path = Path(source)
-    if not path.is_file() or saved_description(path).is_file():
-        return None
-    if is_database(path):
-        return partial(_read_store, path)
-    if path.suffix.lower() == ".npz" and _is_own_archive(path):
-        return partial(_read_npz, path, path.stem)
-    if path.suffix.lower() == ".parquet" and _is_own_table(path):
-        return partial(_read_own_table, path)
+    if path.is_file() and not saved_description(path).is_file():
+        for is_own, read in OWN_FILES:
+            if is_own(path):
+                return partial(read, path, path.stem)
     return None
 
 
-def _is_own_frame(attrs: Mapping[Any, Any]) -> bool:
-    """Return whether the metadata of a DataFrame is that of `Dataset.to_frame`."""
-    return OWN in attrs
-
-
 def _is_own_archive(path: Path) -> bool:
-    """Return whether an archive has X, and labels y of 1 and 0."""
+    """Return whether a file is an archive with X, and labels y of 1 and 0."""
+    if path.suffix.lower() != ".npz":
+        return False
     arrays, names = read_archive(path, ("y",))
     labels = arrays.get("y", np.array(["none"]))
     return "X" in names and labels.dtype.kind in "iufb" and bool(np.isin(labels, (0, 1)).all())
@@ -169,19 +162,20 @@ def _is_own_archive(path: Path) -> bool:
 
 def _is_own_table(path: Path) -> bool:
     """Return whether a Parquet file was written of a table that `Dataset.to_frame` made."""
+    if path.suffix.lower() != ".parquet":
+        return False
     with read_errors(path, "a Parquet file", "pyarrow", "files"):
         from pyarrow.parquet import read_schema
 
         metadata = read_schema(path).metadata or {}
-        about = json.loads(metadata.get(b"PANDAS_ATTRS", b"{}"))
-        return _is_own_frame(about)
+        return OWN in json.loads(metadata.get(b"PANDAS_ATTRS", b"{}"))
 
 
-def _read_own_table(path: Path) -> Dataset:
+def _read_own_table(path: Path, name: str) -> Dataset:
     """Return the data set of a Parquet file of ours."""
     import pandas as pd
 
-    return _from_own_frame(pd.read_parquet(path), path.stem)
+    return _from_own_frame(pd.read_parquet(path), name)
 
 
 def _from_own_frame(frame: Any, name: str) -> Dataset:
@@ -213,7 +207,7 @@ def _read_npz(path: Path, name: str) -> Dataset:
         return make_dataset(X, arrays["y"], name=name, **about)
 
 
-def _read_store(path: Path) -> Dataset:
+def _read_store(path: Path, name: str) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
     Quarantined and forgotten ones are left out. Raises DataError if the store contradicts its
@@ -238,10 +232,17 @@ def _read_store(path: Path) -> Dataset:
         labelled.labels,
         # As the store counts: a part that came again has one vote.
         part=labelled.hashes.astype(np.str_) if has_repeats else None,
-        name=path.stem,
+        name=name,
         rate_hz=spec.rate_hz,
         unit=spec.unit if isinstance(spec.unit, str) else ", ".join(spec.unit or ()),
         channels=tuple(spec.columns),
         limit=spec.limit,
         fit=spec.fit,
     )
+
+
+OWN_FILES: tuple[tuple[Callable[[Path], bool], Callable[[Path, str], Dataset]], ...] = (
+    (is_database, _read_store),
+    (_is_own_archive, _read_npz),
+    (_is_own_table, _read_own_table),
+)

@@ -6,7 +6,8 @@ Reading a cell as a number is strict: what does not follow the description raise
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from numpy.typing import NDArray
 from ..errors import DataError, listed, shortened
 from .description import TextForm
 
+Cells = NDArray[Any]
+Floats = NDArray[np.float64]
+LARGEST = 3.4028235e38  # of a sample, which is a float32
 # A minus sign that typographers use, which Excel writes in some languages.
 MINUS = str.maketrans({"−": "-"})
 
@@ -44,33 +48,44 @@ class Table:
         Numbers, times, or texts as objects. In a file of a single part a column of one cell holds
         for all rows.
     lines : sequence of int
-        Line of each row in the file.
+        Line of each row in the file, or the one line of all.
     units : mapping of str to str
         Units that the file states for its columns.
     above : sequence of str
         Lines above the header.
+    header : int
+        Line of the header; 0 for none.
+    damage : mapping of int to str
+        What is wrong with lines of another number of cells; their rows have empty cells.
+    origin : mapping of str to sequence of str
+        The columns of the file that the cells of a column stood in, if they are others.
     """
 
     source: str
-    columns: Mapping[str, NDArray[Any]]
+    columns: Mapping[str, Cells]
     lines: Sequence[int]
     units: Mapping[str, str] = field(default_factory=dict)
     above: Sequence[str] = ()
+    header: int = 0
+    damage: Mapping[int, str] = field(default_factory=dict)
+    origin: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
-    def column(self, name: str) -> NDArray[Any]:
+    def column(self, name: str) -> Cells:
         """Return a column; raise UnreadableError if there is none of this name."""
         if name not in self.columns:
-            found = listed(self.columns) if self.columns else "none"
-            raise UnreadableError(f"Expected a column {name}, got {found}", column=name)
+            found = listed(self.columns) or "none"
+            raise UnreadableError(f"Expected a column {name}, got {found}", self.header, name)
         return self.columns[name]
 
     def take(self, rows: Any) -> "Table":
         """Return a table of some rows: a slice, or an array of positions or booleans."""
-        lines = self.lines[rows] if isinstance(rows, slice) else np.asarray(self.lines)[rows]
+        lines = self.lines
+        if len(lines) > 1:
+            lines = lines[rows] if isinstance(rows, slice) else np.asarray(lines)[rows]
         columns = {name: c[rows] if len(c) > 1 else c for name, c in self.columns.items()}
-        return Table(self.source, columns, lines, self.units, self.above)
+        return replace(self, columns=columns, lines=lines)
 
-    def words(self, name: str) -> NDArray[Any]:
+    def words(self, name: str) -> Cells:
         """Return a column as texts, shape (rows,), without blanks around them.
 
         Whole numbers have no decimal point: 1.0 is "1". NaN and None are "".
@@ -81,7 +96,7 @@ class Table:
         texts = np.array([as_word(cell) for cell in cells.tolist()], dtype=object)
         return np.asarray(texts[codes])
 
-    def numbers(self, name: str, form: TextForm) -> NDArray[np.float64]:
+    def numbers(self, name: str, form: TextForm) -> Floats:
         """Return a column as numbers, shape (rows,); a missing one is NaN.
 
         Raises UnreadableError for a cell that is no finite number of this form, and no word for a
@@ -90,32 +105,24 @@ class Table:
         cells = self.column(name)
         if cells.dtype.kind in "iuf":
             values = cells.astype(np.float64)
-            bad = np.flatnonzero(np.isinf(values))
-        elif (plain := _plain_numbers(cells, form)) is not None:
-            return plain
         else:
-            number = number_pattern(form)
-            values = np.empty(len(cells))
-            bad = np.empty(0, dtype=np.int64)
-            for i, cell in enumerate(cells.tolist()):
-                text = "" if cell is None else str(cell).strip()
-                if number.fullmatch(text):
-                    values[i] = to_number(text, form)
-                elif text in form.missing or (cell is None and "null" in form.missing):
-                    values[i] = np.nan
-                else:
-                    bad = np.array([i])
-                    break
-        if len(bad):
-            i = int(bad[0])
-            marks = f" with the decimal mark {form.decimal}"
-            marks += f" and groups by {form.thousands!r}" if form.thousands else ""
-            message = f"Expected a number{marks}, got {shortened(cells[i])}"
-            raise UnreadableError(message, self.line(i), name)
+            values = np.array([_number(cell, form) for cell in cells.tolist()], dtype=np.float64)
+        groups = f" and groups by {form.thousands!r}" if form.thousands else ""
+        wanted = f"a number with the decimal mark {form.decimal}{groups}"
+        self.refuse(np.abs(values) > LARGEST, wanted, name)
         return values
+
+    def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:
+        """Raise UnreadableError for the first cell of a column that is bad, if one is."""
+        if is_bad.any():
+            row = int(is_bad.argmax())
+            found = shortened(self.columns[name][row : row + 1].tolist()[0])
+            column = self.origin[name][row] if name in self.origin else name
+            raise UnreadableError(f"Expected {wanted}, got {found}", self.line(row), column)
 
     def line(self, row: int) -> int:
         """Return the line of a row; 0 if it is not known."""
+        row = row if len(self.lines) > 1 else 0
         return int(self.lines[row]) if row < len(self.lines) else 0
 
     def one_word(self, name: str, at: str = "same") -> str:
@@ -123,16 +130,13 @@ class Table:
 
         Raises UnreadableError if it changes although it must be the same.
         """
-        words = self.words(name)
-        if not len(words):
+        cells = self.column(name)
+        if not len(cells):
             raise UnreadableError(f"Expected a word in column {name}, got no rows", column=name)
-        if at == "same":
-            other = np.flatnonzero(words != words[0])
-            if len(other):
-                i = int(other[0])
-                message = f"Expected one word in all rows, got {words[0]!r} and {words[i]!r}"
-                raise UnreadableError(message, self.line(i), name)
-        return str(words[-1 if at == "last" else 0])
+        if at == "same" and (cells != cells[0]).any():
+            words = self.words(name)
+            self.refuse(words != words[0], f"one word in all rows, {words[0]!r}", name)
+        return as_word(cells[-1 if at == "last" else 0])
 
 
 @dataclass(slots=True)
@@ -159,61 +163,39 @@ class Recording:
     """
 
     source: str
-    samples: NDArray[np.float64]
-    seconds: NDArray[np.float64] | None = None
+    samples: Floats
+    seconds: Floats | None = None
     start: float = np.nan
     part: str = ""
     label: int | None = None
     order: str = ""
     lines: Sequence[int] = ()
 
-    def sort(self) -> None:
-        """Put the samples in the order of their times, in place."""
-        if self.seconds is None:
-            return
-        order = np.argsort(self.seconds, kind="stable")
-        self.lines = np.asarray(self.lines)[order].tolist() if len(self.lines) else ()
-        self.start += float(self.seconds[order[0]])
-        self.seconds = self.seconds[order] - self.seconds[order[0]]
-        self.samples = self.samples[:, order]
-
 
 def as_word(cell: Any) -> str:
     """Return a cell as a text: "" for NaN and None, no decimal point for whole numbers."""
     if cell is None or cell != cell:
         return ""
-    if isinstance(cell, float) and cell.is_integer():
-        return str(int(cell))
-    return str(cell).strip()
+    is_whole = isinstance(cell, float) and cell.is_integer()
+    return str(int(cell) if is_whole else cell).strip()
 
 
-def _plain_numbers(cells: NDArray[Any], form: TextForm) -> NDArray[np.float64] | None:
-    """Return texts as numbers if all are plain ones, without groups; None if one may not be."""
-    texts = cells.tolist()
-    if form.thousands or not all(isinstance(text, str) for text in texts):
-        return None
-    joined = "\n".join(texts)
-    if not joined.isascii() or "_" in joined or (form.decimal != "." and "." in joined):
-        return None
-    try:
-        values = np.array(joined.replace(form.decimal, ".").split("\n"), dtype=np.float64)
-    except ValueError:
-        return None
-    return values if np.isfinite(values).all() else None
-
-
-def number_pattern(form: TextForm) -> re.Pattern[str]:
+@lru_cache
+def _pattern(form: TextForm) -> re.Pattern[str]:
     """Return the pattern of a number with the marks of a form."""
-    mark = re.escape(form.thousands)
-    groups = rf"|\d{{1,3}}(?:{mark}\d{{3}})+" if form.thousands else ""
-    decimal = re.escape(form.decimal)
-    return re.compile(
-        rf"[-+−]?(?:(?:\d+{groups})(?:{decimal}\d*)?|{decimal}\d+)(?:[eE][-+]?\d+)?", re.ASCII
-    )
+    mark, decimal = re.escape(form.thousands), re.escape(form.decimal)
+    groups = rf"|\d{{1,3}}(?:{mark}\d{{3}})+" if mark else ""
+    digits = rf"(?:(?:\d+{groups})(?:{decimal}\d*)?|{decimal}\d+)"
+    return re.compile(rf"[-+−]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)
 
 
-def to_number(text: str, form: TextForm) -> float:
-    """Return the number of a text that `number_pattern` matches."""
+def _number(cell: Any, form: TextForm) -> float:
+    """Return the number in a cell, NaN for a word that stands for a lost one, inf for others."""
+    if isinstance(cell, int | float) and not isinstance(cell, bool):
+        return np.inf if abs(cell) > LARGEST else float(cell)
+    text = "null" if cell is None else str(cell).strip()
+    if not _pattern(form).fullmatch(text):
+        return np.nan if text in form.missing else np.inf
     if form.thousands:
         text = text.replace(form.thousands, "")
     return float(text.replace(form.decimal, ".").translate(MINUS))

@@ -19,9 +19,8 @@ from ...files import UNREADABLE, check_size, read_errors
 from ..dataset import Fault
 from ..description import Description
 from ..table import Table, UnreadableError
-from ..triggers import as_trigger
 from .frames import as_cells
-from .split import Parts
+from .split import Parts, signals_of
 from .windows import cut, label_events
 
 SUFFIX = ".mcap"
@@ -115,7 +114,7 @@ def read_bag(
     trigger = description.windows.trigger
     sources = (description.label, *description.check)
     others = {source.topic for source in sources} | {*description.part.column, description.order}
-    others |= {*as_trigger(trigger).signals} if trigger else set()
+    others |= {*signals_of(description)}
     others = {name for name in others if name.startswith("/") and "." not in name}
     rows: list[tuple[int, int, list[Any]]] = []
     events: Events = defaultdict(list)

@@ -1,10 +1,9 @@
 """The files that a description names, and their content."""
 
-import fnmatch
 import gzip
 import re
 import zlib
-from collections.abc import Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from ...errors import DataError, instead
@@ -12,12 +11,14 @@ from ..description import FOLDER_FILE, Description
 from ..table import UnreadableError
 
 GZIP = ".gz"
+BAD = (ValueError, NotImplementedError, OSError)  # what an unusable pattern raises
+Key = list[tuple[int, int, str]]
 
 
-def natural_key(text: str) -> list[tuple[int, int, str]]:
+def natural_key(text: str) -> Key:
     """Return a key that sorts numbers in texts by their size: run_2 before run_10."""
-    pieces = re.split(r"(\d+)", text)
-    return [(1, int(p), "") if p.isdecimal() and p.isascii() else (0, 0, p) for p in pieces if p]
+    pieces = re.split(r"([0-9]+)", text)
+    return [(1, int(p), "") if p.isascii() and p.isdecimal() else (0, 0, p) for p in pieces if p]
 
 
 def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
@@ -28,23 +29,21 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """
     if root.is_file():
         return [(root, root.name)]
-    sources = (description.label, *description.check, description.windows)
-    exclude = [*description.exclude, *(source.listing for source in sources), FOLDER_FILE]
-    found = {
-        path.relative_to(root).as_posix(): path
-        for pattern in description.files
-        for path in root.glob(pattern)
-        if path.is_file()
-    }
-    names = [
-        name for name in found if not any(fnmatch.fnmatchcase(name, other) for other in exclude)
-    ]
-    names.sort(key=lambda name: (natural_key(name.rpartition("/")[2]), natural_key(name)))
-    if not names:
-        patterns = ", ".join(description.files)
+    listings = [source.listing for source in (description.label, *description.check)]
+    listings += [description.windows.listing, FOLDER_FILE]
+    others = {Path(listing).as_posix() for listing in listings}
+    names: dict[str, Path] = {}
+    for pattern in description.files:
+        with instead(DataError, f"Expected patterns below a folder in files, got {pattern}", *BAD):
+            names |= {path.relative_to(root).as_posix(): path for path in root.glob(pattern)}
+    found = [(path, name) for name, path in names.items() if path.is_file() and name not in others]
+    for pattern in description.exclude:
+        found = [item for item in found if not fnmatchcase(item[1], pattern)]
+    if not found:
         do = f"is it the description of another folder? See `dengine data {root}`"
-        raise DataError(f"Expected files {patterns} in {root}, found none; {do}.")
-    return [(found[name], name) for name in names]
+        wanted = f"files {', '.join(description.files)} in {root}"
+        raise DataError(f"Expected {wanted}, found none; {do}.")
+    return sorted(found, key=lambda item: (natural_key(item[0].name), natural_key(item[1])))
 
 
 def read_file(path: Path) -> bytes:
@@ -52,8 +51,7 @@ def read_file(path: Path) -> bytes:
 
     Raises UnreadableError if it cannot be read, or changed while it was read.
     """
-    reasons: Sequence[type[Exception]] = (OSError, EOFError, zlib.error)
-    with instead(UnreadableError, f"Cannot read {path.name}", *reasons):
+    with instead(UnreadableError, f"Cannot read {path.name}", OSError, EOFError, zlib.error):
         before = path.stat()
         content = path.read_bytes()
         after = path.stat()

@@ -7,20 +7,20 @@ list of objects the columns of their keys.
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import listed, shortened
 from ...files import read_archive, read_errors
 from ..description import TextForm
-from ..table import Table, UnreadableError
+from ..table import Cells, Table, UnreadableError
 from .text import to_utf8
 
 MOST_CHANNELS = 16  # a list of so few lists has a channel in each, a longer one a sample
-Columns = dict[str, NDArray[Any]]
+Columns = dict[str, Cells]
+DAMAGES = (ValueError, RecursionError)
 
 
 def read_objects(content: bytes, source: str, form: TextForm) -> list[Table]:
@@ -29,9 +29,9 @@ def read_objects(content: bytes, source: str, form: TextForm) -> list[Table]:
     try:
         found = json.loads(text)
         rows = [(0, value) for value in (found if isinstance(found, list) else [found])]
-    except (json.JSONDecodeError, RecursionError):
+    except DAMAGES:
         rows = [(i, _parse(line, i)) for i, line in enumerate(text.split("\n"), 1) if line.strip()]
-    for line, value in rows:
+    for line, value in rows or [(0, "")]:
         if not isinstance(value, Mapping):
             raise UnreadableError(f"Expected an object of JSON, got {shortened(value)}", line)
     return [Table(source, columns_of("", value), [line]) for line, value in rows]
@@ -41,31 +41,47 @@ def _parse(line: str, number: int) -> Any:
     """Return the object in a line of JSON; raise UnreadableError for another text."""
     try:
         return json.loads(line)
-    except (json.JSONDecodeError, RecursionError) as error:
+    except DAMAGES as error:
         raise UnreadableError(f"Expected JSON: {error}", number) from error
 
 
 def columns_of(prefix: str, value: Any) -> Columns:
     """Return the columns of a nested object, each with its cells; a scalar is a column of one."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
+    value = value.tolist() if isinstance(value, np.ndarray) else value
+    items = value if isinstance(value, list) else [value]
+    first = items[0] if items else None
+    nested: Mapping[Any, Any]
     if isinstance(value, Mapping):
-        items = value.items()
-        pairs = [(f"{prefix}.{name}" if prefix else str(name), item) for name, item in items]
-    elif isinstance(value, list) and value and isinstance(value[0], Mapping):
-        pairs = [(f"{prefix}.{name}", [item.get(name) for item in value]) for name in value[0]]
-    elif isinstance(value, list) and value and isinstance(value[0], list | np.ndarray):
-        rows = value if len(value) <= MOST_CHANNELS else list(zip(*value, strict=False))
-        pairs = [(f"{prefix}.{i}", list(row)) for i, row in enumerate(rows)]
+        nested = value
+    elif isinstance(first, Mapping | list | np.ndarray):
+        nested = _turned(prefix, items, first)
     else:
-        return {prefix: as_cells(value if isinstance(value, list) else [value])}
-    return {key: cells for name, item in pairs for key, cells in columns_of(name, item).items()}
+        return {prefix: as_cells(items)}
+    stem = f"{prefix}." if prefix else ""
+    return _flat(columns_of(f"{stem}{name}", item) for name, item in nested.items())
 
 
-def as_cells(values: Sequence[Any]) -> NDArray[Any]:
+def _turned(prefix: str, items: Sequence[Any], first: Any) -> Mapping[Any, Any]:
+    """Return the lists of a list of objects by their keys, or of lists by their places."""
+    forms = {len(item) if isinstance(item, type(first)) else -1 for item in items}
+    if len(forms) > 1:
+        message = f"Expected lists or objects of one length in {prefix}, got others"
+        raise UnreadableError(message, column=prefix)
+    if isinstance(first, Mapping):
+        return {name: [item.get(name) for item in items] for name in first}
+    is_wide = len(items) <= MOST_CHANNELS
+    return dict(enumerate(map(list, items if is_wide else zip(*items, strict=True))))
+
+
+def _flat(columns: Iterable[Columns]) -> Columns:
+    """Return all columns of some."""
+    return {name: cells for some in columns for name, cells in some.items()}
+
+
+def as_cells(values: Sequence[Any]) -> Cells:
     """Return values as an array (n,) of numbers if all are numbers, else of objects."""
-    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-        return np.array(values, dtype=None if all(abs(v) < 2**62 for v in values) else np.float64)
+    if {*map(type, values)} <= {int, float} and all(abs(value) < 2**62 for value in values):
+        return np.array(values)
     cells = np.empty(len(values), dtype=object)
     cells[:] = values
     return cells
@@ -73,12 +89,11 @@ def as_cells(values: Sequence[Any]) -> NDArray[Any]:
 
 def join(tables: Sequence[Table]) -> Table:
     """Return one table of tables with a row each, in the columns of the first."""
-    first = tables[0]
     columns = {
-        name: as_cells([next(iter(t.columns.get(name, ())), None) for t in tables])
-        for name in first.columns
+        name: as_cells([next(iter(table.columns.get(name, ())), None) for table in tables])
+        for name in tables[0].columns
     }
-    return Table(first.source, columns, [table.line(0) for table in tables])
+    return Table(tables[0].source, columns, [table.line(0) for table in tables])
 
 
 def read_frame(frame: Any, source: str) -> Table:
@@ -103,17 +118,15 @@ def read_npz(content: bytes, source: str) -> Table:
     An array (C, n), or (n, C) with C < n, has the columns `NAME.0`, `NAME.1`, ...
     """
     arrays, _ = read_archive(content, name=source)
-    columns: Columns = {}
-    for name, x in arrays.items():
-        columns |= _array_columns(name, np.squeeze(x))
-    return Table(source, columns, [])
+    return Table(source, _flat(_array_columns(k, np.squeeze(x)) for k, x in arrays.items()), [])
 
 
-def _array_columns(name: str, x: NDArray[Any]) -> Columns:
+def _array_columns(name: str, x: Cells) -> Columns:
     """Return the columns of an array of one part, a scalar, (n,), (C, n) or (n, C)."""
     if x.ndim < 2:
         return {name: np.atleast_1d(x)}
-    return {f"{name}.{i}": row for i, row in enumerate(x if len(x) <= x.shape[1] else x.T)}
+    rows = x if len(x) <= x.shape[1] else np.swapaxes(x, 0, 1)
+    return _flat(_array_columns(f"{name}.{i}", row) for i, row in enumerate(rows))
 
 
 def part_tables(content: bytes, source: str, channel: str = "") -> list[Table]:
@@ -126,14 +139,13 @@ def part_tables(content: bytes, source: str, channel: str = "") -> list[Table]:
     stem = channel if channel in arrays else channel.rpartition(".")[0]
     if not channel:
         stem = max(arrays, key=lambda name: arrays[name].size, default="")
-    if stem not in arrays or not arrays[stem].ndim:
+    n = len(np.atleast_1d(arrays.get(stem, [])))
+    if not n:
         raise UnreadableError(f"Expected an array {channel}, got {listed(arrays)}", column=channel)
-    n = len(arrays[stem])
     tables = []
     for i in range(n):
-        columns: Columns = {}
-        for name, x in arrays.items():
-            columns |= _array_columns(name, x[i] if x.ndim and len(x) == n else x)
+        of_part = {name: x[i] if x.ndim and len(x) == n else x for name, x in arrays.items()}
+        columns = _flat(_array_columns(name, x) for name, x in of_part.items())
         tables.append(Table(source, columns, []))
     return tables
 

@@ -4,7 +4,7 @@ Files are split into one table for each part, each table becomes a `Recording`, 
 a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ...errors import DataError, listed, shortened
 from ...records import FITS
 from ...traces import can_fit_length, fit_length
-from ..checks import finished_notes, without_repeats
+from ..checks import Fitted, check_description, finished_notes, without_repeats
 from ..dataset import Dataset, Fault
 from ..description import ANY, Channel, Description, LabelSource
-from ..table import Recording, Table, UnreadableError
+from ..table import Cells, Floats, Recording, Table, UnreadableError
 from ..units import conversion
 from . import bags, frames, windows
 from .clock import check_steps, times_of
@@ -27,21 +27,57 @@ from .files import find_files, natural_key, read_file
 from .places import LabelReader, Place, part_of, read_labels
 from .split import Parts, split, tables_of
 
+Found = Iterator[Recording | Fault]
+Progress = Callable[[int], None]
 FRAME = "table"  # what a DataFrame is called in messages
 WORDS = {1: "good", 0: "bad", None: "not checked"}
-Floats = NDArray[np.float64]
+KINDS = ("listing", "column", "path", "line", "topic")  # of sources of labels
 
 
 @dataclass
 class Reader:
-    """Makes a `Recording` of the table of one part, by a description.
+    """Reads recordings by one description.
 
-    label, checks : the source of labels, and those that must agree with it.
+    Parameters
+    ----------
+    description : Description
+    label, checks : LabelReader, sequence of LabelReader
+        Of its source of labels, and of those that must agree with it.
+    base : Path
+        The folder of the recordings, in which their listings stand.
     """
 
     description: Description
     label: LabelReader
     checks: Sequence[LabelReader] = ()
+    base: Path = Path()
+
+    def file(self, path: Path, name: str) -> Found:
+        """Yield the recordings of a file, and its faults."""
+        try:
+            tables = tables_of(read_file(path), name, self.description)
+            yield from self.recordings(tables, name)
+        except DataError as error:
+            yield fault_of(error, name)
+
+    def recordings(self, tables: Sequence[Table], name: str) -> Found:
+        """Yield the recordings of the tables of a file, and its faults."""
+        faults: list[Fault] = []
+        about = self.description.windows
+        if about.trigger or about.listing:
+            parts = windows.cut(tables[0], name, self.description, self.base, faults)
+        else:
+            parts = split(tables, name, self.description, faults)
+        yield from self.parts(parts)
+        yield from faults
+
+    def parts(self, parts: Parts) -> Found:
+        """Yield the recording of each part, or its fault."""
+        for source, path, table in parts:
+            try:
+                yield self.recording(table, path, source)
+            except UnreadableError as error:
+                yield fault_of(error, source)
 
     def recording(self, table: Table, path: str, source: str) -> Recording:
         """Return the recording of a table; UnreadableError if it does not follow the description.
@@ -49,50 +85,39 @@ class Reader:
         path : by which the part is named. source : what it is called.
         """
         clock = self.description.time
-        samples, table = self.samples(table)
+        table, lost = self.kept_rows(table)
         seconds, start = None, np.nan
         if clock.column:
             seconds, start = times_of(table, clock, self.description.text)
-            if len(seconds) != samples.shape[1]:
-                message = f"Expected a time for each of {samples.shape[1]} samples"
-                raise UnreadableError(f"{message}, got {len(seconds)}")
-        lines = table.lines if len(table.lines) == samples.shape[1] else ()
-        recording = Recording(source, samples, seconds, start, lines=lines)
-        if clock.sort:
-            recording.sort()
-        self.name(recording, Place(path, table))
-        return recording
-
-    def samples(self, table: Table) -> tuple[Floats, Table]:
-        """Return the samples (C, n) of a table, NaN where they are lost, and its rows with samples.
-
-        Raises UnreadableError for a cell that is no number, a unit that cannot be converted, and
-        channels of different lengths, and like `kept_rows`.
-        """
-        table, lost = self.kept_rows(table)
         rows = [self.channel(table, channel) for channel in self.description.channels]
-        if len({*map(len, rows)}) > 1:
-            lengths = ", ".join(str(len(row)) for row in rows)
-            raise UnreadableError(f"Expected channels of one length, got {lengths} samples")
+        lengths = [*map(len, rows if seconds is None else [*rows, seconds])]
+        if len({*lengths}) > 1:
+            raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
         samples = np.stack(rows)
         if len(lost):
             samples[:, lost] = np.nan
-        return samples, table
+        if clock.sort and seconds is not None:
+            order = np.argsort(seconds, kind="stable")
+            table, samples = table.take(order), samples[:, order]
+            start += float(seconds[order[0]])
+            seconds = seconds[order] - seconds[order[0]]
+        lines = table.lines if len(table.lines) == samples.shape[1] else ()
+        recording = Recording(source, samples, seconds, start, lines=lines)
+        self.name(recording, Place(path, table))
+        return recording
 
-    def kept_rows(self, table: Table) -> tuple[Table, Any]:
+    def kept_rows(self, table: Table) -> tuple[Table, Cells]:
         """Return the rows of a table that are samples, and which of these are lost; () for none.
 
         Raises UnreadableError for a word of `[rows]` whose meaning is not stated.
         """
-        lost: Any = ()
+        lost = np.empty(0, dtype=bool)
         for column, about in self.description.rows.items():
             words = table.words(column)
             known = {*about.keep, *about.drop, *about.invalid}
             is_other = ~np.isin(words, [*known])
-            if ANY not in known and is_other.any():
-                i = int(is_other.argmax())
-                message = f"Expected one of the words {listed(sorted(known))}, got {words[i]!r}"
-                raise UnreadableError(message, table.line(i), column)
+            if ANY not in known:
+                table.refuse(is_other, f"one of the words {listed(sorted(known))}", column)
             invalid, drop = (
                 np.isin(words, [*some]) | (is_other & (ANY in some))
                 for some in (about.invalid, about.drop)
@@ -103,11 +128,13 @@ class Reader:
 
     def channel(self, table: Table, channel: Channel) -> Floats:
         """Return the samples of a channel in its unit, shape (n,)."""
-        values = table.numbers(channel.column, self.description.text)
+        form, column = self.description.text, channel.column
+        values = table.numbers(column, form)
         try:
-            factor = conversion(table.units.get(channel.column, ""), channel.unit)
+            factor = conversion(table.units.get(column, ""), channel.unit)
         except DataError as error:
-            raise UnreadableError(str(error), 0, channel.column) from error
+            line = form.units + table.header * isinstance(form.header, str)
+            raise UnreadableError(str(error), line, column) from error
         return values * (factor * channel.factor)
 
     def name(self, recording: Recording, place: Place) -> None:
@@ -117,8 +144,8 @@ class Reader:
         long recording has the key of its window, if no number is stated.
         """
         recording.part = part_of(self.description.part, place)
-        if not recording.part and "window" in place.table.columns:
-            recording.part = place.table.one_word("window")
+        if not recording.part and windows.KEY in place.table.columns:
+            recording.part = place.table.one_word(windows.KEY)
         recording.label = self.label.label(place, recording.part)
         for other in self.checks:
             label = other.label(place, recording.part)
@@ -132,13 +159,12 @@ class Reader:
 
 def title_of(source: LabelSource) -> str:
     """Return what a source of labels is called in messages."""
-    kinds = ("listing", "column", "path", "line", "topic")
-    kind = next((kind for kind in kinds if getattr(source, kind)), "column")
+    kind = next((kind for kind in KINDS if getattr(source, kind)), "column")
     return f"the {kind} {shortened(getattr(source, kind))}"
 
 
 def read_recordings(
-    source: Any, description: Description, progress: Callable[[int], None] | None = None
+    source: Any, description: Description, progress: Progress | None = None
 ) -> Dataset:
     """Read recordings exactly as a description says.
 
@@ -160,52 +186,29 @@ def read_recordings(
     DataError
         If a key is still open, no file is found, a listing cannot be read, or no recording is left.
     """
-    if open_keys := description.open_keys:
-        raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
+    check_description(description)
     is_path = isinstance(source, Path)
     base = (source if source.is_dir() else source.parent) if is_path else Path()
     sources = (description.label, *description.check)
     labels = [read_labels(base, one, description.text) for one in sources]
-    reader = Reader(description, labels[0], labels[1:])
-    recordings: list[Recording] = []
-    faults: list[Fault] = []
-    notes: list[str] = []
+    reader = Reader(description, labels[0], labels[1:], base)
     files = find_files(source, description) if is_path else []
+    notes: list[str] = []
+    found: list[Recording | Fault] = []
     if description.layout == "mcap":
-        _add(reader, bags.split_bag(files, description, base, notes, faults), recordings, faults)
-        files = []
-    for path, name in files:
-        try:
-            tables = tables_of(read_file(path), name, description)
-            _add(reader, split_all(tables, name, description, base, faults), recordings, faults)
-        except DataError as error:
-            faults.append(fault_of(error, name))
-        if progress is not None:
-            progress(1)
-    if not is_path:
-        tables = [frames.read_frame(source, FRAME)]
-        _add(reader, split(tables, FRAME, description, faults), recordings, faults)
+        faults: list[Fault] = []
+        found += reader.parts(bags.split_bag(files, description, base, notes, faults))
+        found += faults
+    elif not is_path:
+        found += reader.recordings([frames.read_frame(source, FRAME)], FRAME)
+    else:
+        for path, name in files:
+            found += reader.file(path, name)
+            if progress is not None:
+                progress(1)
     notes += [note for label in labels if (note := label.unused_note())]
     name = FRAME if not is_path else source.name if source.is_dir() else source.stem
-    return to_dataset(recordings, faults, description, name, notes)
-
-
-def split_all(
-    tables: Sequence[Table], name: str, description: Description, base: Path, faults: list[Fault]
-) -> Parts:
-    """Return the parts of a file, which may be one long recording."""
-    if description.windows.trigger or description.windows.listing:
-        return windows.cut(tables[0], name, description, base, faults)
-    return split(tables, name, description, faults)
-
-
-def _add(reader: Reader, parts: Parts, recordings: list[Recording], faults: list[Fault]) -> None:
-    """Add the recordings of parts, and the faults among them, to two lists."""
-    for source, path, table in parts:
-        try:
-            recordings.append(reader.recording(table, path, source))
-        except UnreadableError as error:
-            faults.append(fault_of(error, source))
+    return to_dataset(found, description, name, notes)
 
 
 def fault_of(error: DataError, source: str) -> Fault:
@@ -215,63 +218,83 @@ def fault_of(error: DataError, source: str) -> Fault:
 
 
 def to_dataset(
-    recordings: Sequence[Recording],
-    faults: list[Fault],
-    description: Description,
-    name: str,
-    notes: list[str],
+    found: Iterable[Recording | Fault], description: Description, name: str, notes: Sequence[str]
 ) -> Dataset:
     """Return the data set of recordings, in the order in which they were made.
 
     Raises DataError if none is left.
     """
-    fitted: list[tuple[Recording, NDArray[np.float32]]] = []
-    for recording in recordings:
-        try:
-            check_steps(recording, description.time)
-            if recording.label is not None:
-                fitted.append((recording, fit(recording, description)))
-        except UnreadableError as error:
-            faults.append(fault_of(error, recording.source))
-    if description.order == "time":
-        fitted.sort(key=lambda item: item[0].start)
-    elif description.order != "name":
-        fitted.sort(key=lambda item: natural_key(item[0].order))
+    fitted, faults, n_unlabelled = _fitted(found, description)
+    orders: Mapping[str, Callable[[Fitted], Any]] = {
+        "time": lambda item: item[0].start,
+        "name": lambda _: 0,  # as they were found
+    }
+    fitted.sort(key=orders.get(description.order, lambda item: natural_key(item[0].order)))
     fitted, repeats = without_repeats(fitted)
-    faults = faults + repeats
-    n_unlabelled = sum(recording.label is None for recording in recordings)
+    faults += repeats
     if not fitted:
-        why = f" {faults[0]}." if faults else ""
         n = f"{len(faults)} have faults, {n_unlabelled} no label"
+        why = "".join(f" {fault}." for fault in faults[:1])
         raise DataError(f"Expected recordings in {name}, none is left: {n}.{why}")
-    n_found = len(fitted) + len(faults) + n_unlabelled
-    if n_found < description.seen.recordings:
-        seen = f"The description was made for {description.seen.recordings} recordings"
-        notes = [*notes, f"{seen}, now there are {n_found}."]
+    n_found, n_seen = len(fitted) + len(faults) + n_unlabelled, description.seen.recordings
+    if n_found < n_seen:
+        seen = f"The description was made for {n_seen} recordings, now there are {n_found}."
+        notes = [*notes, seen]
+    return _joined(
+        fitted, description, name=name, faults=(*faults,), unlabelled=n_unlabelled, notes=notes
+    )
+
+
+def _joined(
+    fitted: Sequence[Fitted], description: Description, notes: Sequence[str], **others: Any
+) -> Dataset:
+    """Return the data set of recordings with their traces."""
     traces = np.stack([trace for _, trace in fitted])
-    labels = np.array([recording.label for recording, _ in fitted], dtype=np.int8)
-    parts = np.array([recording.part for recording, _ in fitted])
-    sources = np.array([recording.source for recording, _ in fitted])
-    channels = description.channels
-    is_grid = description.time.column and description.time.rate_hz
+    about = {
+        key: np.array([getattr(recording, key) for recording, _ in fitted])
+        for key in ("source", "part", "label")
+    }
+    channels, clock = description.channels, description.time
+    names, units = zip(*((channel.column, channel.unit) for channel in channels), strict=True)
     lengths = description.traces.lengths.removesuffix("-all")
+    is_grid = lengths == "resample" and clock.column and clock.rate_hz
     return Dataset(
         traces[:, 0] if len(channels) == 1 else traces,
-        labels,
-        name=name,
-        rate_hz=description.time.rate_hz or None,
-        unit=", ".join(channel.unit for channel in channels).strip(", "),
-        limit=max((channel.limit for channel in channels), default=0) or None,
-        part=parts if (parts != "").any() else None,
-        faults=tuple(faults),
-        channels=tuple(channel.column for channel in channels),
-        source=sources,
-        fit="strict" if lengths == "resample" and is_grid else lengths,
+        about["label"].astype(np.int8),
+        rate_hz=clock.rate_hz or None,
+        unit=", ".join(units).strip(", "),
+        limit=channels[0].limit or None,
+        part=about["part"] if (about["part"] != "").any() else None,
+        channels=names,
+        source=about["source"],
+        fit="strict" if is_grid else lengths,
         lengths=np.array([recording.samples.shape[1] for recording, _ in fitted]),
-        notes=(*notes, *finished_notes(traces, sources)),
-        unlabelled=n_unlabelled,
-        ordered=int((np.diff(labels) != 0).sum()) != 1,
+        notes=(*notes, *finished_notes(traces, about["source"].tolist())),
+        ordered=np.count_nonzero(np.diff(about["label"])) != 1,
+        **others,
     )
+
+
+def _fitted(
+    found: Iterable[Recording | Fault], description: Description
+) -> tuple[list[Fitted], list[Fault], int]:
+    """Return the labelled recordings with their traces, the faults, and the number of others."""
+    fitted: list[Fitted] = []
+    faults: list[Fault] = []
+    n_unlabelled = 0
+    for item in found:
+        if isinstance(item, Fault):
+            faults.append(item)
+            continue
+        try:
+            check_steps(item, description.time)
+            if item.label is None:
+                n_unlabelled += 1
+            else:
+                fitted.append((item, fit(item, description)))
+        except UnreadableError as error:
+            faults.append(fault_of(error, item.source))
+    return fitted, faults, n_unlabelled
 
 
 def fit(recording: Recording, description: Description) -> NDArray[np.float32]:
@@ -288,8 +311,6 @@ def fit(recording: Recording, description: Description) -> NDArray[np.float32]:
     samples, lengths = description.traces.samples, description.traces.lengths
     n = recording.samples.shape[1]
     seconds, rate = recording.seconds, description.time.rate_hz
-    if not samples:
-        raise DataError("Expected traces.samples, the samples of each trace.")
     if lengths == "resample" and seconds is not None and n > 1:
         step = 1 / rate if rate else float(seconds[-1]) / max(samples - 1, 1)
         times = np.arange(samples) * step

@@ -2,22 +2,25 @@
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import DataError
 from ..dataset import Fault
 from ..description import ANY, Description
-from ..table import Table, as_word
+from ..table import Cells, Table, as_word
 from ..triggers import as_trigger
 from . import frames
+from .clock import is_dated
 from .files import natural_key
-from .text import read_text
+from .text import Test, read_text
 
-NUMBER = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 Parts = Iterator[tuple[str, str, Table]]  # the source, the path by which it is named, the table
+NUMBER = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
+OBJECTS = {"json": frames.read_objects, "jsonl": frames.read_objects, "ts": frames.read_ts}
+TABLES = {"parquet": frames.read_parquet, "npz": frames.read_npz}
 
 
 def tables_of(content: bytes, name: str, description: Description) -> list[Table]:
@@ -25,40 +28,43 @@ def tables_of(content: bytes, name: str, description: Description) -> list[Table
 
     Raises UnreadableError or DataError if it is no file of the described format.
     """
-    kind = description.format
-    if kind in ("json", "jsonl"):
-        return frames.read_objects(content, name, description.text)
-    if kind == "ts":
-        return frames.read_ts(content, name, description.text)
-    if kind == "parquet":
-        return [frames.read_parquet(content, name)]
-    if kind == "npz" and description.layout == "npz":
+    kind, layout, form = description.format, description.layout, description.text
+    if (kind, layout) == ("npz", "npz"):
         return frames.part_tables(content, name, description.channels[0].column)
-    if kind == "npz":
-        return [frames.read_npz(content, name)]
-    numeric, words = column_kinds(description)
-    return [read_text(content, name, description.text, numeric, words)]
+    if kind in OBJECTS:
+        return OBJECTS[kind](content, name, form)
+    if kind in TABLES:
+        return [TABLES[kind](content, name)]
+    keep_damaged = layout in ("long", "wide")
+    return [read_text(content, name, form, *column_kinds(description), keep_damaged)]
 
 
-def column_kinds(description: Description) -> tuple[Any, Any]:
+def column_kinds(description: Description) -> tuple[Test, Test]:
     """Return two functions of a column's name: whether its cells are numbers, and whether words."""
     clock = dict(zip(description.time.column, description.time.format, strict=False))
-    dated = {name for name, form in clock.items() if form == "iso" or "%" in form}
+    dated = {name for name, form in clock.items() if is_dated(form)}
     sources = (description.label, *description.check)
     words = dated | {*description.part.column, *description.rows}
     words |= {source.column for source in sources if not source.listing}
     words |= {description.order} - {"name", "time"}
+    numbers = {*clock, *signals_of(description)} - dated
     patterns = [pattern_of(channel.column) for channel in description.channels]
-    numbers = {*clock} - dated
-    if description.windows.trigger:
-        numbers |= {*as_trigger(description.windows.trigger).signals}
-    is_number = lambda name: name in numbers or any(p.fullmatch(name) for p in patterns)  # noqa: E731
+
+    def is_number(name: str) -> bool:
+        return name in numbers or any(pattern.fullmatch(name) for pattern in patterns)
+
     return is_number, words.__contains__
+
+
+def signals_of(description: Description) -> Sequence[str]:
+    """Return the signals of the trigger that cuts a long recording."""
+    trigger = description.windows.trigger
+    return as_trigger(trigger).signals if trigger else ()
 
 
 def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
     """Return the pattern of a channel's columns, in which `*` stands for any text."""
-    return re.compile(any_text.join(map(re.escape, column.split(ANY))))
+    return re.compile(any_text.join(map(re.escape, column.split(ANY))), re.DOTALL)
 
 
 def split(
@@ -71,21 +77,18 @@ def split(
     of their numbers, are its samples, or the list in its cell. `columns`: so is each column. Cells
     that are empty at the end are no samples.
     """
-    if description.layout == "long":
-        yield from _split_rows(_joined(tables), name, description, faults)
-    elif description.layout == "columns":
+    layout = description.layout
+    if layout == "long":
+        table = tables[0] if len(tables) == 1 else frames.join(tables)
+        yield from _split_rows(table, name, description, faults)
+    elif layout == "columns":
         yield from _split_columns(tables[0], name, description)
-    elif description.layout == "wide" and len(tables) == 1 and len(tables[0].lines) > 1:
-        yield from _split_wide(tables[0], name, description)
+    elif layout == "wide" and description.format not in OBJECTS:
+        yield from _split_wide(tables[0], name, description, faults)
     else:
         for i, table in enumerate(tables, 1):
             row = table.line(0) if len(table.lines) == 1 else i
-            yield (f"{name}, row {row or i}" if len(tables) > 1 else name), name, table
-
-
-def _joined(tables: Sequence[Table]) -> Table:
-    """Return the only table, or one table of many with a row each."""
-    return tables[0] if len(tables) == 1 else frames.join(tables)
+            yield f"{name}, row {row or i}" if len(tables) > 1 else name, name, table
 
 
 def _split_rows(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
@@ -95,62 +98,79 @@ def _split_rows(table: Table, name: str, description: Description, faults: list[
     words = [table.words(column) for column in description.part.column]
     if not words:
         raise DataError("Expected part.column, the column that tells the parts apart.")
-    keys = words[0] if len(words) == 1 else pd.MultiIndex.from_arrays(words)
-    codes, _ = pd.factorize(keys)
+    keys = [*map("\x1f".join, zip(*words, strict=True))] if len(words) > 1 else words[0]
+    codes, _ = pd.factorize(np.asarray(keys, dtype=object))
+    damage = _damaged_parts(table, codes)
     order = np.argsort(codes, kind="stable")
-    ends = np.searchsorted(codes[order], np.arange(codes.max() + 2))
-    for rows in (order[begin:end] for begin, end in zip(ends, ends[1:], strict=False)):
+    ends = np.searchsorted(codes[order], np.arange(codes.max() + 2)).tolist()
+    for code, (begin, end) in enumerate(pairwise(ends)):
+        rows = order[begin:end]
+        if not len(rows):  # that of damaged rows
+            continue
         source = f"{name}, {' '.join(str(word[rows[0]]) for word in words)}"
-        if rows[-1] - rows[0] < len(rows):
-            yield source, name, table.take(slice(rows[0], rows[-1] + 1))
-        elif description.time.sort:
-            yield source, name, table.take(rows)
+        is_whole = rows[-1] - rows[0] < len(rows)
+        if code in damage:
+            faults.append(Fault(source, damage[code], table.damage[damage[code]]))
+        elif is_whole or description.time.sort:
+            yield source, name, table.take(slice(rows[0], rows[-1] + 1) if is_whole else rows)
         else:
             line = table.line(int(rows[np.argmax(np.diff(rows) > 1) + 1]))
             message = "Expected the rows of a part together, others stand between them"
             faults.append(Fault(source, line, message, description.part.column[0]))
 
 
-def _split_wide(table: Table, name: str, description: Description) -> Parts:
+def _damaged_parts(table: Table, codes: Cells) -> dict[int, int]:
+    """Return the line of a damaged row for each part that may have lost it; set its code to -1.
+
+    These are the parts of the rows before and behind it.
+    """
+    if not table.damage:
+        return {}
+    codes[np.isin(table.lines, [*table.damage])] = -1
+    rows = np.flatnonzero(codes == -1)[::-1].tolist()  # the first one of a part is named
+    near = ((code, row) for row in rows for code in codes[max(row - 1, 0) : row + 2].tolist())
+    return {code: table.line(row) for code, row in near}
+
+
+def _split_wide(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
     """Yield each row."""
-    names = [channel.column for channel in description.channels if ANY in channel.column]
-    patterns = {name: pattern_of(name, NUMBER) for name in names}
-    groups = {
-        pattern: sorted(filter(matcher.fullmatch, table.columns), key=natural_key)
-        for pattern, matcher in patterns.items()
-    }
-    cells = {
-        key: np.stack([table.columns[c] for c in names], axis=1)
-        for key, names in groups.items()
-        if names
-    }
-    units = {key: table.units.get(names[0], "") for key, names in groups.items() if names}
-    used = {column for names in groups.values() for column in names}
-    others = [name for name, cells in table.columns.items() if name not in used and len(cells)]
+    keys = [channel.column for channel in description.channels if ANY in channel.column]
+    found = {key: [*filter(pattern_of(key, NUMBER).fullmatch, table.columns)] for key in keys}
+    groups = {key: sorted(names, key=natural_key) for key, names in found.items() if names}
+    cells = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
+    units = {key: table.units.get(names[0], "") for key, names in groups.items()}
+    units = {**table.units, **units}
+    others = {*table.columns}.difference(*groups.values())
     for i, line in enumerate(table.lines):
+        source = f"{name}, row {line}"
+        if line in table.damage:
+            faults.append(Fault(source, line, table.damage[line]))
+            continue
         columns = {key: without_empty_end(rows[i]) for key, rows in cells.items()}
-        for column in others:
+        for column in filter(lambda name: len(table.columns[name]), others):
             columns |= frames.columns_of(column, table.columns[column][i])
-        yield f"{name}, row {line}", name, Table(name, columns, [line], {**table.units, **units})
+        row = replace(table, columns=columns, lines=[line], units=units, origin=groups)
+        yield source, name, row
 
 
 def _split_columns(table: Table, name: str, description: Description) -> Parts:
     """Yield each column that the channel's pattern matches, with the clock beside it."""
     channel = description.channels[0].column
-    clock = {*description.time.column}
-    for column, cells in table.columns.items():
-        if column not in clock and pattern_of(channel).fullmatch(column):
-            kept = without_empty_end(cells)
-            columns = {key: table.columns[key][: len(kept)] for key in clock} | {channel: kept}
-            units = table.units | {channel: table.units.get(column, "")}
-            yield (
-                f"{name}, column {column}",
-                column,
-                Table(name, columns, table.lines[: len(kept)], units),
+    shared = {*description.time.column, *description.rows} & {*table.columns}
+    for column in filter(pattern_of(channel).fullmatch, table.columns):
+        if column not in shared:
+            samples = without_empty_end(table.columns[column])
+            n = len(samples)
+            columns = {key: table.columns[key][:n] for key in shared} | {channel: samples}
+            units = {**table.units, channel: table.units.get(column, "")}
+            origin = {channel: [column] * n}
+            part = replace(
+                table, columns=columns, lines=table.lines[:n], units=units, origin=origin
             )
+            yield f"{name}, column {column}", column, part
 
 
-def without_empty_end(cells: NDArray[Any]) -> NDArray[Any]:
+def without_empty_end(cells: Cells) -> Cells:
     """Return cells without those at the end that are empty or NaN."""
     n = len(cells)
     while n and as_word(cells[n - 1]) in ("", "NaN", "nan"):

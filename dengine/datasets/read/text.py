@@ -8,26 +8,30 @@ import codecs
 import csv
 import io
 import re
-from collections.abc import Callable, Collection, Sequence
-from typing import Any
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..description import TextForm
-from ..table import Table, UnreadableError
+from ..table import Cells, Table, UnreadableError
 
 COMMENT = re.compile(r"^[#%]+\s*")
 BLANK = " "
 REST = "*"  # at the end of the last name: it stands for all columns that remain
+Columns = dict[str, Cells]
+Test = Callable[[str], bool]
 
 
 def read_text(
     content: bytes,
     source: str,
     form: TextForm,
-    is_numeric: Callable[[str], bool],
-    is_word: Callable[[str], bool],
+    is_numeric: Test,
+    is_word: Test,
+    keep_damaged: bool = False,
 ) -> Table:
     """Return the table of a text file.
 
@@ -41,6 +45,8 @@ def read_text(
         Whether the cells of a column, by its name, are numbers; in a plain file they come as such.
     is_word : callable
         Whether the cells of a column are kept as they are. Of others, only their number counts.
+    keep_damaged : bool
+        Whether lines of another number of cells are the table's `damage`, instead of an error.
 
     Returns
     -------
@@ -52,26 +58,49 @@ def read_text(
         If the file is empty, in another encoding, has no such header, or a row of another number
         of cells.
     """
-    content = to_utf8(content, form.encoding)
+    table, body = _parts(to_utf8(content, form.encoding), source, form)
+    numbers, words = ({*filter(test, body.names)} for test in (is_numeric, is_word))
+    columns = _read_plain(body, form, numbers, words)
+    if columns is not None:
+        return replace(table, columns=columns, lines=range(body.first, body.first + body.n))
+    rows = _rows(body, form)
+    n = len(body.names)
+    wanted = f"Expected {n} cells, as there are columns"
+    damage = {i: f"{wanted}, got {len(row)}" for i, row in rows if len(row) != n}
+    if damage and (not keep_damaged or len(damage) == len(rows)):
+        line, message = next(iter(damage.items()))
+        raise UnreadableError(message, line)
+    texts = np.array([[""] * n if i in damage else row for i, row in rows], dtype=object)
+    columns = dict(zip(body.names, texts.reshape(-1, n).T, strict=True))
+    return replace(table, columns=columns, lines=[i for i, _ in rows], damage=damage)
+
+
+class Body(NamedTuple):
+    """The n lines of samples in a file, `content[start:end]` from line `first` on."""
+
+    content: bytes
+    start: int
+    end: int
+    first: int
+    n: int
+    names: Sequence[str]
+
+
+def _parts(content: bytes, source: str, form: TextForm) -> tuple[Table, Body]:
+    """Return what stands above the samples, as a table without columns, and the samples."""
     if not content.strip():
         raise UnreadableError("Expected rows of samples, the file is empty")
     header, units, data = _places(content, form)
-    top, body = _split_lines(content, data - 1)
-    names = _names(top, header, body, form)
-    unit_cells = split_line(top[units - 1], form.delimiter) if 0 < units <= len(top) else []
-    stated_units = dict(zip(names, map(str.strip, unit_cells), strict=False))
-    above = top[: (header or data) - 1]
-    lines: Sequence[int] = range(data, data + body.count(b"\n") + 1)
-    if form.drop:
-        body, lines = _without_dropped(body, data, form)
-    if not body.strip():
+    heads = content.split(b"\n", data)[:data]
+    top = [line.decode() for line in heads]
+    start, end = sum(len(line) + 1 for line in heads[:-1]), len(content.rstrip(b"\n"))
+    if len(heads) < data or start >= end:
         raise UnreadableError("Expected rows of samples, got none", data)
-    numeric = {name for name in names if is_numeric(name)}
-    words = {name for name in names if is_word(name)}
-    columns = _read_plain(body, names, form, numeric, words)
-    if columns is None:
-        columns, lines = _read_cells(body, names, form, lines)
-    return Table(source, columns, lines, stated_units, above)
+    names = _names(top, header, form)
+    cells = split_line(top[units - 1], form.delimiter) if 0 < units < data else ()
+    stated = dict(zip(names, map(str.strip, cells), strict=False))
+    table = Table(source, {}, (), stated, top[: (header or data) - 1], header)
+    return table, Body(content, start, end, data, content.count(b"\n", start, end) + 1, names)
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
@@ -84,38 +113,31 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
         try:
             text = content.decode("utf-8-sig" if is_utf8 else encoding)
         except UnicodeDecodeError as error:
-            line = content[: error.start].count(b"\n") + 1
-            byte = content[error.start]
-            message = f"Expected a text in {encoding}, got the byte 0x{byte:02x}"
-            raise UnreadableError(f"{message}; state text.encoding", line) from error
+            message = f"Expected a text in {encoding}, got the byte 0x{content[error.start]:02x}"
+            raise _at(content, error.start, f"{message}; state text.encoding") from error
         content = text.encode("utf-8", "replace")
     if b"\r" in content:
         content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if b"\0" in content:
-        line = content[: content.index(b"\0")].count(b"\n") + 1
-        raise UnreadableError("Expected a text, got a zero byte", line)
-    return content.rstrip(b"\n")
+        raise _at(content, content.index(b"\0"), "Expected a text, got a zero byte")
+    return content
+
+
+def _at(content: bytes, place: int, message: str) -> UnreadableError:
+    """Return an error at a byte of a file."""
+    return UnreadableError(message, content.count(b"\n", 0, place) + 1)
 
 
 def _places(content: bytes, form: TextForm) -> tuple[int, int, int]:
     """Return the lines of the header, of the units and of the first samples; 0 for none."""
     if not isinstance(form.header, str):
         return form.header, form.units, form.data
-    lines = content.decode().split("\n")
-    for i, line in enumerate(lines, 1):
-        if line.startswith(form.header):
-            return i, form.units and i + form.units, i + form.data
-    raise UnreadableError(f"Expected a header that begins with {form.header!r}, got none")
-
-
-def _split_lines(content: bytes, n: int) -> tuple[list[str], bytes]:
-    """Return the first n lines, and the rest."""
-    start = 0
-    for _ in range(n):
-        start = content.find(b"\n", start) + 1
-        if not start:
-            return content.decode().split("\n"), b""
-    return content[:start].decode().split("\n")[:-1], content[start:]
+    begin = form.header.encode()
+    at = 0 if content.startswith(begin) else content.find(b"\n" + begin) + 1
+    if not at and not content.startswith(begin):
+        raise UnreadableError(f"Expected a header that begins with {form.header!r}, got none")
+    line = content.count(b"\n", 0, at) + 1
+    return line, form.units and line + form.units, line + form.data
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
@@ -127,117 +149,83 @@ def split_line(line: str, delimiter: str) -> list[str]:
 
 def header_names(cells: Sequence[str]) -> list[str]:
     """Return the columns' names: those that repeat get a number, like `X.2`, empty ones too."""
-    names: list[str] = []
-    for i, cell in enumerate(map(str.strip, cells), 1):
-        name = cell or f"column{i}"
-        n = sum(1 for earlier in cells[: i - 1] if earlier.strip() == name)
-        names.append(f"{name}.{n + 1}" if n else name)
-    return names
+    names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
+    counts = [names[:i].count(name) for i, name in enumerate(names)]
+    return [f"{name}.{n + 1}" if n else name for name, n in zip(names, counts, strict=True)]
 
 
-def _names(top: Sequence[str], header: int, body: bytes, form: TextForm) -> list[str]:
-    """Return the names of the columns: as stated, or those of the header."""
-    if form.names:
-        names = list(form.names)
-    elif 0 < header <= len(top):
-        line = COMMENT.sub(
-            "", top[header - 1].strip() if form.delimiter == BLANK else top[header - 1]
-        )
-        return header_names(split_line(line, form.delimiter))
-    else:
+def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
+    """Return the names of the columns: as stated, or those of the header among the lines on top."""
+    if not form.names and not 0 < header < len(top):
         raise UnreadableError("Expected a header, or text.names; got neither", header)
-    if names[-1].endswith(REST):
-        first = body.partition(b"\n")[0].decode()
-        n = len(split_line(first, form.delimiter)) - len(names) + 1
-        stem = names.pop()[: -len(REST)]
-        names += [f"{stem}{i}" for i in range(n)]
-    return names
+    if not form.names:
+        line = top[header - 1]
+        line = COMMENT.sub("", line.strip() if form.delimiter == BLANK else line)
+        return header_names(split_line(line, form.delimiter))
+    *names, last = form.names
+    if not last.endswith(REST):
+        return [*form.names]
+    n = len(split_line(top[-1], form.delimiter)) - len(names)
+    return [*names, *(f"{last[: -len(REST)]}{i}" for i in range(n))]
 
 
-def _without_dropped(body: bytes, first: int, form: TextForm) -> tuple[bytes, list[int]]:
-    """Return the lines that do not begin with what is dropped, and their numbers."""
-    drop = tuple(text.encode() for text in form.drop)
-    kept = [
-        (i, line) for i, line in enumerate(body.split(b"\n"), first) if not line.startswith(drop)
-    ]
-    return b"\n".join(line for _, line in kept), [i for i, _ in kept]
-
-
-def _read_plain(
-    body: bytes,
-    names: Sequence[str],
-    form: TextForm,
-    numeric: Collection[str],
-    words: Collection[str],
-) -> dict[str, NDArray[Any]] | None:
-    """Return the columns by pandas' parser; None if anything in the file is not plain."""
+def _read_plain(body: Body, form: TextForm, numbers: set[str], words: set[str]) -> Columns | None:
+    """Return the columns by pandas' parser; None if anything in them is not plain."""
     import pandas as pd
 
-    if form.thousands or len({*names}) < len(names):
+    content, start, _, _, n, names = body
+    has_groups = form.thousands and content.find(form.thousands.encode(), start) >= 0
+    if form.drop or has_groups or len({*names}) < len(names):
         return None
-    types: dict[str, Any] = dict.fromkeys(words, "category")
+    file = io.BytesIO(content)
+    file.seek(start)
+    missing = {name: [*form.missing] for name in numbers} if form.missing else None
     try:
-        frame = pd.read_csv(
-            io.BytesIO(body),
-            sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
-            header=None,
-            names=[*names],
-            decimal=form.decimal,
-            dtype=types,
-            keep_default_na=False,
-            na_values={name: [*form.missing] for name in numeric} if form.missing else None,
-            skip_blank_lines=True,
-            low_memory=False,
-            encoding="utf-8",
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", pd.errors.DtypeWarning)
+            frame = pd.read_csv(
+                file,
+                sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
+                header=None,
+                names=[*names],
+                decimal=form.decimal,
+                dtype=dict.fromkeys(words, "category"),
+                keep_default_na=False,
+                na_values=missing,
+            )
     except (ValueError, OverflowError):  # a row of too many cells, among others
         return None
-    is_whole = isinstance(frame.index, pd.RangeIndex) and len(frame) == body.count(b"\n") + 1
-    # A row that is cut short has no last cell.
-    if not is_whole or frame[names[-1]].isna().any():
+    is_whole = len(frame) == n and isinstance(frame.index, pd.RangeIndex)
+    if not is_whole or _is_cut(body, frame, form.delimiter):
         return None
-    columns = dict[str, NDArray[Any]]()
-    for name in names:
-        column = frame[name]
-        if name in types:
-            texts = np.array([as_text.strip() for as_text in column.cat.categories], dtype=object)
-            columns[name] = texts[column.cat.codes.to_numpy()]
-        elif name in numeric:
-            values = column.to_numpy()
-            lost = form.missing and values.dtype.kind == "f"
-            is_plain = values.dtype.kind in "iuf"
-            if not is_plain or not (np.isfinite(values) | (np.isnan(values) & bool(lost))).all():
-                return None
-            columns[name] = values
-        else:
-            columns[name] = np.empty(0)
+    return _cells_of(frame, numbers - words, words, bool(missing))
+
+
+def _is_cut(body: Body, frame: Any, delimiter: str) -> bool:
+    """Return whether a line may have fewer cells than there are columns."""
+    if delimiter == BLANK or b'"' in body.content:
+        return bool(frame[body.names[-1]].isin(["", np.nan]).any())
+    n_marks = body.content.count(delimiter.encode(), body.start, body.end)
+    return n_marks != body.n * (len(body.names) - 1)
+
+
+def _cells_of(frame: Any, numbers: set[str], words: set[str], may_miss: bool) -> Columns | None:
+    """Return the columns of a DataFrame; None if a number among them is none, or not finite."""
+    columns: Columns = dict.fromkeys(frame.columns, np.empty(0))
+    for name in words:
+        cells = frame.pop(name).array
+        texts = np.array([*map(str.strip, cells.categories)], dtype=object)
+        columns[name] = texts[cells.codes]
+    for name in numbers:
+        values = columns[name] = frame.pop(name).to_numpy()
+        is_number = values.dtype.kind in "iuf"
+        if not is_number or not (np.isfinite(values) | (np.isnan(values) & may_miss)).all():
+            return None
     return columns
 
 
-def _read_cells(
-    body: bytes, names: Sequence[str], form: TextForm, lines: Sequence[int]
-) -> tuple[dict[str, NDArray[Any]], list[int]]:
-    """Return the columns as texts, and the line of each row, cell by cell.
-
-    Raises UnreadableError for a row of another number of cells. Empty lines are passed over.
-    """
-    rows = []
-    numbers = []
-    text = body.decode()
-    if form.delimiter == BLANK:
-        rows = [line.split() for line in text.split("\n")]
-        numbers = list(lines)
-    else:
-        reader = csv.reader(io.StringIO(text), delimiter=form.delimiter)
-        previous = 0
-        for row in reader:
-            rows.append(row)
-            numbers.append(lines[min(previous, len(lines) - 1)])
-            previous = reader.line_num
-    kept = [(number, row) for number, row in zip(numbers, rows, strict=True) if row]
-    for number, row in kept:
-        if len(row) != len(names):
-            message = f"Expected {len(names)} cells, as there are columns, got {len(row)}"
-            raise UnreadableError(message, number)
-    cells = np.array([row for _, row in kept], dtype=object).reshape(len(kept), len(names))
-    return dict(zip(names, cells.T, strict=True)), [number for number, _ in kept]
+def _rows(body: Body, form: TextForm) -> list[tuple[int, list[str]]]:
+    """Return the cells of each line with its number, without lines that are empty or dropped."""
+    lines = enumerate(body.content[body.start : body.end].decode().split("\n"), body.first)
+    kept = ((i, line) for i, line in lines if line.strip() and not line.startswith(form.drop))
+    return [(i, split_line(line, form.delimiter)) for i, line in kept]

@@ -15,6 +15,7 @@ from .clock import column_times, times_of
 from .places import listing_table
 from .split import Parts
 
+KEY = "window"  # column of the key of a window in the table of its part
 EPOCH = 1e8  # seconds: smaller times of a listing count from the start of the recording
 TOLERANCE = 1e-5  # seconds: float64 rounds dates to less
 Floats = NDArray[np.float64]
@@ -40,7 +41,7 @@ def cut(
             faults.append(Fault(f"{name}, {key}", 0, fault))
         else:
             part = table.take(rows)
-            columns = {**part.columns, "window": np.array([key], dtype=object)}
+            columns = {**part.columns, KEY: np.array([key], dtype=object)}
             yield f"{name}, {key}", f"{name}/{key}", Table(name, columns, part.lines, table.units)
     if not n:
         what = windows.trigger or windows.listing
