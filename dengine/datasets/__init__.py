@@ -4,8 +4,7 @@
     description.save("cell_3/recordings.toml")
     load_dataset("cell_3/")  # a Dataset, read exactly by that file
 
->>> load_dataset("insertion")  # 1503 simulated insertions, shipped with the package
-<Dataset insertion: 1503 traces, 1000 samples at 500 Hz, 701 good, 802 bad, 0 unlabelled, 0 left out>
+    load_dataset("insertion")  # 1503 simulated insertions, shipped with the package
 
 `make_dataset` makes a `Dataset` of arrays; `importing.import_labelled` puts one into a store.
 """

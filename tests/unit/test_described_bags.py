@@ -163,7 +163,7 @@ def test_a_lost_message_and_a_missing_label_are_faults_and_nothing_is_filled_in(
         "cell.mcap, 3",
         "cell.mcap, 6",
     ]
-    assert "got a gap of 0.004 s" in texts[0]
+    assert "got 0.004 s before row 11" in texts[0]
 
 
 def test_a_file_that_was_not_closed_is_read_up_to_its_end_and_a_damaged_one_is_refused(

@@ -103,7 +103,7 @@ def read_bag(
     Raises
     ------
     DataError
-        If the topic of the channels has no messages, or a file before the last is not whole although
+        If the topic of the channels has no messages, or if a file before the last is not whole and
         a trigger cuts.
     """
     topics = {channel.column.partition(".")[0] for channel in description.channels}
@@ -145,10 +145,11 @@ def read_bag(
     logs = columns[LOG_TIME] = as_cells([logged for logged, *_ in rows])
     stamps = as_cells([stamp for _, stamp, _ in rows])
     columns |= {STAMP: stamps} if stamps.all() else {}
-    for name, messages in events.items():
-        messages.sort(key=lambda message: message[0])
-        places = np.searchsorted([time for time, _ in messages], logs, side="right")
-        values = [None, *(value for _, value in messages)]
+    for name, found_events in events.items():
+        found_events.sort(key=lambda event: event[0])
+        begins = np.array([time for time, _ in found_events])
+        places = np.searchsorted(begins, logs, side="right")
+        values = [None, *(value for _, value in found_events)]
         columns[name] = as_cells([values[place] for place in places.tolist()])
     return Table(files[0][1], columns, []), events
 
