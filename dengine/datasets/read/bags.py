@@ -7,8 +7,9 @@ another topic has the newest `data` of it.
 
 import struct
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ STAMP, LOG_TIME = "stamp", "log_time"
 MESSAGE_BYTES = 1000.0  # in memory
 RECOVER = "mcap recover or ros2 bag reindex may save what is whole"
 Message = tuple[str, str, int, Any]  # topic, type, nanoseconds of the log, message
-Events = dict[str, list[tuple[int, Any]]]  # for each topic its messages: nanoseconds, value
 
 
 def read_messages(
@@ -77,81 +77,61 @@ def value_of(message: Any, path: str) -> Any:
     return message
 
 
-def read_bag(
-    files: Sequence[tuple[Path, str]],
-    description: Description,
-    notes: list[str],
-    faults: list[Fault],
-) -> tuple[Table, Events]:
-    """Return the table of a bag, and the messages of its other topics.
+@dataclass
+class Bag:
+    """The messages of a bag that a description needs.
 
-    Parameters
-    ----------
-    files : sequence of (Path, str)
-        In their order, each with its name for messages.
-    description : Description
-    notes, faults : list
-        Get what users should know, and the files that are damaged.
-
-    Returns
-    -------
-    Table
-        With `stamp` only if all messages have one.
-    dict of str to list of (int, value)
-        In the order of the log.
-
-    Raises
-    ------
-    DataError
-        If the topic of the channels has no messages, or if a file before the last is not whole and
-        a trigger cuts.
+    topic : that of the channels. others : topics whose `data` is read. rows : for each message of
+    the channels the times of the log and of its header, in nanoseconds, and their values. events :
+    for each other topic its messages, as (nanoseconds of the log, value).
     """
-    topics = {channel.column.partition(".")[0] for channel in description.channels}
+
+    topic: str
+    fields: Sequence[str]
+    others: Collection[str]
+    rows: list[tuple[int, int, list[Any]]] = field(default_factory=list)
+    events: dict[str, list[tuple[int, Any]]] = field(default_factory=lambda: defaultdict(list))
+
+    def add(self, messages: Iterable[Message]) -> None:
+        """Add messages; raise UnreadableError if one lacks a field."""
+        for topic, _, logged, message in messages:
+            if topic in self.others:
+                self.events[topic].append((logged, value_of(message, "data")))
+            if topic == self.topic:
+                stamp = getattr(getattr(message, "header", None), "stamp", None)
+                time = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
+                values = [value_of(message, name) for name in self.fields]
+                self.rows.append((logged, time, values))
+
+    def table(self, name: str, columns: Sequence[str]) -> Table:
+        """Return a table with a row for each message of the channels, in the order of the log.
+
+        It has the column `stamp` only if all messages have one.
+        """
+        self.rows.sort(key=lambda row: row[0])
+        logs, stamps, values = zip(*self.rows, strict=True)
+        cells = dict(zip(columns, map(as_cells, zip(*values, strict=True)), strict=True))
+        cells |= {LOG_TIME: as_cells(logs)} | ({STAMP: as_cells(stamps)} if all(stamps) else {})
+        for topic, events in self.events.items():
+            events.sort(key=lambda event: event[0])
+            begins = np.array([time for time, _ in events])
+            newest = [None, *(value for _, value in events)]
+            places = np.searchsorted(begins, cells[LOG_TIME], side="right")
+            cells[topic] = as_cells([newest[place] for place in places.tolist()])
+        return Table(name, cells, [])
+
+
+def bag_of(description: Description) -> Bag:
+    """Return an empty bag for a description; DataError if its channels are of several topics."""
+    pairs = [channel.column.partition(".") for channel in description.channels]
+    topics = sorted({topic for topic, _, _ in pairs})
     if len(topics) != 1:
-        raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
-    topic = topics.pop()
-    fields = [channel.column.partition(".")[2] for channel in description.channels]
-    trigger = description.windows.trigger
+        raise DataError(f"Expected channels of one topic, got {listed(topics)}.")
     sources = (description.label, *description.check)
     others = {source.topic for source in sources} | {*description.part.column, description.order}
     others |= {*signals_of(description)}
     others = {name for name in others if name.startswith("/") and "." not in name}
-    rows: list[tuple[int, int, list[Any]]] = []
-    events: Events = defaultdict(list)
-    for path, name in files:
-        if trigger and (notes or faults):
-            why = (*notes, *faults)[0]
-            raise DataError(f"Expected whole files before {name}, since a trigger cuts: {why}")
-        try:
-            messages = list(read_messages(path, {topic, *others}, notes))
-        except UnreadableError as error:
-            faults.append(Fault(name, 0, str(error)))
-            continue
-        for found, _, logged, message in messages:
-            if found in others:
-                events[found].append((logged, value_of(message, "data")))
-            if found == topic:
-                stamp = getattr(getattr(message, "header", None), "stamp", None)
-                time = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-                rows.append((logged, time, [value_of(message, field) for field in fields]))
-    if not rows:
-        why = f" {faults[0]}." if faults else ""
-        raise DataError(f"Expected messages of {topic}, found none.{why}")
-    rows.sort(key=lambda row: row[0])
-    columns = {
-        channel.column: as_cells([row[2][i] for row in rows])
-        for i, channel in enumerate(description.channels)
-    }
-    logs = columns[LOG_TIME] = as_cells([logged for logged, *_ in rows])
-    stamps = as_cells([stamp for _, stamp, _ in rows])
-    columns |= {STAMP: stamps} if stamps.all() else {}
-    for name, found_events in events.items():
-        found_events.sort(key=lambda event: event[0])
-        begins = np.array([time for time, _ in found_events])
-        places = np.searchsorted(begins, logs, side="right")
-        values = [None, *(value for _, value in found_events)]
-        columns[name] = as_cells([values[place] for place in places.tolist()])
-    return Table(files[0][1], columns, []), events
+    return Bag(topics[0], [name for _, _, name in pairs], others)
 
 
 def split_bag(
@@ -161,11 +141,39 @@ def split_bag(
     notes: list[str],
     faults: list[Fault],
 ) -> Parts:
-    """Yield each part of a bag, with the labels of its topics; see `read_bag` and `windows.cut`."""
-    table, events = read_bag(files, description, notes, faults)
+    """Yield each part of a bag, with the labels of its topics; see `windows.cut`.
+
+    Parameters
+    ----------
+    files : sequence of (Path, str)
+        In their order, each with its name for messages.
+    description : Description
+    base : Path
+        Their folder.
+    notes, faults : list
+        Get what users should know, and the files that are damaged.
+
+    Raises
+    ------
+    DataError
+        If the topic of the channels has no messages, or if a file before the last is not whole and
+        a trigger cuts.
+    """
+    bag = bag_of(description)
+    for path, name in files:
+        if description.windows.trigger and (notes or faults):
+            why = (*notes, *faults)[0]
+            raise DataError(f"Expected whole files before {name}, since a trigger cuts: {why}")
+        try:
+            bag.add(list(read_messages(path, {bag.topic, *bag.others}, notes)))
+        except UnreadableError as error:
+            faults.append(Fault(name, 0, str(error), error.column))
+    if not bag.rows:
+        why = f" {faults[0]}." if faults else ""
+        raise DataError(f"Expected messages of {bag.topic}, found none.{why}")
     name = files[0][1] if len(files) == 1 else base.resolve().name
+    table = bag.table(name, [channel.column for channel in description.channels])
     parts = cut(table, name, description, base, faults)
-    for source in (description.label, *description.check):
-        if source.topic:
-            parts = label_events(parts, source.topic, events[source.topic], LOG_TIME)
+    for topic in {source.topic for source in (description.label, *description.check)} - {""}:
+        parts = label_events(parts, topic, bag.events[topic], LOG_TIME)
     return parts
