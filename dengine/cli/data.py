@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..datasets.description import Seen
 from . import options
 from .options import DataChoice, RecipeChoice, fault_lines, short_name, verb
 from .output import (
@@ -52,6 +51,7 @@ def data(
     DATA may also be what needs no description: a bundled set, the file of a store, or an .npz file
     with X (traces, samples) and y (1 success, 0 failure).
     """
+    from ..datasets.description import Seen
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey_dataset
 

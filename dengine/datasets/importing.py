@@ -219,11 +219,8 @@ def import_parts(
     """
     gate = TraceGate(trace_spec)
     counts = Counter[str]()
-    n_silent = 0  # accepted parts since the last label of which nothing was heard
     counts_silence = policy.stops == "some"
-    if counts_silence:
-        since = int(store.settings().get("policy_since", 0))
-        n_silent = len(store.unreported_accepts(since)) - store.silent_total(since)
+    n_silent = _count_silent(store, policy)
     for start in range(0, len(parts), CHUNK):
         new: dict[str, StoredDecision] = {}
         labels: list[NewLabel] = []
@@ -231,28 +228,21 @@ def import_parts(
             fault, hash_of_content = gate(torch.from_numpy(trace))
             earlier = new.get(decision.id) or store.get_decision(decision.id)
             if earlier is not None and earlier.source is not None:  # a forgotten one has a label
-                if label is not None:
-                    counts["repeated" if label == earlier.success else "contradicted"] += 1
+                counts[_repeat_of(label, earlier)] += 1
                 continue
             stored = earlier
             if stored is None:
-                is_certain = decision.predicted is not Action.VERIFY
-                propensity = policy.audited_share if is_certain else 1.0
-                # A trace with a fault is stored, but never used for training.
-                reason = REASONS[fault] if fault else decision.reason
-                stored = StoredDecision(
-                    replace(decision, reason=reason, propensity=propensity),
-                    trace.copy(),
-                    trace_hash(hash_of_content, decision.part),
-                    bool(fault),
-                    store.clock(),
-                )
+                stored = _as_stored(decision, trace, fault, hash_of_content, policy, store.clock())
                 new[decision.id] = stored
             if counts_silence and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as silent.
                 n_silent += (label is None) - (earlier is not None)
             if label is None:
                 continue
+            silent = 0
+            if not fault:
+                silent = n_silent
+                n_silent = 0
             labels.append(
                 NewLabel(
                     decision.id,
@@ -260,13 +250,12 @@ def import_parts(
                     source_of(decision.action, decision.audit, label),
                     model_version=0,
                     point=None,
-                    silent=0 if fault else n_silent,
+                    silent=silent,
                     time=store.clock(),
                     content_hash=stored.content_hash,
                     decided=stored.time,
                 )
             )
-            n_silent = n_silent if fault else 0
             counts["quarantined" if fault else "imported"] += 1
         store.apply_records([*new.values(), *labels])
         if on_traces is not None:
@@ -278,6 +267,44 @@ def import_parts(
         resumed=True,
         contradicted=counts["contradicted"],
     )
+
+
+def _count_silent(store: "SqlStore", policy: Policy) -> int:
+    """Return how many accepted parts there are since the last label of which nothing was heard.
+
+    If silence confirms a part, there is none.
+    """
+    if policy.stops != "some":
+        return 0
+    since = int(store.settings().get("policy_since", 0))
+    return len(store.unreported_accepts(since)) - store.silent_total(since)
+
+
+def _repeat_of(label: bool | None, earlier: StoredDecision) -> str:
+    """Return what the label of a part that has one in the store counts as; "" without a label."""
+    if label is None:
+        return ""
+    return "repeated" if label == earlier.success else "contradicted"
+
+
+def _as_stored(
+    decision: Decision,
+    trace: NDArray[np.float32],
+    fault: int,
+    hash_of_content: int,
+    policy: Policy,
+    time: float,
+) -> StoredDecision:
+    """Return the record of a decision; a trace with a fault never trains, and is its reason.
+
+    fault : position in `REASONS`, 0 for none.
+    """
+    is_certain = decision.predicted is not Action.VERIFY
+    propensity = policy.audited_share if is_certain else 1.0
+    reason = REASONS[fault] if fault else decision.reason
+    made = replace(decision, reason=reason, propensity=propensity)
+    part_hash = trace_hash(hash_of_content, decision.part)
+    return StoredDecision(made, trace.copy(), part_hash, bool(fault), time)
 
 
 def _verifying_decisions(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:
