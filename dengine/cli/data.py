@@ -41,7 +41,7 @@ SIGNIFICANT = 0.01  # p-values below it are called drift
 def data(
     context: click.Context, source: DataChoice, save: bool, check: bool, out: Out | None
 ) -> None:
-    """Describe recordings, read them by that, and list what is wrong with them.
+    """Describe recordings, and list what is wrong with them.
 
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
     .npz, .ts or .mcap. Shown are the saved description or, without one, a proposal, in which ? is
