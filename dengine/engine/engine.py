@@ -566,6 +566,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
         Raises StoreError where the labels before it cannot be stored.
         """
+        if self._core.live.pinned:
+            self._corrections.release()
         return self._core.retrain()
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
