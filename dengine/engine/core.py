@@ -21,12 +21,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
 from ..history.status import Status, retrain_fault
 from ..model.base import N_EXAMPLES, EngineModel, Exportable
-from ..records import Action, Decision, Reason, RetrainReport, TraceSpec, as_id, as_success
+from ..records import (
+    Action,
+    Decision,
+    Reason,
+    RetrainReport,
+    TraceArray,
+    TraceSpec,
+    as_id,
+    as_success,
+)
 from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
 from ..traces import convert_trace
@@ -393,7 +402,7 @@ class EngineCore:
                 self.settings.save()
         return spec
 
-    def _check_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
+    def _check_trace(self, trace: ArrayLike) -> TraceArray:
         """Return a trace as float32, shape (channels, samples), converted as the trace contract
         demands.
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..decision.scripting import reason_of
 from ..errors import DengineError, SettingError
 from ..model.base import EngineModel
-from ..records import TRAINED
+from ..records import TRAINED, TraceArray
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
 
@@ -69,7 +69,7 @@ class TrainingWindow:
         """Sequence number of the newest label; 0 before the first."""
         return int(self._block[0][self._end - 1]) if self._end else 0
 
-    def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
+    def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
         `label` is 1 or 0, `hash_` the hash of part or content, `seq` the label's number, larger
@@ -126,7 +126,7 @@ class TrainingWindow:
         newer: list[int] = numbers[np.searchsorted(numbers, seq, "right") :].tolist()
         return newer
 
-    def row(self, seq: int) -> tuple[NDArray[np.float32], int, int]:
+    def row(self, seq: int) -> tuple[TraceArray, int, int]:
         """Return the trace (channels, samples), the label and the hash of a label of the window."""
         i = int(np.searchsorted(self._block[0][: self._end], seq))
         return self._block[1][i], int(self._block[2][i]), int(self._block[3][i])

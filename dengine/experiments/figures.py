@@ -24,7 +24,7 @@ from ..errors import OutputError, instead
 from ..files import write_output
 from ..history.explain import Explanation
 from ..history.sentences import Bound
-from ..records import Action
+from ..records import Action, TraceArray
 from ..reducers import has_own_unit
 from ..traces import as_traces
 from .costs import CostCurve, PolicyCost
@@ -778,7 +778,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 
 
 def _draw_drift(
-    figure: Any, X: NDArray[np.float32], y: NDArray[Any], finite: NDArray[np.bool_], label: str
+    figure: Any, X: TraceArray, y: NDArray[Any], finite: NDArray[np.bool_], label: str
 ) -> None:
     """Draw the share of good parts in a sliding tenth of the set, and each finite trace's mean.
 

@@ -25,13 +25,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
 from ..errors import DataError, StoreError, instead
 from ..recipe import Recipe
-from ..records import FITS, Action, Decision, Reason, TraceSpec, stored_trace_spec
+from ..records import FITS, Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
 from ..store.opening import opening
 from ..traces import as_trace, can_fit_length
 
@@ -63,7 +62,7 @@ class JournalLine:
     """
 
     decision: Decision
-    trace: NDArray[np.float32]
+    trace: TraceArray
     label: bool | None
     late: bool = False
 
@@ -263,7 +262,7 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     return JournalLine(decision, trace, LABELS.get(label))
 
 
-def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
+def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> TraceArray:
     """Return samples, channel after channel, as a trace of the contract, float32 (C, T).
 
     Another number of samples is fitted as `spec.fit` says. Raises DataError, naming `where`, for

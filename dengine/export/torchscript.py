@@ -33,7 +33,7 @@ from ..decision.scripting import script
 from ..engine.decide import as_part
 from ..errors import ExportError, instead
 from ..folds import part_hash
-from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec, as_success
+from ..records import ACTIONS, REASONS, Action, Reason, TraceArray, TraceSpec, as_success
 from ..traces import as_trace, as_traces
 from .bundle import (
     METADATA,
@@ -144,7 +144,7 @@ def _content(module: Any, metadata: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def golden_trace(spec: TraceSpec) -> NDArray[np.float32]:
+def golden_trace(spec: TraceSpec) -> TraceArray:
     """Return the trace, float32 (C, T), on which a loader checks the embedding of its machine.
 
     It is a sine, always the same for a contract, within half of the sensor's limit.

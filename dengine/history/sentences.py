@@ -18,7 +18,7 @@ from ..decision.members import CLOSED
 from ..decision.policy import RULES, Policy
 from ..folds import COIN_BITS, audit_salt, content_hash, toss
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec
+from ..records import Action, Decision, Reason, TraceArray, TraceSpec
 from ..store.records import StoredDecision
 from ..traces import LARGEST, ForceLimitsGate
 from .past_versions import Novelty, Thresholds
@@ -204,9 +204,7 @@ def explain_in_words(
         yield f"The part turned out {item.label}{source}."
 
 
-def _explain_audit(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
+def _explain_audit(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on an audit: what the model alone would have done, the coin.
 
     The coin is computed again from the trace and the engine's seed.
@@ -220,9 +218,7 @@ def _explain_audit(
     return f"{alone}. {coin_fell}; it is a function of the trace and the seed."
 
 
-def _explain_saturated(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
+def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on a saturated trace.
 
     It has the number of samples that touch the sensor's range, and the time and the channel of the
@@ -240,9 +236,7 @@ def _explain_saturated(
     return f": {len(touching)} samples touch the sensor's range of {limit}, {first}."
 
 
-def _explain_not_finite(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
+def _explain_not_finite(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on a trace with NaN or infinity, with their number."""
     n = int((~np.isfinite(trace)).sum())
     return (
@@ -251,9 +245,7 @@ def _explain_not_finite(
     )
 
 
-def _explain_outside(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
+def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
     x = torch.from_numpy(trace)
     windows = circumstances.recipe.policy.windows
@@ -265,7 +257,7 @@ def _explain_outside(
 
 
 # For each reason the rest of the sentence that begins with what was done.
-WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
+WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
     Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
     Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was verified.",
