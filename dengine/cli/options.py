@@ -334,16 +334,6 @@ _WINDOW = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 
 
-def _windows(
-    context: click.Context, option: click.Parameter, values: tuple[str, ...]
-) -> tuple[str, ...] | None:
-    """Return the windows that were given, without empty ones; None if the option was not given.
-
-    An empty tuple removes all windows of a recipe. It is a callback of click's.
-    """
-    return tuple(filter(None, values)) if values else None
-
-
 POLICY = {
     "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
     "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
@@ -354,7 +344,13 @@ POLICY = {
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
     "prices": click.option("--prices", type=CommaList(click.FloatRange(0.0)), help=_PRICES),
     "windows": click.option(
-        "--window", "windows", metavar=_WINDOW, multiple=True, callback=_windows, help=_WINDOWS
+        "--window",
+        "windows",
+        metavar=_WINDOW,
+        multiple=True,
+        # None where the option was not given; an empty tuple removes all windows of a recipe.
+        callback=lambda _, option, values: tuple(filter(None, values)) if values else None,
+        help=_WINDOWS,
     ),
 }
 SETTINGS = POLICY | {
@@ -605,16 +601,12 @@ def n_jobs_option(default: int, text: str) -> Option:
 
     0 is turned into -1, one process for each core.
     """
-
-    def all_cores_for_0(context: click.Context, option: click.Parameter, n_jobs: int) -> int:
-        return n_jobs or -1
-
     return click.option(
         "--n-jobs",
         type=int,
         default=default,
         show_default=True,
-        callback=all_cores_for_0,
+        callback=lambda _, option, n_jobs: n_jobs or -1,
         help=text,
     )
 

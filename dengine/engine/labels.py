@@ -36,6 +36,8 @@ class CellLabels:
         None  # of the store's labels, when the window is filled anew; None: all of them
     )
 
+    has_gaps = False  # no label waits for one of a peer
+
     def __init__(self, window: TrainingWindow) -> None:
         self._window = window
         self.new_labels = 0

@@ -339,7 +339,7 @@ class Learner:
         rule.
         """
         note = self._start[2] if self._start is not None else ""
-        if note and trained.model is not None:
+        if note:
             trained = replace(trained, reason=f"{trained.reason}; {note}")
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
@@ -577,15 +577,10 @@ class Learner:
         self.end_training()
         self.store_labels()
         self._take_in_all_news()
-        if self._peers is not None and (self._peers.is_lost or self._has_gaps):
+        if self._peers is not None and (self._peers.is_lost or self.labels.has_gaps):
             raise StoreError(
                 f"News of product {self._store.product!r} cannot be had now; try it again."
             )
-
-    @property
-    def _has_gaps(self) -> bool:
-        """Whether labels of this cell wait for labels of peers that have not come."""
-        return isinstance(self.labels, ProductLabels) and self.labels.has_gaps
 
     def apply_corrections(self, may_retrain: bool = True) -> None:
         """Apply the store's newest corrections to window, references, count of new labels and rule.

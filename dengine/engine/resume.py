@@ -92,15 +92,18 @@ def find_clean_start(
 
     if is_clean(trained_on) or not newest.keeps_references:
         return newest, ""
-    for number in [stored.report.version for stored in store.versions() if stored.kept][::-1]:
-        with suppress(StoreError):  # of a damaged version
-            version = store.load_version(number)
+    for stored in reversed(store.versions()):
+        with suppress(StoreError):  # of a version that is not kept, or damaged
+            version = store.load_version(stored.report.version)
             model = template.successor()
             if model.needs_refit(version.state):
                 return newest, ""
             if is_clean(TrainedOn.from_state(version.state)):
                 model.set_state(without_rule(version.state))
-                return model, f"from version {number}, which never saw the forgotten labels"
+                return (
+                    model,
+                    f"from version {version.version}, which never saw the forgotten labels",
+                )
     return template, "from initial weights, which never saw the forgotten labels"
 
 

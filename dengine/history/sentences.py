@@ -5,13 +5,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
 from ..decision.members import CLOSED
@@ -225,24 +224,14 @@ def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Cir
     first.
     """
     spec = circumstances.spec
-    touching: NDArray[Any] = np.zeros((0, 2))
-    if spec.limit is not None:
-        touching = np.argwhere(np.abs(trace) >= spec.limit)
+    limit = math.inf if spec.limit is None else spec.limit
+    touching = np.argwhere(np.abs(trace) >= limit)
     if not len(touching):
         return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
     first = f"first after {spec.time_text(sample)} (channel {channel + 1})"
-    limit = "" if spec.limit is None else spec.value_text(spec.limit, channel)
-    return f": {len(touching)} samples touch the sensor's range of {limit}, {first}."
-
-
-def _explain_not_finite(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the rest of the sentence on a trace with NaN or infinity, with their number."""
-    n = int((~np.isfinite(trace)).sum())
-    return (
-        f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded "
-        "too far is."
-    )
+    text = spec.value_text(limit, channel)
+    return f": {len(touching)} samples touch the sensor's range of {text}, {first}."
 
 
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
@@ -262,7 +251,9 @@ WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
     Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was verified.",
     Reason.AUDIT: _explain_audit,
-    Reason.NOT_FINITE: _explain_not_finite,
+    Reason.NOT_FINITE: lambda decision, trace, circumstances: (
+        f": {(~np.isfinite(trace)).sum()} of {trace.size} samples are NaN or infinite."
+    ),
     Reason.CONSTANT: lambda decision, trace, circumstances: (
         f": every sample is {circumstances.spec.value_text(float(trace.flat[0]), 0)}: a dead "
         "sensor."

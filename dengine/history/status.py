@@ -11,6 +11,7 @@ them.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
@@ -281,8 +282,7 @@ class Status:
             [report.reason for report in reports[newest_accepted:]], self.version
         )
         trained = [report.reason for report in reports if report.reason.startswith(TRAINED)]
-        notes = trained[-1].split("; ") if trained else []
-        repeats = next((note.partition(":")[0] for note in notes if REPEATS in note), "")
+        repeats = re.search(rf"[^;:]* {REPEATS}", "".join(trained[-1:]))
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.loss, self.loss),
@@ -298,7 +298,7 @@ class Status:
                 f"more than {rejects.tolerance:.1%}.",
             ),
             (failing, failing),
-            (repeats, f"{repeats}. {REPEATS_MEANING}"),
+            (repeats, f"{repeats and repeats[0].strip()}. {REPEATS_MEANING}"),
             (
                 self.shadow and would_accept.verdict == "broken",
                 f"It would break the tolerance of {would_accept.tolerance:.1%}.",
