@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 Command = Callable[..., Any]
 Option = Callable[[Command], Command]
+Options = Mapping[str, Any]  # the values of options, by name
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(1)
@@ -259,7 +260,7 @@ class RecipeChoice:
     """
 
     name: str | None
-    settings: Mapping[str, Any]
+    settings: Options
 
     def load(self, base: Any = "conv") -> Recipe:
         """Return the recipe, or `base` if no name was given, with the given settings.
@@ -391,7 +392,7 @@ class DataChoice:
     """
 
     data: str
-    options: Mapping[str, Any]
+    options: Options
 
     def load(self) -> Dataset:
         """Load the data set and return it.
@@ -547,7 +548,7 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> O
     return bundle_options("source", _data_choice, {"data": data} | DATA)
 
 
-def recorder_settings(options: Mapping[str, Any]) -> tuple[dict[str, Any], TraceSpec]:
+def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
     """Return those of the options in `TRACE` that a robot's recorder takes, under its names, and
     the contract of what it records.
     """
@@ -559,7 +560,7 @@ def recorder_settings(options: Mapping[str, Any]) -> tuple[dict[str, Any], Trace
     return settings, replace(spec_of_recording(**settings), **form)
 
 
-def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:
+def trace_spec_from(options: Options) -> TraceSpec | None:
     """Return the contract of live traces, by those options of `TRACE` that were given.
 
     `--channels` with one number gives how many there are; with names, their columns.

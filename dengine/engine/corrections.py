@@ -8,7 +8,7 @@ Each change is an event that is kept for ever. Nothing is overwritten: a correct
 an earlier version answers again as a new one, and a decision stays as it was decided.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from ..store.records import (
 )
 from ..traces import check_rate
 from .core import EngineCore
-from .settings import BASELINE_SETTINGS, EvidenceWindow
+from .settings import BASELINE_SETTINGS, EvidenceWindow, Settings
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
@@ -380,7 +380,7 @@ class Corrections:
         return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._core.live.version)
 
 
-def _check_baseline_settings(changes: Mapping[str, Any]) -> None:
+def _check_baseline_settings(changes: Settings) -> None:
     """Raise SettingError for changes of a policy that have no effect on a handed-in model.
 
     `changes` holds the changed settings by name; those of `BASELINE_SETTINGS` have an effect.

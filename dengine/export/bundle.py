@@ -52,6 +52,7 @@ SHA256 = re.compile(r"[0-9a-f]{64}")
 SUM_BYTES = 2**16
 
 KeyFile = str | os.PathLike[str]
+Metadata = dict[str, Any]  # what an exported file says of itself, by name
 
 
 def make_key(path: KeyFile) -> Path:
@@ -175,7 +176,7 @@ def prepare_export(
     return source, DecisionModule(source.trace, decider, shape, source.stops_all)
 
 
-def describe(source: Exportable) -> dict[str, Any]:
+def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
     It names schema, versions, time, trace contract, policy, references (number and SHA-256), the
@@ -273,7 +274,7 @@ def _check_outputs(path: str | os.PathLike[str], force: bool) -> None:
         check_output(file, force)
 
 
-def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
+def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> Metadata:
     """Read the description in an exported TorchScript file, without loading its code.
 
     Parameters
@@ -349,7 +350,7 @@ def _read(path: Path, most: int = -1) -> bytes:
         raise ExportError(f"{path} cannot be read: {error}.") from error
 
 
-def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
+def metadata_of(content: bytes, path: Path) -> Metadata:
     """Return the description inside the content of a TorchScript file, a zip archive.
 
     No code of the file is run. Raises ExportError, which names `path`, if there is none or it has
@@ -364,7 +365,7 @@ def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
         return check_schema(json.loads(archive.read(next(names, METADATA))), path)
 
 
-def check_schema(metadata: Any, path: Path) -> dict[str, Any]:
+def check_schema(metadata: Any, path: Path) -> Metadata:
     """Return a description as it is if it has the present schema, `SCHEMA`.
 
     Raises ExportError, naming `path`, for another schema and for what is no dict.

@@ -39,6 +39,7 @@ from ..traces import CONSTANT, LARGEST, NOT_FINITE, SATURATED, TOO_LARGE, as_tra
 from .bundle import (
     METADATA,
     KeyFile,
+    Metadata,
     check_schema,
     describe,
     prepare_export,
@@ -179,7 +180,7 @@ class OnnxModel:
         The file's description of itself.
     """
 
-    def __init__(self, content: bytes, metadata: dict[str, Any]) -> None:
+    def __init__(self, content: bytes, metadata: Metadata) -> None:
         runtime = _import_package("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1

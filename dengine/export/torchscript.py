@@ -38,6 +38,7 @@ from ..traces import as_trace, as_traces
 from .bundle import (
     METADATA,
     KeyFile,
+    Metadata,
     describe,
     metadata_of,
     prepare_export,
@@ -134,7 +135,7 @@ def export_torchscript(
     return write_export(path, content, force, key, source)
 
 
-def _content(module: Any, metadata: dict[str, Any]) -> bytes:
+def _content(module: Any, metadata: Metadata) -> bytes:
     """Return the bytes of a file with this module and description.
 
     They are made in memory because libtorch ends the whole process if a disk is full.
@@ -186,7 +187,7 @@ class ExportedModel:
         Contract of its traces.
     """
 
-    def __init__(self, module: Any, metadata: dict[str, Any]) -> None:
+    def __init__(self, module: Any, metadata: Metadata) -> None:
         self.module = module
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
