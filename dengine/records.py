@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from .errors import ReportError, SettingError, StoreError, expect, instead, shortened
 from .representation import to_html
 
+PartNumber = str | int | None  # as a caller gives it
 TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
 
 

@@ -29,6 +29,7 @@ from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import NotTakenError, StoreError, expect
+from ..files import FilePath
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
 from ..model.base import EngineModel, Model
@@ -38,6 +39,7 @@ from ..records import (
     Cycle,
     Decision,
     Outcome,
+    PartNumber,
     RetrainReport,
     TraceSpec,
     as_id,
@@ -67,9 +69,9 @@ from .trainer import Clock
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ..store.opening import StoreLike
     from ..store.sql import SqlStore
 
-    StoreLike = str | os.PathLike[str] | SqlStore
 
 log = logging.getLogger("dengine")
 
@@ -190,7 +192,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         store: StoreLike | None = None,
         seed: int = 0,
         *,
-        recipe: Recipe | str | os.PathLike[str] | None = None,
+        recipe: Recipe | FilePath | None = None,
         model: Model | None = None,
         executor: Executor | None = None,
         replaying: bool = False,
@@ -405,7 +407,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     # Decisions
 
     def decide(
-        self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str | None = None
+        self, trace: ArrayLike, part: PartNumber = None, *, decision_id: str | None = None
     ) -> Decision:
         """Decide on one trace, and record the decision.
 
@@ -444,7 +446,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         decision_id: str,
         success: bool,
         trace: ArrayLike | None = None,
-        part: str | int | None = None,
+        part: PartNumber = None,
     ) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
 

@@ -29,6 +29,7 @@ import numpy as np
 from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
 from ..errors import DataError, StoreError, instead
+from ..files import FilePath
 from ..recipe import Recipe
 from ..records import FITS, Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
 from ..store.opening import opening
@@ -92,7 +93,7 @@ class CellJournal:
     set_aside: str = ""
 
 
-def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
+def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     """Read and check the journal of a cell program.
 
     Rejected parts, and verified ones without a label, are left out. An accepted part whose label
@@ -170,7 +171,7 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
     return CellJournal(lines, next(iter(accepted), None), head[3], len(tail), set_aside)
 
 
-def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
+def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
     """Return a sentence if the head of a journal knows of a line that the journal lacks, else "".
 
     The head is the file PATH.head: the number of lines and the last checksum. `crcs` are the
@@ -280,9 +281,7 @@ def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> TraceArray:
     return as_trace(values.reshape(spec.channels, -1), spec)
 
 
-def import_journal(
-    store: "StoreLike", path: str | os.PathLike[str], any_model: bool = False
-) -> ImportReport:
+def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) -> ImportReport:
     """Import what an exported cell learned into the store of its engine.
 
     Each part is imported once, however often its journal is. Rule and certificate count the parts
