@@ -271,22 +271,21 @@ def _match_spec(x: TraceArray, trace_spec: TraceSpec) -> TraceArray:
         turn = "; it looks transposed: turn it, trace.T" if is_transposed else ""
         do = f"pass (channels, samples){turn}"
         raise TraceError(f"Expected {trace_spec.channels} channel(s), got {channels}; {do}.")
-    if samples == trace_spec.samples:
+    n = trace_spec.samples
+    if samples == n:
         return x
-    if trace_spec.fit == "strict":
-        form = f"{trace_spec.samples} samples"
-        if (rate := trace_spec.rate_hz) is not None:
-            form = f"{rate:g} Hz x {trace_spec.samples / rate:g} s"
-        new = f"TraceSpec(samples={trace_spec.samples}, fit='pad')"
-        do = f"resample the trace to {form}, or start a new store with {new}"
-        raise TraceError(f"Expected {trace_spec.samples} samples, got {samples}; {do}.")
-    if not can_fit_length(samples, trace_spec.samples, FITS.index(trace_spec.fit)):
-        n = trace_spec.samples
-        wanted = f"at least {n}" if trace_spec.fit == "cut" else f"{-(-n // 2)} to {2 * n}"
+    fit = FITS.index(trace_spec.fit)
+    if not can_fit_length(samples, n, fit):
+        rate = trace_spec.rate_hz
+        form = f"{n} samples" if rate is None else f"{rate:g} Hz x {n / rate:g} s"
+        new = f"TraceSpec(samples={n}, fit='pad')"
+        to_half = f"{-(-n // 2)} to {2 * n}"
+        wanted = (f"{n}", f"at least {n}", to_half, to_half)[fit]
         do = f"{trace_spec.fit} fits no other length: record a whole insertion, and nothing else"
+        if trace_spec.fit == "strict":
+            do = f"resample the trace to {form}, or start a new store with {new}"
         raise TraceError(f"Expected {wanted} samples, got {samples}; {do}.")
-    tensor = torch.from_numpy(np.array(x, order="C"))
-    return np.asarray(fit_length(tensor, trace_spec.samples, FITS.index(trace_spec.fit)))
+    return np.asarray(fit_length(torch.from_numpy(np.array(x, order="C")), n, fit))
 
 
 # Of `clip_extremes`.

@@ -376,9 +376,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return cls(
                     store=opened, **fill_from_peers(settings | {"seed": seed}, opened, allowed)
                 )
-            names = ("model", "executor", "replaying", "clock", "on_safe_mode")
+            names = ("model", "trace", "executor", "replaying", "clock", "on_safe_mode")
             options = {name: settings.pop(name) for name in names if name in settings}
-            options["trace"] = settings.get("trace")
             recipe = settings.get("recipe")
             reducer = settings.get("reducer")
             if reducer is None and isinstance(recipe, Recipe):
