@@ -90,13 +90,6 @@ class Peers:
             self._outbox.call_store(lambda: self._outbox.check_integrity(since=newest))
         return news, has_newer_version
 
-    def fetch_version(self) -> ModelVersion | None:
-        """Return the newest version of the product with its state; None before the first.
-
-        Raises StoreError where the store gives no answer in time.
-        """
-        return self._outbox.call_store(self._outbox.store.last_version)
-
     def note_loss(self, error: StoreError) -> None:
         """Note that news cannot be had: set `is_lost`, and ask again after `NEWS_SECONDS`.
 

@@ -544,7 +544,7 @@ class Learner:
             news, has_newer_version = peers.fetch_news()
             if has_newer_version:
                 self.store_labels()  # the peers' version is to have them among its references
-                version = peers.fetch_version()
+                version = self._outbox.call_store(self._store.last_version)
         except StoreError as error:
             peers.note_loss(error)
             return 0

@@ -116,11 +116,6 @@ def newest_reference(version: ModelVersion) -> int:
     return int(version.state["trained_on"][-1])
 
 
-def newest_correction(version: ModelVersion) -> int:
-    """Return the number of the newest correction that a stored version has; 0 if none."""
-    return int(version.state.get("corrected_to", 0))
-
-
 def add_labels_since(
     model: EngineModel, store: SqlStore, version: ModelVersion, window: TrainingWindow
 ) -> int:
@@ -132,7 +127,7 @@ def add_labels_since(
     label that the model cannot take is logged and skipped. Returns the number of the newest
     correction in the store. Raises StoreError where the store cannot be read.
     """
-    corrected_to = newest_correction(version)
+    corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
     # model gets it as it was when the version was stored, and then the corrections.
     as_of = corrected_to if model.keeps_references else None

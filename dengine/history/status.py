@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 
 PAGE_SIZE = 500  # decisions read at a time
 MAX_LAST = 10**9  # decisions that can be asked for
+Counts = dict[str, int]  # by name
 NEWEST = 500  # decisions that `Status.newest` counts
 MAX_DROPPED = 3  # dropped retrains in a row that are an alarm: the first may lack labels
 N_EVENTS = 5  # newest events that a status shows
@@ -146,7 +147,7 @@ class Span:
     bad_accepts: ErrorEstimate
     unlabelled: int
     retrains: int
-    dropped: dict[str, int]
+    dropped: Counts
     verified_share: float | None
     novel_share: float | None
 
@@ -233,10 +234,10 @@ class Status:
     newest: Span
     ever: Span
     unreported: int
-    actions: dict[str, int]
-    reasons: dict[str, int]
+    actions: Counts
+    reasons: Counts
     labels: int
-    sources: dict[str, int]
+    sources: Counts
     corrected: int
     forgotten: int
     certificate: Certificate
