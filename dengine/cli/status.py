@@ -22,7 +22,7 @@ from .output import (
 )
 
 if TYPE_CHECKING:
-    from ..history.status import Counts, ErrorEstimate, Span, Status
+    from ..history.status import ErrorEstimate, Span, Status
 
 VERDICTS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
 # In shadow mode every part is verified: those are no audits, though they share the reason.
@@ -140,7 +140,7 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     return rows
 
 
-def _without_audits(counts: Counts) -> Counts:
+def _without_audits(counts: dict[str, int]) -> dict[str, int]:
     """Return counts with the key "audit" renamed to "certain but checked".
 
     For a policy without audits: what has that reason was verified in shadow mode.
