@@ -19,7 +19,6 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from enum import Enum
-from functools import reduce
 from types import BuiltinFunctionType, FunctionType
 from typing import Any, Self
 
@@ -39,12 +38,13 @@ from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
 from ..decision.rule import DecisionRule
 from ..decision.scripting import (
-    INTERNAL,
     arrays_with_prefix,
+    attributes_of,
+    has_tensor,
     incompatible_model_error,
+    module_state,
     restore,
     script,
-    tensor_attributes,
 )
 from ..errors import ExportError, StoreError, expect, listed
 from ..folds import content_hash, fold_of
@@ -185,24 +185,11 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     `compiled` sets. The classes themselves are part of it, not their names: a notebook cell that is
     run again defines another class.
     """
-    modules = eager.named_modules(remove_duplicate=False)
-    return tuple((name, *_own_structure(module)) for name, module in modules)
-
-
-def _own_structure(module: nn.Module) -> tuple[Any, ...]:
-    """Return the class, the compiled attributes and the tensors' shapes of one module, as a tuple.
-
-    Submodules are left out. Attributes are (name, key) by name, tensors (name, shape); the shapes
-    in a `ForceLimitsGate` are None, because limits may change in number.
-    """
-    attributes = sorted(
-        (name, _as_key(value)) for name, value in vars(module).items() if name not in INTERNAL
+    return tuple(
+        (path, type(module), _as_key(attributes_of(module)))
+        for path, module in eager.named_modules(remove_duplicate=False)
+        if not isinstance(module, ForceLimitsGate)  # limits may change in number
     )
-    # Force limits may change in number without a new module.
-    is_limits = isinstance(module, ForceLimitsGate)
-    tensors = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
-    shapes = [(name, None if is_limits else tuple(tensor.shape)) for name, tensor in tensors]
-    return (type(module), *attributes, *shapes)
 
 
 def _as_key(value: object) -> object:
@@ -218,7 +205,7 @@ def _as_key(value: object) -> object:
     if isinstance(value, list | tuple):
         return (type(value), *map(_as_key, value))
     if isinstance(value, dict):
-        return tuple((repr(key), _as_key(item)) for key, item in value.items())
+        return tuple(sorted((repr(key), _as_key(item)) for key, item in value.items()))
     return repr(value) if isinstance(value, CONSTANTS) else None
 
 
@@ -245,9 +232,11 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     up on a trace of `warm_up_shape` (C, T), see `template_of`.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
-    for name, value in tensor_attributes(eager):
-        *path, leaf = name.split(".")
-        setattr(reduce(getattr, path, module), leaf, value)
+    submodules = dict(module.named_modules(remove_duplicate=False))
+    for path, submodule in eager.named_modules(remove_duplicate=False):
+        for name, value in attributes_of(submodule).items():
+            if has_tensor(value):
+                setattr(submodules[path], name, value)
     return module
 
 
@@ -819,8 +808,6 @@ class ModelPrediction(EngineModel):
             return "the embedding of a reference is not finite"
         points = self.spaces.embed(self.examples)
         self._example_points = points / self.scale[:, None]
-        some = self.examples[:: N_EXAMPLES // 4]  # four, since each takes a decision's time
-        expected = self.spaces.embed(some)
         state = self.spaces.get_state()
         for _ in range(N_CHECKS):
             restored = self.spaces
@@ -829,7 +816,7 @@ class ModelPrediction(EngineModel):
                     restored = as_reducer(clone(self.reducer), self.folds).set_state(state)
             except StoreError:  # of the test trace, whose points `set_state` compares
                 return NOT_RESTORED
-            if not is_close(restored.embed(some), expected, SAME_BATCH):
+            if not is_close(restored.embed(self.examples), points, SAME_BATCH):
                 return NOT_RESTORED
         return ""
 
@@ -854,9 +841,9 @@ class ModelPrediction(EngineModel):
         if self.rule_is_stale:
             state["rule_is_stale"] = np.array(True)  # an engine that opens the store rebuilds it
         else:
-            state |= _module_state(self.rule, "rule.")
+            state |= module_state(self.rule, "rule.")
         if not self.gate.disabled:
-            state |= _module_state(self.gate, "novelty.")
+            state |= module_state(self.gate, "novelty.")
         reducer_state = self.spaces.get_state() or {}
         return state | {f"reducer.{name}": values for name, values in reducer_state.items()}
 
@@ -904,13 +891,6 @@ class ModelPrediction(EngineModel):
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
         return self.__dict__ | {"_decider": None}
-
-
-def _module_state(module: nn.Module, prefix: str) -> State:
-    """Return copies of a module's tensors as arrays, by their names behind the prefix."""
-    return {
-        f"{prefix}{name}": tensor.numpy().copy() for name, tensor in module.state_dict().items()
-    }
 
 
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:

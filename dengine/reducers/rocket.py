@@ -37,7 +37,7 @@ from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
-from ..decision.scripting import arrays_with_prefix, restore
+from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import expect
 from ..records import is_whole
 from .base import (
@@ -676,9 +676,7 @@ class RocketReducer(Reducer):
         }
         for i, tower in enumerate(self.towers_):
             state |= {f"{name}.{i}": value.numpy() for name, value in tower._asdict().items()}
-        for name, value in self.net_.state_dict().items():
-            state[f"net.{name}"] = value.numpy().copy()
-        return state
+        return state | module_state(self.net_, "net.")
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.

@@ -39,10 +39,9 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from ..decision.scripting import (
     arrays_with_prefix,
     incompatible_model_error,
-    plain_tensors,
+    module_state,
     reason_of,
     restore,
-    restore_plain_tensors,
     script,
 )
 from ..errors import SettingError, expect
@@ -439,13 +438,12 @@ class TorchReducer(Reducer):
 
         As `torch.optim.swa_utils.update_bn`, from preprocessed traces x (n, C', L): at most 256 of
         them, drawn at random but the same for the same n. No label is read, so each member may see
-        all folds. Other buffers, and tensors that are plain attributes, are copied from the trained
-        members. The averaged members are in evaluation mode afterwards.
+        all folds. Other buffers are copied from the trained members. The averaged members are in
+        evaluation mode afterwards.
         """
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
             buffer.copy_(trained)
-        restore_plain_tensors(members, plain_tensors(self.members_))
         norms = [module for module in members.modules() if isinstance(module, _BatchNorm)]
         for norm in norms:
             norm.reset_running_stats()
@@ -540,8 +538,7 @@ class TorchReducer(Reducer):
 
         They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
         optimiser, so that training can go on, and the points of a test trace, by which `set_state`
-        recognises the network. Tensors of the network that are in no state dict come after
-        "plain.". Raises NotFittedError before a fit.
+        recognises the network. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
@@ -552,18 +549,11 @@ class TorchReducer(Reducer):
             "loss": np.array(self.loss_),
             "points": self._embed_ramp(),
         }
-        tensors: dict[str, Mapping[str, Tensor]] = {
-            "preprocessor": self.preprocessor_.state_dict(),
-            "members": self.members_.state_dict(),
-            "averaged": self.averaged_members_.state_dict(),
-            "plain.members": plain_tensors(self.members_),
-            "plain.averaged": plain_tensors(self.averaged_members_),
-        }
+        for name, module in self._modules().items():
+            state |= module_state(module, name)
         for i, moments in self.optimizer_state_.items():
-            tensors[f"optimizer.{i}"] = moments
-        for prefix, named in tensors.items():
-            for name, value in named.items():
-                state[f"{prefix}.{name}"] = value.detach().numpy().copy()
+            for name, value in moments.items():
+                state[f"optimizer.{i}.{name}"] = value.numpy().copy()
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
@@ -582,12 +572,9 @@ class TorchReducer(Reducer):
         self.n_steps_left_ = n_steps_left
         self.n_new_steps_ = n_new_steps
         self.loss_ = float(state["loss"])
-        restore(self.preprocessor_, arrays_with_prefix(state, "preprocessor."))
-        for name, members in (("members", self.members_), ("averaged", self.averaged_members_)):
-            restore(members, arrays_with_prefix(state, f"{name}."))
-            plain = arrays_with_prefix(state, f"plain.{name}.")
-            tensors = {key: torch.from_numpy(np.array(value)) for key, value in plain.items()}
-            restore_plain_tensors(members, tensors)
+        for name, module in self._modules().items():
+            # A state of an earlier release lacks buffers that are not persistent.
+            restore(module, module_state(module, "") | arrays_with_prefix(state, name))
         for name, value in arrays_with_prefix(state, "optimizer.").items():
             i, key = name.split(".")
             moments = self.optimizer_state_.setdefault(int(i), {})
@@ -598,6 +585,14 @@ class TorchReducer(Reducer):
         if points is not None and not np.allclose(points, self._embed_ramp(), atol=SAME_POINTS):
             raise incompatible_model_error("network has the same sizes and is another one")
         return self
+
+    def _modules(self) -> dict[str, nn.Module]:
+        """Return the modules whose tensors are the state, by the prefix of their names there."""
+        return {
+            "preprocessor.": self.preprocessor_,
+            "members.": self.members_,
+            "averaged.": self.averaged_members_,
+        }
 
     @torch.inference_mode()
     def _embed_ramp(self) -> Floats:

@@ -35,7 +35,7 @@ from scipy.sparse import csr_matrix
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
-from ..decision.scripting import arrays_with_prefix, restore
+from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import SettingError, expect
 from ..records import is_number, is_whole
 from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, seed_of
@@ -461,7 +461,7 @@ class UmapReducer(Reducer):
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]
         counts += [self.n_epochs_, self.n_steps_, self.n_new_steps_]
-        state = {
+        return module_state(self.make_frames_, "frames.") | {
             "shape": np.array(self.trace_shape_),
             "counts": np.array(counts),
             "numbers": self.neighbors_.numbers,
@@ -470,9 +470,6 @@ class UmapReducer(Reducer):
             "distances": self.neighbors_.distances.numpy(),
             "embedding": self.embedding_.numpy(),
         }
-        for name, value in self.make_frames_.state_dict().items():
-            state[f"frames.{name}"] = value.numpy().copy()
-        return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
