@@ -47,10 +47,10 @@ from .base import (
     Reducer,
     StopRule,
     binary_labels,
+    check_classes,
     folds_of,
     points_in_fold_space,
     seed_of,
-    single_class_error,
 )
 from .logistic_heads import fit_heads, masked_loss
 from .preprocessing import averaging
@@ -732,17 +732,6 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints:
     values = np.arange(n) if numbers is None else numbers
     hashes = values.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.sort(np.argpartition(hashes, MAX_TRAINING_TRACES)[:MAX_TRAINING_TRACES])
-
-
-def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
-    """Raise SettingError unless the labels (n,) within each mask have both classes.
-
-    The masks are the rows of a bool array (K, n), one for each head.
-    """
-    for k, mask in enumerate(masks):
-        n_classes = len(np.unique(labels[mask]))
-        if n_classes < 2:
-            raise single_class_error(k, int(mask.sum()), n_classes)
 
 
 def apply_in_chunks(function: Callable[[Tensor], Tensor], x: Tensor, size: int = CHUNK) -> Tensor:

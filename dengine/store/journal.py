@@ -107,7 +107,7 @@ class Head:
         When it was written, in seconds since 1970.
     """
 
-    newest: tuple[int, str] | None
+    newest: tuple[int, str] | None = None
     n_drained: int = 0
     n_synced: int = 0
     digest: str = ""
@@ -159,7 +159,7 @@ class Journal:
         self.dropped = 0
         self.loss = ""
         self.newest_entry: tuple[int, str] | None = None
-        self.head = _read_head(path) or Head(None)
+        self.head = _read_head(path)
         self.n_drained = 0
         self._n_synced = 0
         self._time = 0.0
@@ -300,10 +300,10 @@ class Journal:
     def clear(self) -> None:
         """Remove all records, drained or not; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, which frees the reserved space: call `reserve`
-        afterwards, and also before, so that no disk keeps the cut without the header. Raise
+        The file is cut off behind its header, and space is reserved and synced again. Raise
         StoreError if the file cannot be written.
         """
+        self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):
             self._file.truncate(HEADER)
             self.drained_to = HEADER
@@ -311,6 +311,7 @@ class Journal:
             self.end = HEADER
             self._digest = bytes(16)
             self._file.write(self._header(), 0)
+        self.reserve()
 
     def reserve(self) -> None:
         """Reserve disk space for at least RESERVE bytes of records, and sync that.
@@ -392,12 +393,9 @@ class Journal:
                 self.n_drained = fields["n_drained"]
             except DAMAGES:  # all of it is drained again, which is harmless
                 damaged = 1
-                head = Head(None)
+                head = Head()
         self.end = max(self._file.size, HEADER)
         self.drained_to = min(max(self.drained_to, HEADER), self.end)
-        # Behind the record that the head names nothing was acknowledged.
-        newest = bytes.fromhex(head.digest)
-        is_acknowledged = not newest or head.n_synced > self.n_drained
         # The first record's digest is not checked: those before it may be gone.
         previous: bytes | None = None
         begin = self.drained_to
@@ -405,8 +403,7 @@ class Journal:
         for offset, end, record in self.undrained_records():
             digest: bytes = FRAME.unpack(self._file.read(FRAME.size, offset))[3]
             follows = previous is None or digest == _chain_digest(previous, record)
-            damaged += is_acknowledged and (offset > begin or not follows)
-            is_acknowledged &= digest != newest
+            damaged += offset > begin or not follows
             digests.add(digest)
             previous = digest
             begin = end
@@ -416,7 +413,9 @@ class Journal:
         self._digest = previous or bytes(16)
         n_known = self.n_drained + len(digests)
         self._n_synced = max(head.n_synced, n_known)
-        if head.n_synced > self.n_drained and (n_known < head.n_synced or newest not in digests):
+        if head.n_synced > self.n_drained and (
+            n_known < head.n_synced or bytes.fromhex(head.digest) not in digests
+        ):
             self.loss = (
                 f"{max(1, head.n_synced - n_known)} records (decisions, labels or events) are "
                 "missing from the journal, though they were on disk; the newest is of "
@@ -526,7 +525,7 @@ def read_newest_entries(path: Path) -> set[tuple[int, str]]:
 
     They are none, one or two; a file that is missing or damaged names none.
     """
-    entries = {(_read_head(path) or Head(None)).newest}
+    entries = {_read_head(path).newest}
     with suppress(OSError, *DAMAGES), path.open("rb") as file:
         entries.add(_parse_header(file.read(HEADER))["newest"])
     return {entry for entry in entries if entry is not None}
@@ -554,11 +553,11 @@ def read_undrained(path: Path) -> tuple[list[Record], str]:
     return newest, journal.loss
 
 
-def _read_head(journal: Path) -> Head | None:
-    """Return the content of the head beside a journal; None if it is missing or damaged."""
+def _read_head(journal: Path) -> Head:
+    """Return the content of the head beside a journal; an empty one if it is missing or damaged."""
     with suppress(OSError, *DAMAGES):
         return Head(**_unpack_fields(head_path(journal).read_bytes()))
-    return None
+    return Head()
 
 
 def _parse_header(header: bytes) -> dict[str, Any]:

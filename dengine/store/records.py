@@ -132,26 +132,21 @@ def as_text(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
 
 
-def check_state(
-    report: RetrainReport, state: Mapping[str, NDArray[Any]] | None
-) -> dict[str, NDArray[Any]] | None:
-    """Return a copy of a version's arrays, by name; None for a dropped candidate without arrays.
+def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> None:
+    """Raise StoreError for an accepted version without arrays, and for one of Python objects.
 
-    Raises StoreError for an accepted version without arrays, and for an array of Python objects,
-    which would need a pickle.
+    These would need a pickle. The arrays of a dropped candidate, by name, may be None.
     """
     if state is None and report.accepted:
         raise StoreError(
             f"Expected the arrays of accepted version {report.version}, got None; pass its state."
         )
-    copies = None if state is None else {name: np.array(values) for name, values in state.items()}
-    for name, values in (copies or {}).items():
+    for name, values in (state or {}).items():
         if values.dtype.hasobject:
             raise StoreError(
                 f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers "
                 "or strings."
             )
-    return copies
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,14 +16,14 @@ import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from ..errors import StoreError, expect, instead, listed, shortened
+from ..errors import StoreError, expect, instead, listed
 from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
@@ -96,8 +96,6 @@ log = logging.getLogger("dengine")
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 # Of the environment: seconds for all stores that are given none.
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"
-# For a store in memory, about 0.5 MB each; a replay of 1,503 parts has fewer.
-MAX_UNWRITTEN_VERSIONS = 40
 
 
 class SqlStore(AbstractContextManager["SqlStore"]):
@@ -177,7 +175,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.before_use: Callable[[], None] = self._write_memory
         # Of a store in memory: what was given and is written to the database when it is first read.
         self._unwritten: list[Record] = []
-        self._unwritten_versions: list[tuple[Any, ...]] = []
         self._has_label: dict[str, bool] = {}  # of every decision, by id
         self._newest_label = 0
         self.database = Database(
@@ -405,9 +402,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         or not as they were stored; these are left out. Raise StoreError if traces have different
         shapes, or a label is not 0 or 1.
         """
-        positions = {row.seq: i for i, row in enumerate(rows)}  # the forgotten are not among them
-        traces = np.zeros((0, 0, 0), dtype=np.float32)
-        is_kept = np.zeros(len(rows), dtype=bool)
+        labels = {row.seq: row for row in rows}  # the forgotten are not among them
+        traces: dict[int, NDArray[np.float32]] = {}
         is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
             TRACE.c.decision_id == LABEL.c.decision_id
         )
@@ -418,32 +414,27 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         names = TRACE.c.keys()
         for *values, seq in connection.execute(query.execution_options(yield_per=CHUNK)):
             row = dict(zip(names, values, strict=True))
-            if seq not in positions or not is_intact(TRACE.name, row):
-                continue
-            shape = row["channels"], row["samples"]
-            if not len(traces):
-                traces = np.empty((len(rows), *shape), dtype=np.float32)
-            if shape != traces.shape[1:]:
-                shapes = sorted({traces.shape[1:], shape})
-                raise StoreError(
-                    f"Expected one shape in a cell's store, found {shapes}; give each kind its "
-                    "own cell_id."
-                )
-            traces[positions[seq]] = unpack(row["data"]).reshape(shape)
-            is_kept[positions[seq]] = True
-        labels = [row.success for row in rows]
-        if not all(label in (0, 1) for label in labels):
+            if seq in labels and is_intact(TRACE.name, row):
+                traces[seq] = unpack(row["data"]).reshape(row["channels"], row["samples"])
+        shapes = sorted({trace.shape for trace in traces.values()})
+        if len(shapes) > 1:
+            raise StoreError(
+                f"Expected one shape in a cell's store, found {shapes}; give each kind its own "
+                "cell_id."
+            )
+        if not all(row.success in (0, 1) for row in rows):
             raise StoreError(
                 "Expected labels that are True or False, found another: the store is damaged; "
                 "restore a copy."
             )
+        kept = [labels[seq] for seq in traces]
         labelled = LabelledTraces(
-            seq=np.array([row.seq for row in rows], dtype=np.int64)[is_kept],
-            traces=traces if is_kept.all() else traces[is_kept[: len(traces)]],
-            labels=np.array(labels, dtype=np.int8)[is_kept],
-            hashes=np.array([row.content_hash for row in rows], dtype=np.int64)[is_kept],
+            seq=np.array([row.seq for row in kept], dtype=np.int64),
+            traces=np.stack([*traces.values()]) if traces else np.zeros((0, 0, 0), np.float32),
+            labels=np.array([row.success for row in kept], dtype=np.int8),
+            hashes=np.array([row.content_hash for row in kept], dtype=np.int64),
         )
-        return labelled, [rows[i].decision_id for i in np.flatnonzero(~is_kept)]
+        return labelled, [row.decision_id for row in rows if row.seq not in traces]
 
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
         """Record as damage that the trace or label of some decisions was left out.
@@ -665,16 +656,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ) -> int:
         """Commit a retrain, and delete the states of older versions that are no longer kept.
 
-        A store in memory without a product keeps the copied arrays, and writes them when it is next
-        read, or when 40 retrains wait.
-
         Parameters
         ----------
         report : RetrainReport
         last_seq : int
             Number of the newest label that the retrain knew of.
         state : mapping of str to array, or None
-            The version's arrays, which are copied; None for a dropped candidate.
+            The version's arrays; None for a dropped candidate.
 
         Returns
         -------
@@ -688,31 +676,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             For an accepted version without arrays, for an array of Python objects, and if the
             database fails.
         """
-        arguments = report, last_seq, check_state(report, state), float(self.clock())
-        if self.wait is None and self.product is None:
-            self._unwritten_versions.append(arguments)
-            if len(self._unwritten_versions) == MAX_UNWRITTEN_VERSIONS:
-                self._write_versions()
-            return report.version
-        return self._commit_version(*arguments)
-
-    def _commit_version(self, *arguments: Any) -> int:
-        """Commit the row of a retrain and delete stored states that are no longer kept.
-
-        The arguments are report, last_seq, state and now, as of `_version_row`. Return the
-        version's number, which is higher than the one given if a peer has taken that.
-        """
-        row = self._version_row(*arguments)
+        row = self._version_row(report, last_seq, state, float(self.clock()))
         return self.database.write(
             lambda connection: self._insert_version(connection, row), flush_first=False
         )
-
-    def _write_versions(self) -> None:
-        """Write the versions that a store in memory was given, and has not written yet."""
-        unwritten = self._unwritten_versions
-        self._unwritten_versions = []
-        for arguments in unwritten:
-            self._commit_version(*arguments)
 
     def _version_row(
         self,
@@ -726,8 +693,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
         an accepted version without arrays, and for an array of Python objects.
         """
-        arrays = check_state(report, state)
-        blob = None if arrays is None else to_npz(arrays)
+        check_state(report, state)
+        blob = None if state is None else to_npz(state)
         return {
             "time": now,
             "last_seq": int(last_seq),
@@ -1284,12 +1251,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return numbers
 
     def _write_memory(self) -> None:
-        """Write the versions and records that a store in memory was given to its database.
+        """Write the records that a store in memory was given to its database.
 
         It is called before every read and most writes; a replay, which reads nothing, never calls
         it.
         """
-        self._write_versions()
         unwritten = self._unwritten
         self._unwritten = []
         for part in chunks(unwritten):
@@ -1311,17 +1277,10 @@ def _checked_wait(wait: float | None) -> float:
 
     It is the argument, else the environment's DENGINE_STORE_WAIT, else 0.4.
     """
-    text = os.environ.get(WAIT_VARIABLE) if wait is None else None
-    name = "a wait" if text is None else WAIT_VARIABLE
-    seconds = WAIT if wait is None else wait
-    try:
-        if text:
-            seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0.0 < seconds < math.inf:
-        raise StoreError(
-            f"Expected {name} above 0 seconds, got {shortened(text or wait)}; {WAIT} is the "
-            "default."
-        )
+    value = (os.environ.get(WAIT_VARIABLE) or WAIT) if wait is None else wait
+    seconds = math.nan
+    with suppress(ValueError):
+        seconds = float(value)
+    wanted = f"{WAIT_VARIABLE if wait is None else 'a wait'} above 0 seconds"
+    expect(0.0 < seconds < math.inf, wanted, value, f"{WAIT} is the default", StoreError)
     return seconds

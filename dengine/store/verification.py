@@ -223,8 +223,7 @@ def _inspect_journal(path: Path) -> tuple[int | None, str]:
     with suppress(StoreError):  # it is damaged, or another user's
         if path.exists():
             records, loss = read_undrained(path)
-            # Read again, since a running engine may have emptied it meanwhile.
-            return len(records), loss and read_undrained(path)[1]
+            return len(records), loss
     return None, ""
 
 
