@@ -85,8 +85,9 @@ def register_tensors(module: nn.Module) -> None:
     in a list, tuple or dict stay as they are.
     """
     for submodule in module.modules():
-        for name, value in (vars(submodule) | dict(submodule.named_buffers(recurse=False))).items():
-            if isinstance(value, Tensor) and not hasattr(type(submodule), name):
+        for name, value in attributes_of(submodule).items():
+            is_tensor = isinstance(value, Tensor) and not isinstance(value, nn.Parameter)
+            if is_tensor and not hasattr(type(submodule), name):
                 vars(submodule).pop(name, None)
                 submodule.register_buffer(name, value.contiguous())
 

@@ -581,18 +581,6 @@ class ModelPrediction(EngineModel):
         """The `Predictor` in the decider; ValueError if nothing was fitted."""
         return self.decider(self._conditions).predictor
 
-    def decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Return the decider for these conditions, and keep it.
-
-        It is built anew if none is kept, or if the kept one is for other conditions. None stands
-        for no force limits, no sensor limit and no audits. Raises ValueError if nothing was fitted.
-        """
-        is_same = conditions is self._conditions or conditions == self._conditions
-        if self._decider is None or not is_same:
-            self._decider = self.build_decider(conditions)
-            self._conditions = conditions
-        return self._decider
-
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
         """Make one labelled trace, shape (samples,) or (channels, samples), a reference.
 
@@ -623,22 +611,14 @@ class ModelPrediction(EngineModel):
         Returns the point, float32 (d,), scaled.
         """
         if point is None:
-            point = self._reference_point(x, hash_, embedding)
+            if embedding is None:
+                with torch.inference_mode():
+                    embedding = self.predictor.embed(torch.from_numpy(x)).numpy()
+            point = np.array(embedding[self._fold(hash_)], dtype=np.float32)
         self.index.add_one(
             torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number
         )
         return point
-
-    def _reference_point(self, x: Floats, hash_: int, embedding: Embedding | None) -> Floats:
-        """Return the scaled point of a trace (C, T) in the space of its fold, float32 (d,).
-
-        It is taken from `embedding` (K, d), which is scaled already, or computed where that is
-        None.
-        """
-        if embedding is not None:
-            return np.array(embedding[self._fold(hash_)], dtype=np.float32)
-        with torch.inference_mode():
-            return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
 
     def renumber_reference(self, old: int, new: int) -> None:
         self.index.renumber(old, new)

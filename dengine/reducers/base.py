@@ -495,6 +495,12 @@ def seed_of(random_state: Any) -> int | None:
     )
 
 
+def draw_seed(random_state: Any) -> int:
+    """Return the seed of a `random_state`, a random one for None."""
+    seed = seed_of(random_state)
+    return int(np.random.default_rng().integers(2**31)) if seed is None else seed
+
+
 def uses_labels(transformer: Any) -> bool:
     """Return whether a transformer's `fit` needs labels, by its tag `target_tags.required`."""
     return bool(get_tags(transformer).target_tags.required)

@@ -54,8 +54,8 @@ from .base import (
     Reducer,
     StopRule,
     binary_labels,
+    draw_seed,
     folds_of,
-    seed_of,
 )
 from .checkpoints import load_checkpoint
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
@@ -612,23 +612,21 @@ class TorchReducer(Reducer):
         negative.
         """
         expect(self.n_components in (1, 2), "n_components 1 or 2", self.n_components)
-        expect(is_whole(self.folds, 2, 1000), "folds >= 2 where labels are used", self.folds)
-        expect(is_whole(self.steps, 1, 10**6), "steps >= 1, an integer", self.steps)
-        expect(is_whole(self.fit_steps, 1, 10**6), "fit_steps >= 1, an integer", self.fit_steps)
-        expect(is_whole(self.batch_size, 2, 10**6), "batch_size >= 2, an integer", self.batch_size)
-        expect(is_whole(self.shift, 0, 10**6), "shift >= 0 frames, an integer", self.shift)
-        not_negative = "weight_decay", "gain", "noise", "mixup"
-        for name in ("learning_rate", "weight_averaging", *not_negative):
+        smallest = {"folds": 2, "steps": 1, "fit_steps": 1, "batch_size": 2, "shift": 0}
+        for name, least in smallest.items():
             value = getattr(self, name)
-            expect(is_number(value), f"{name}, a number", value)
+            expect(is_whole(value, least, 10**6), f"{name} >= {least}, an integer", value)
+        expect(self.folds <= 1000, "folds <= 1000", self.folds)
+        not_negative = "learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"
+        for name in not_negative:
+            value = getattr(self, name)
+            is_valid = is_number(value) and 0.0 <= value < float("inf")
+            expect(is_valid, f"{name} >= 0, a number", value)
         expect(self.learning_rate > 0.0, "learning_rate > 0", self.learning_rate)
         is_path = isinstance(self.checkpoint, str | PathLike)
         expect(is_path, 'checkpoint, the name of a file, or ""', self.checkpoint)
-        is_share = 0.0 <= self.weight_averaging < 1.0
+        is_share = self.weight_averaging < 1.0
         expect(is_share, "weight_averaging from 0 to below 1", self.weight_averaging)
-        for name in not_negative:
-            value = getattr(self, name)
-            expect(0.0 <= value < float("inf"), f"{name} >= 0", value)
 
 
 def draw_batches(
@@ -681,12 +679,6 @@ def warm_optimizer() -> None:
     weight = nn.Parameter(torch.zeros(1))
     weight.grad = torch.zeros(1)
     torch.optim.AdamW([weight], fused=True).step()
-
-
-def draw_seed(random_state: Any) -> int:
-    """Return the seed of a `random_state`, a random one for None."""
-    seed = seed_of(random_state)
-    return int(np.random.default_rng().integers(2**31)) if seed is None else seed
 
 
 def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:

@@ -38,7 +38,7 @@ from torch import Tensor, nn
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import SettingError, expect
 from ..records import is_number, is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, seed_of
+from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, draw_seed
 from .umap_graph import (
     CHUNK,
     Frames,
@@ -331,8 +331,7 @@ class UmapReducer(Reducer):
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
         self.make_frames_.learn(torch.from_numpy(sample))
-        seed = seed_of(self.random_state)
-        self.seed_ = int(np.random.default_rng().integers(2**31)) if seed is None else seed
+        self.seed_ = draw_seed(self.random_state)
         n_features = self.make_frames_.n_features
         self.neighbors_ = Neighbors.empty(n_features, self.n_neighbors - 1)
         self.precomputed_neighbors_ = None

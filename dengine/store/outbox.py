@@ -256,18 +256,15 @@ class Outbox:
         and the journal is set to be drained from its beginning. An event is also stored if the
         journal or its head is new though the store is not.
         """
-        entries = [
-            entry for entry in (journal.newest_entry, journal.head.newest) if entry is not None
-        ]
         database = self.store.database
-        if missing := [entry for entry in entries if not database.has_entry(*entry)]:
+        if missing := [entry for entry in journal.entries if not database.has_entry(*entry)]:
             self._log_event(
                 DATA_LOST,
                 f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: the "
                 "store was cut off, or restored from a copy; labels may be missing.",
             )
             journal.drained_to = HEADER  # the journal may still hold some of them
-        elif len(entries) < 2 and database.newest_entry is not None:
+        elif len(journal.entries) < 2 and database.newest_entry is not None:
             self._log_event(
                 "journal",
                 f"the journal {journal.path}, or its head beside it, is new here, and the store is "
@@ -982,7 +979,7 @@ class Outbox:
             )
         with self._changed:
             journal.drained_to = chunk[-1][1]
-            journal.n_drained += len(chunk)
+            journal.head.n_drained += len(chunk)
             self._save_newest_entry()
             self._remove_drained(records, numbers)
             for _ in chunk:

@@ -125,7 +125,7 @@ def list_cells(url: str) -> list[CellSummary]:
         settings = connection.execute(sa.select(*SETTING.c["cell_id", "key", "value"])).all()
         decisions = _count_by_cell(connection, DECISION)
         labels = _count_by_cell(connection, LABEL)
-        versions: dict[str, int] = dict(connection.execute(accepted).tuples())
+        versions = {row[0]: row[1] for row in connection.execute(accepted)}
     products = {cell_id: value for cell_id, key, value in settings if key == PRODUCT_KEY}
     summaries = []
     for name in sorted({row.cell_id for row in settings}):

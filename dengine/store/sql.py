@@ -30,10 +30,12 @@ from .journal import Journal, Record, journal_path
 from .ledger import is_intact, read_settings, state_sum
 from .peers import check_peer_settings
 from .queries import (
+    CORRECTION_OF_LABEL,
     LABEL_OF_DECISION,
     SOURCE,
     SUCCESS,
     TRACE_OF_DECISION,
+    TRAINS,
     WITH_LABELS,
     Scope,
     audit_columns,
@@ -408,7 +410,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             TRACE.c.decision_id == LABEL.c.decision_id
         )
         query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, is_of_label))
-        query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
+        query = query.where(scope.shared(LABEL.c.cell_id), TRAINS)
         first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
         query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
         names = TRACE.c.keys()
@@ -489,7 +491,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = sa.select(*fields, known_overdue).select_from(
             LABEL.join(DECISION, LABEL_OF_DECISION)
         )
-        query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.quarantined == sa.false())
+        query = query.where(LABEL.c.cell_id == self.cell_id, TRAINS)
         query = query.where(LABEL.c.seq > int(seq), LABEL.c.source != Source.INSPECTION.value)
         query = query.where(label != FORGOTTEN, DECISION.c.model_version >= since_version)
         rows = self._read(query.order_by(LABEL.c.seq))
@@ -609,10 +611,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             The sum of `silent`; labels of quarantined traces are left out.
         """
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
-        is_counted = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
-        return int(
-            self._read(query.where(is_counted, LABEL.c.model_version >= since_version))[0][0]
-        )
+        query = query.where(LABEL.c.cell_id == self.cell_id, TRAINS)
+        return int(self._read(query.where(LABEL.c.model_version >= since_version))[0][0])
 
     def status(self, tally: Tally | None = None) -> dict[str, Any]:
         """Return counts of all decisions and labels of the cell.
@@ -957,11 +957,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         def add_rows(connection: sa.Connection) -> int:
             """Insert the event and everything that it changes; return the event's number."""
-            (number,) = self.database.insert(connection, EVENT.c.number, [to_row(event)])
-            if change.decisions:
-                self._correct_labels(
-                    connection, change, {"author": author, "event": number, "time": now}
-                )
+            labels = self._labels_to_correct(connection, change.decisions)
+            number = self.database.insert_corrections(connection, event, change.success, labels)
             if version is not None:
                 stored = self._insert_version(connection, version)
                 if stored != version["version"]:
@@ -976,25 +973,21 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         return self.database.write(add_rows)
 
-    def _correct_labels(
-        self, connection: sa.Connection, change: Change, event: Mapping[str, Any]
-    ) -> None:
-        """Insert a correction for each decision of a change.
+    def _labels_to_correct(
+        self, connection: sa.Connection, ids: Sequence[str]
+    ) -> dict[str, bool | None]:
+        """Return the present label of each of these decisions; None if it was forgotten.
 
-        `event` has the columns that they share: author, event and time. Raise ReportError for a
-        decision that is unknown or has no label.
+        Raise ReportError for a decision that is unknown or has no label.
         """
-        stored = self.database.stored_labels(connection, change.decisions)
-        for id_ in change.decisions:
+        stored = self.database.stored_labels(connection, ids)
+        for id_ in ids:
             if id_ not in stored:
                 raise unknown_decision(id_)
             if stored[id_].corrected is None:
                 raise nothing_to_correct(id_)
         labels = {0: False, 1: True, FORGOTTEN: None}
-        common = {**event, "success": change.success}
-        corrections = {id_: labels[stored[id_].corrected] for id_ in change.decisions}
-        rows = [common | {"decision_id": id_, "was": was} for id_, was in corrections.items()]
-        self.database.insert_corrections(connection, rows)
+        return {id_: labels[stored[id_].corrected] for id_ in ids}
 
     def corrections(self, after: int = 0) -> list[Correction]:
         """Return corrections of labels, oldest first, also those that a later one replaced.
@@ -1009,11 +1002,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         list of Correction
             Of all cells of the product.
         """
-        is_of_label = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (
-            LABEL.c.decision_id == CORRECTION.c.decision_id
-        )
         query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(
-            CORRECTION.join(LABEL, is_of_label)
+            CORRECTION.join(LABEL, CORRECTION_OF_LABEL)
         )
         query = query.where(
             self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after)
