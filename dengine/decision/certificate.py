@@ -34,7 +34,9 @@ References: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures
 """
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
+from functools import partial
 
 from ..errors import expect, percent
 
@@ -152,18 +154,12 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     doubled = min(2.0 * share, 0.99)
     odds = math.log((1.0 - share) / (1.0 - doubled))
     step = max(1, round(math.log(doubled / share) / odds))
-    too_low = 1
     limit = 1
     while _run_length(share, step, limit) < parts:
-        too_low = limit
         limit = 2 * limit
-    while limit - too_low > 1:
-        middle = (too_low + limit) // 2
-        if _run_length(share, step, middle) < parts:
-            too_low = middle
-        else:
-            limit = middle
-    return step, limit
+    limits = range(limit + 1)
+    too_low = max(1, limit // 2)
+    return step, bisect_left(limits, parts, too_low, key=partial(_run_length, share, step))
 
 
 def _run_length(share: float, step: int, limit: int) -> float:

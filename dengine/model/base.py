@@ -448,16 +448,7 @@ class BaselineAdapter(EngineModel):
             )
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
-    def add_reference(
-        self,
-        x: Floats,
-        y: int,
-        hash_: int,
-        number: int = 0,
-        *,
-        embedding: Embedding | None = None,
-        point: Floats | None = None,
-    ) -> Floats:
+    def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
         """Let the baseline take in the labelled trace.
 
         Returns the trace, which serves as its reference point.

@@ -744,9 +744,8 @@ class ModelPrediction(EngineModel):
         counts itself. Raises TraceError for another shape, RuntimeError where the rule is stale,
         and ValueError where nothing was fitted.
         """
-        predictions = self.predict_many(X)
-        n_success = np.array([prediction.n_success for prediction in predictions], dtype=np.int64)
-        n_failure = np.array([prediction.n_failure for prediction in predictions], dtype=np.int64)
+        counts = [(p.n_success, p.n_failure) for p in self.predict_many(X)]
+        n_success, n_failure = np.array(counts, dtype=np.int64).reshape(-1, 2).T
         return n_success, n_failure
 
     def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -756,9 +755,8 @@ class ModelPrediction(EngineModel):
         trace. Raises TraceError for another shape, RuntimeError where the rule is stale, and
         ValueError where nothing was fitted.
         """
-        predictions = self.predict_many(X)
-        lower = np.array([prediction.lower for prediction in predictions])
-        upper = np.array([prediction.upper for prediction in predictions])
+        bounds = [(p.lower, p.upper) for p in self.predict_many(X)]
+        lower, upper = np.array(bounds, dtype=np.float64).reshape(-1, 2).T
         return lower, upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:

@@ -255,6 +255,13 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         return None
 
+    def restore_shape(self, state: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+        """Restore the shape of traces from the array "shape" of a state; return it, (C, T)."""
+        channels, samples = (int(value) for value in state["shape"])
+        self.trace_shape_ = (channels, samples)
+        self.n_features_in_ = channels * samples
+        return channels, samples
+
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned and return self; the parameters must be the same.
 
@@ -625,14 +632,7 @@ class CrossFitted(_Wrapping):
         self.dim_ = self.embed(traces[:1]).shape[2]
         return self
 
-    def train(
-        self,
-        X: Floats,
-        y: Ints,
-        folds: Ints,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
-    ) -> Floats:
+    def train(self, X: Floats, y: Ints, folds: Ints, *_: object, **__: object) -> Floats:
         return self.fit(X, y, folds=folds).embed_references(X, folds)
 
     def embed(self, X: Floats) -> Floats:

@@ -563,10 +563,8 @@ class TorchReducer(Reducer):
         if the network gives other points for the test trace than when the state was taken. A state
         without these points is not checked.
         """
-        channels, samples = (int(value) for value in state["shape"])
+        channels, samples = self.restore_shape(state)
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
-        self.trace_shape_ = (channels, samples)
-        self.n_features_in_ = channels * samples
         self._build(channels, samples, average, seed)
         self.n_steps_ = n_steps
         self.n_steps_left_ = n_steps_left

@@ -475,9 +475,7 @@ class UmapReducer(Reducer):
 
         What `precompute` found is dropped. Raises StoreError if the frames are of another size.
         """
-        channels, samples = (int(value) for value in state["shape"])
-        self.trace_shape_ = (channels, samples)
-        self.n_features_in_ = channels * samples
+        channels, samples = self.restore_shape(state)
         n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])
         self.seed_ = seed
         self.n_epochs_ = n_epochs

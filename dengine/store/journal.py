@@ -398,7 +398,7 @@ class Journal:
         self.end = begin
         self.dropped = len(rest.rstrip(b"\0"))
         n_drained = fields["n_drained"]
-        n_known = n_drained + len(digests)
+        n_known = n_drained + len(set(digests))  # a record may be there twice
         is_newest_missing = n_known < head.n_synced or bytes.fromhex(head.digest) not in digests
         if head.n_synced > n_drained and is_newest_missing:
             self.loss = (

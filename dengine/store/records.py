@@ -132,23 +132,6 @@ def as_text(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
 
 
-def check_state(report: RetrainReport, state: Mapping[str, NDArray[Any]] | None) -> None:
-    """Raise StoreError for an accepted version without arrays, and for one of Python objects.
-
-    These would need a pickle. The arrays of a dropped candidate, by name, may be None.
-    """
-    if state is None and report.accepted:
-        raise StoreError(
-            f"Expected the arrays of accepted version {report.version}, got None; pass its state."
-        )
-    for name, values in (state or {}).items():
-        if values.dtype.hasobject:
-            raise StoreError(
-                f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers "
-                "or strings."
-            )
-
-
 @dataclass(frozen=True, slots=True)
 class NewLabel:
     """A label on its way into a store.
@@ -316,22 +299,17 @@ def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     failure (upper < 1). So there are none, one or two. Their `seq` is 0, the other side's bound is
     1 or 0, and `predicted` is VERIFY unless the model alone would have acted on that side.
     """
+    accepts = int(decision.predicted is Action.ACCEPT)
+    rejects = 2 * int(decision.predicted is Action.REJECT)
     outcomes = []
     if decision.lower > 0.0:
-        accepts = int(decision.predicted is Action.ACCEPT)
-        outcomes.append(
-            OutcomeRecord(
-                0, decision.lower, 1.0, False, False, 0, accepts, decision.inclusion_probability
-            )
-        )
+        outcomes.append((decision.lower, 1.0, False, accepts))
     if decision.upper < 1.0:
-        rejects = 2 * int(decision.predicted is Action.REJECT)
-        outcomes.append(
-            OutcomeRecord(
-                0, 0.0, decision.upper, True, False, 0, rejects, decision.inclusion_probability
-            )
-        )
-    return outcomes
+        outcomes.append((0.0, decision.upper, True, rejects))
+    return [
+        OutcomeRecord(0, lower, upper, good, False, 0, predicted, decision.inclusion_probability)
+        for lower, upper, good, predicted in outcomes
+    ]
 
 
 @dataclass(frozen=True, slots=True)

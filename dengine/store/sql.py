@@ -65,7 +65,6 @@ from .records import (
     VersionError,
     as_data,
     as_text,
-    check_state,
     chunks,
     from_npz,
     from_row,
@@ -187,6 +186,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.product = self._scope.product
         self._journal: Journal | None = None
 
+    def _own(self, table: sa.Table) -> sa.ColumnElement[bool]:
+        """Return the SQL condition that a row of a table is this cell's."""
+        return table.c.cell_id == self.cell_id
+
     # Settings
 
     def settings(self) -> dict[str, str]:
@@ -217,7 +220,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             lock(connection, PRODUCT, self.product)
             for name, peer_settings in self._read_peers(connection).items():
                 check_peer_settings(settings, peer_settings, name, self.product)
-        is_replaced = (SETTING.c.cell_id == self.cell_id) & SETTING.c.key.not_in(RESERVED)
+        is_replaced = self._own(SETTING) & SETTING.c.key.not_in(RESERVED)
         connection.execute(sa.delete(SETTING).where(is_replaced))
         rows = [
             {"cell_id": self.cell_id, "key": key, "value": value} for key, value in settings.items()
@@ -287,7 +290,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         A read transaction stays open meanwhile.
         """
-        query = sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id)
+        query = sa.select(DECISION.c.id).where(self._own(DECISION))
         with self.database.reading() as connection:
             yield from (
                 connection.execute(query.execution_options(yield_per=CHUNK)).scalars().partitions()
@@ -491,7 +494,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = sa.select(*fields, known_overdue).select_from(
             LABEL.join(DECISION, LABEL_OF_DECISION)
         )
-        query = query.where(LABEL.c.cell_id == self.cell_id, TRAINS)
+        query = query.where(self._own(LABEL), TRAINS)
         query = query.where(LABEL.c.seq > int(seq), LABEL.c.source != Source.INSPECTION.value)
         query = query.where(label != FORGOTTEN, DECISION.c.model_version >= since_version)
         rows = self._read(query.order_by(LABEL.c.seq))
@@ -565,13 +568,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         -------
         int
         """
-        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(
-            DECISION.c.cell_id == self.cell_id
-        )
+        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(self._own(DECISION))
         last = self._read(newest.order_by(DECISION.c.number.desc()).limit(1))
-        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(
-            LABEL.c.cell_id == self.cell_id
-        )
+        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL))
         by_labels = self._read(of_labels)[0][0] or 0
         is_in_force = bool(last) and last[0].model_version >= since_version
         return max(by_labels, last[0].number - within) if is_in_force else by_labels
@@ -592,9 +591,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             .select_from(WITH_LABELS)
             .where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
         )
-        query = query.where(
-            DECISION.c.cell_id == self.cell_id, DECISION.c.quarantined == sa.false()
-        )
+        query = query.where(self._own(DECISION), DECISION.c.quarantined == sa.false())
         return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
@@ -611,7 +608,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             The sum of `silent`; labels of quarantined traces are left out.
         """
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
-        query = query.where(LABEL.c.cell_id == self.cell_id, TRAINS)
+        query = query.where(self._own(LABEL), TRAINS)
         return int(self._read(query.where(LABEL.c.model_version >= since_version))[0][0])
 
     def status(self, tally: Tally | None = None) -> dict[str, Any]:
@@ -637,7 +634,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             sources[group.source] += group.n if group.success is not None else 0
         forgotten = tally.by("label")["forgotten"]
         query = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
-        corrected = self._read(query.where(CORRECTION.c.cell_id == self.cell_id))[0][0]
+        corrected = self._read(query.where(self._own(CORRECTION)))[0][0]
         return {
             "decisions": tally.count(),
             "actions": {action.value: actions[action] for action in Action},
@@ -693,8 +690,14 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
         an accepted version without arrays, and for an array of Python objects.
         """
-        check_state(report, state)
-        blob = None if state is None else to_npz(state)
+        if state is None and report.accepted:
+            raise StoreError(
+                f"Expected the arrays of accepted version {report.version}, got None; pass its "
+                "state."
+            )
+        do = "store numbers or strings"
+        with instead(StoreError, "Expected a version of plain arrays", ValueError, do=do):
+            blob = None if state is None else to_npz(state)
         return {
             "time": now,
             "last_seq": int(last_seq),
@@ -866,7 +869,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         If the store cannot be written, the text is logged instead, and nothing raised.
         """
-        query = sa.select(EVENT.c.number).where(EVENT.c.cell_id == self.cell_id)
+        query = sa.select(EVENT.c.number).where(self._own(EVENT))
         query = query.where(EVENT.c.kind == "damaged", EVENT.c.text == as_text(text))
         if not self._read(query.limit(1)):
             try:
@@ -902,10 +905,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         list of Event
         """
         query = (
-            sa.select(EVENT)
-            .where(EVENT.c.cell_id == self.cell_id)
-            .order_by(EVENT.c.number.desc())
-            .limit(limit)
+            sa.select(EVENT).where(self._own(EVENT)).order_by(EVENT.c.number.desc()).limit(limit)
         )
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
@@ -922,12 +922,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             None if there was no change, or there is no such decision. The order is the ledger's,
             whatever the clock said.
         """
-        is_decision = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
+        is_decision = self._own(DECISION) & (DECISION.c.id == decision_id)
         decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
         kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
-        query = sa.select(EVENT).where(
-            EVENT.c.cell_id == self.cell_id, kinds, EVENT.c.entry > decided
-        )
+        query = sa.select(EVENT).where(self._own(EVENT), kinds, EVENT.c.entry > decided)
         rows = self._read(query.order_by(EVENT.c.number).limit(1))
         return from_row(Event, rows[0]._mapping) if rows else None
 
@@ -1083,9 +1081,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
         query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
-        query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(
-            LABEL.c.seq
-        )
+        query = query.where(self._own(LABEL), LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         names = LABEL.c.keys()
         damaged = {
@@ -1138,9 +1134,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             .select_from(WITH_LABELS)
             .group_by(*columns, "aged", SUCCESS, SOURCE)
         )
-        query = query.where(
-            DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version
-        )
+        query = query.where(self._own(DECISION), DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = (
             [row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1)
