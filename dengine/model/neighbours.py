@@ -202,10 +202,9 @@ def _as_key(value: object) -> object:
         return value
     if isinstance(value, Tensor):
         return tuple(value.shape)
-    if isinstance(value, list | tuple):
-        return (type(value), *map(_as_key, value))
-    if isinstance(value, dict):
-        return tuple(sorted((repr(key), _as_key(item)) for key, item in value.items()))
+    if isinstance(value, list | tuple | dict):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return (type(value), *sorted((repr(key), _as_key(item)) for key, item in items))
     return repr(value) if isinstance(value, CONSTANTS) else None
 
 

@@ -664,8 +664,8 @@ class Database:
         self,
         connection: sa.Connection,
         event: Event,
-        success: bool | None = None,
-        labels: Mapping[str, bool | None] | None = None,
+        success: bool | None,
+        labels: Mapping[str, bool | None],
     ) -> int:
         """Insert an event and the corrections that it records, in a write transaction.
 
@@ -675,7 +675,7 @@ class Database:
         event : Event
         success : bool or None
             The new label of all decisions; None: forgotten.
-        labels : mapping of str to bool or None, optional
+        labels : mapping of str to bool or None
             Label until now of each decision, by id; None if it was forgotten.
 
         Returns

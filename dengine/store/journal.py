@@ -276,7 +276,7 @@ class Journal:
         """
         with self._describing, _os_errors(self.path):
             self.head.newest = newest
-            self._file.write(self._header(), 0)
+            self._write_header()
             self._write_head()
 
     def _write_head(self) -> None:
@@ -298,7 +298,7 @@ class Journal:
             self.drained_to = HEADER
             self.head.n_drained = self.head.n_synced
             self.end = HEADER
-            self._file.write(self._header(), 0)
+            self._write_header()
         self.reserve()
 
     def reserve(self) -> None:
@@ -341,8 +341,8 @@ class Journal:
                 self._file.truncate(HEADER if self.is_drained else self.end)
         self._file.close()
 
-    def _header(self) -> bytes:
-        """Return the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
+    def _write_header(self) -> None:
+        """Write the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
 
         The JSON has this process as the owner, the drained records and the newest ledger entry.
         """
@@ -352,11 +352,11 @@ class Journal:
             "newest": self.head.newest,
             "n_drained": self.head.n_drained,
         }
-        return (MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0")
+        self._file.write((MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0"), 0)
 
     def _write_header_and_reserve(self) -> None:
         """Write the header, and reserve disk space for records."""
-        self._file.write(self._header(), 0)
+        self._write_header()
         self.reserve()
 
     def _scan(self) -> None:

@@ -89,13 +89,11 @@ class Scope:
 
         With `conditions`, only over the rows that fulfil them all. 0 if there is none.
         """
-        if self.product is not None:
-            return connection.execute(newest_of(self.product, column, *conditions)).scalar() or 0
         is_own = column.table.c.cell_id == self.cell_id
-        return (
-            connection.execute(sa.select(sa.func.max(column)).where(is_own, *conditions)).scalar()
-            or 0
-        )
+        query = sa.select(sa.func.max(column)).where(is_own, *conditions)
+        if self.product is not None:
+            query = newest_of(self.product, column, *conditions)
+        return connection.execute(query).scalar() or 0
 
     def newest_version(self, connection: sa.Connection) -> int:
         """Return the number of the newest accepted version; 0 before the first."""

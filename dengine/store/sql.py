@@ -277,9 +277,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
         if not rows:
             return None
-        if trace and not is_intact(
-            TRACE.name, dict(zip(TRACE.c.keys(), rows[0][-len(TRACE.c) :], strict=True))
-        ):
+        if trace and not is_intact(TRACE, rows[0][-len(TRACE.c) :]):
             where = f"as it was stored in {self.database.name}, its bytes have changed"
             do = "see `dengine verify`, and restore the store from a copy"
             raise StoreError(f"Expected the trace of decision {decision_id!r} {where}; {do}.")
@@ -416,11 +414,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = query.where(scope.shared(LABEL.c.cell_id), TRAINS)
         first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
         query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
-        names = TRACE.c.keys()
-        for *values, seq in connection.execute(query.execution_options(yield_per=CHUNK)):
-            row = dict(zip(names, values, strict=True))
-            if seq in labels and is_intact(TRACE.name, row):
-                traces[seq] = unpack(row["data"]).reshape(row["channels"], row["samples"])
+        for row in connection.execute(query.execution_options(yield_per=CHUNK)):
+            if row.seq in labels and is_intact(TRACE, row):
+                traces[row.seq] = unpack(row.data).reshape(row.channels, row.samples)
         shapes = sorted({trace.shape for trace in traces.values()})
         if len(shapes) > 1:
             raise StoreError(
@@ -1049,10 +1045,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             conditions.append(DECISION.c.time < where.until)
         number = DECISION.c.number
         if start_after is not None:
-            other = DECISION.alias("other")
-            is_other = (other.c.cell_id == self.cell_id) & (other.c.id == start_after)
-            limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
-            conditions.append(number < limit_number if newest else number > limit_number)
+            start = self.get_decision(start_after, trace=False)
+            if start is None:
+                return []
+            conditions.append(number < start.number if newest else number > start.number)
         query = (
             past_query(self.cell_id)
             .where(*conditions)
@@ -1083,12 +1079,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
         query = query.where(self._own(LABEL), LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
-        names = LABEL.c.keys()
-        damaged = {
-            row.decision_id
-            for row in rows
-            if not is_intact(LABEL.name, dict(zip(names, row, strict=False)))
-        }
+        damaged = {row.decision_id for row in rows if not is_intact(LABEL, row)}
         self._record_left_out(sorted(damaged), "label")
         rows = [row for row in rows if row.decision_id not in damaged]
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
