@@ -70,7 +70,7 @@ class Members(nn.Module):
                 else Separate([network(channels, samples) for _ in range(count)])
             )
             features = count_features(self.networks, count, channels, samples)
-        register_tensors(self.networks)
+            register_tensors(self.networks)
         if isinstance(self.networks, Separate):
             n_of_members = sum(map(count_trained, self.networks.networks))
             wanted = "a network for each member, with weights of its own"
