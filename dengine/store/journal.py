@@ -367,7 +367,6 @@ class Journal:
         """
         head = self.head
         fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
-        self.entries = [head.newest] if head.newest else []
         damaged = 0
         if self._file.size:
             header = self._file.read(HEADER, 0)
@@ -383,8 +382,7 @@ class Journal:
                 head = Head()
         self.end = max(self._file.size, HEADER)
         self.drained_to = min(max(self.drained_to, HEADER), self.end)
-        if fields["newest"]:
-            self.entries.append(fields["newest"])
+        self.entries = [entry for entry in (self.head.newest, fields["newest"]) if entry]
         # The first record's digest is not checked: those before it may be gone.
         digests: list[bytes] = []
         begin = self.drained_to

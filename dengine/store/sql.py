@@ -186,7 +186,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.product = self._scope.product
         self._journal: Journal | None = None
 
-    def _own(self, table: sa.Table) -> sa.ColumnElement[bool]:
+    def _own(self, table: sa.FromClause) -> sa.ColumnElement[bool]:
         """Return the SQL condition that a row of a table is this cell's."""
         return table.c.cell_id == self.cell_id
 
@@ -490,8 +490,12 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = sa.select(*fields, known_overdue).select_from(
             LABEL.join(DECISION, LABEL_OF_DECISION)
         )
-        query = query.where(self._own(LABEL), TRAINS)
-        query = query.where(LABEL.c.seq > int(seq), LABEL.c.source != Source.INSPECTION.value)
+        query = query.where(
+            self._own(LABEL),
+            TRAINS,
+            LABEL.c.seq > int(seq),
+            LABEL.c.source != Source.INSPECTION.value,
+        )
         query = query.where(label != FORGOTTEN, DECISION.c.model_version >= since_version)
         rows = self._read(query.order_by(LABEL.c.seq))
         overdue: deque[StoredDecision] = deque()
@@ -604,8 +608,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             The sum of `silent`; labels of quarantined traces are left out.
         """
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
-        query = query.where(self._own(LABEL), TRAINS)
-        return int(self._read(query.where(LABEL.c.model_version >= since_version))[0][0])
+        query = query.where(self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version)
+        return int(self._read(query)[0][0])
 
     def status(self, tally: Tally | None = None) -> dict[str, Any]:
         """Return counts of all decisions and labels of the cell.
@@ -1045,10 +1049,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             conditions.append(DECISION.c.time < where.until)
         number = DECISION.c.number
         if start_after is not None:
-            start = self.get_decision(start_after, trace=False)
-            if start is None:
-                return []
-            conditions.append(number < start.number if newest else number > start.number)
+            other = DECISION.alias("other")
+            is_other = self._own(other) & (other.c.id == start_after)
+            limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
+            conditions.append(number < limit_number if newest else number > limit_number)
         query = (
             past_query(self.cell_id)
             .where(*conditions)

@@ -174,8 +174,9 @@ def verify_history(
         )
     with reading(str(url)) as connection:
         names = _selected_cells(connection, cell_id)
-        url_ = connection.engine.url
-        journals = {name: _inspect_journal(journal_path(url_, name)) for name in names}
+        journals = {
+            name: _inspect_journal(journal_path(connection.engine.url, name)) for name in names
+        }
     with reading(str(url)) as connection:  # a later snapshot: it has what the journals knew
         pages = run_integrity_check(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", finding) for finding in pages]
