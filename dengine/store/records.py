@@ -621,7 +621,7 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
     """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
     Integers are compressed, of which a state repeats many; weights hardly get smaller. Raise
-    ValueError for an array of Python objects.
+    StoreError for an array of Python objects.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -629,7 +629,10 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
             info = zipfile.ZipInfo(f"{name}.npy")
             if values.dtype.kind in "iu":
                 info.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(info, "w", force_zip64=True) as member:
+            with (
+                instead(StoreError, f"Expected plain arrays, not {name!r}", ValueError),
+                archive.open(info, "w", force_zip64=True) as member,
+            ):
                 np.save(member, values, allow_pickle=False)
     return buffer.getvalue()
 

@@ -695,9 +695,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
                 f"Expected the arrays of accepted version {report.version}, got None; pass its "
                 "state."
             )
-        do = "store numbers or strings"
-        with instead(StoreError, "Expected a version of plain arrays", ValueError, do=do):
-            blob = None if state is None else to_npz(state)
+        blob = None if state is None else to_npz(state)
         return {
             "time": now,
             "last_seq": int(last_seq),
