@@ -45,7 +45,7 @@ Ints = NDArray[np.int64]
 State = dict[str, NDArray[Any]]
 OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
 OUTLIER_SHARE = 0.05  # more points than this share are not outliers
-SMALLEST = 1e-10  # that the largest sample must reach
+SMALLEST = 1e-12  # that the largest sample must reach
 SAME_POINTS = 1e-3  # by which points of one trace may differ: between machines, compiled, restored
 
 
@@ -300,7 +300,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             and with `reset` if there is no trace.
         TraceError
             If the shape is none of traces, or another than in `fit`, and with `reset` if no sample
-            reaches 1e-10, whose square float32 hardly holds; a plain ValueError for a
+            reaches 1e-12, whose square float32 hardly holds; a plain ValueError for a
             single trace (T,) and for another number of columns of X (n, T).
         """
         if not reset:
