@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from .errors import DataError, DengineError, OutputError, expect, instead
 
+FilePath = str | os.PathLike[str]
 MAX_BYTES = 8 * 2**30  # of arrays
 # All that zipfile, zlib, lzma and NumPy were seen to raise on damaged files.
 UNREADABLE: tuple[type[Exception], ...] = (
@@ -41,7 +42,7 @@ MANIFEST = "manifest.json"
 MIN_KEY_BYTES = 16
 
 
-def read_key(path: str | os.PathLike[str], error: type[DengineError]) -> bytes:
+def read_key(path: FilePath, error: type[DengineError]) -> bytes:
     """Return the secret in a key's file, without line ends behind it.
 
     Raises `error` if the file cannot be read, or the secret has fewer than 16 bytes.
@@ -116,7 +117,7 @@ def _size_text(n_bytes: float) -> str:
 
 
 def read_archive(
-    source: str | os.PathLike[str] | bytes, names: Collection[str] | None = None, *, name: str = ""
+    source: FilePath | bytes, names: Collection[str] | None = None, *, name: str = ""
 ) -> tuple[dict[str, NDArray[Any]], list[str]]:
     """Read arrays of an .npz archive.
 
@@ -176,7 +177,7 @@ def is_database(path: Path) -> bool:
         return file.read(16).startswith(DATABASES)
 
 
-def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
+def check_output(path: FilePath, force: bool = False) -> None:
     """Raise OutputError if a file must not be written.
 
     Call it before the work whose result the file is to hold. A file that does not exist yet is
@@ -206,7 +207,7 @@ def check_output(path: str | os.PathLike[str], force: bool = False) -> None:
 
 
 def write_output(
-    path: str | os.PathLike[str], content: bytes, force: bool = False, *, make_folder: bool = False
+    path: FilePath, content: bytes, force: bool = False, *, make_folder: bool = False
 ) -> Path:
     """Write a file as a whole or not at all, and return its path; parameters as `output_file`."""
     with output_file(path, force, make_folder=make_folder) as partial:
@@ -216,7 +217,7 @@ def write_output(
 
 @contextmanager
 def output_file(
-    path: str | os.PathLike[str], force: bool = False, *, make_folder: bool = False
+    path: FilePath, force: bool = False, *, make_folder: bool = False
 ) -> Iterator[Path]:
     """Context manager that gives the path of an empty file to write.
 

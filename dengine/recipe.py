@@ -27,6 +27,7 @@ from .records import is_number, is_whole
 from .reducers import REDUCERS, class_default, make_reducer, reducer_class
 
 Params = Mapping[str, bool | int | float | str]
+Table = Mapping[str, Any]  # of a TOML file
 CLASS_PATH = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")  # module:Class
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")  # a key that TOML takes without quotes
 PLAIN = (bool, int, float, str, np.bool_, np.integer, np.floating)
@@ -286,7 +287,7 @@ class Recipe:
         return make_reducer(self.reducer, **params | dict(self.params))
 
 
-def _check_keys(table: Mapping[str, Any], record_type: Any, where: str) -> None:
+def _check_keys(table: Table, record_type: Any, where: str) -> None:
     """Raise SettingError if a table has a key that is no field of the dataclass `record_type`.
 
     The message begins with `where`.
@@ -357,12 +358,12 @@ def describe_estimator(estimator: Any) -> str:
     return f"{type(estimator).__qualname__}({', '.join(values)})"
 
 
-def _with_none(table: Mapping[str, Any]) -> dict[str, Any]:
+def _with_none(table: Table) -> dict[str, Any]:
     """Return a table with None in the place of each "none"."""
     return {key: None if value == "none" else value for key, value in table.items()}
 
 
-def _table_text(name: str, values: Mapping[str, Any]) -> str:
+def _table_text(name: str, values: Table) -> str:
     """Return a table of TOML: its header, unless the name is "", and a line for each value."""
     header = f"[{name}]\n" if name else ""
     return header + "".join(f"{key} = {_value_text(value)}\n" for key, value in values.items())

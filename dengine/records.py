@@ -14,9 +14,13 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .errors import ReportError, SettingError, StoreError, expect, instead, shortened
 from .representation import to_html
+
+PartNumber = str | int | None  # as a caller gives it
+TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:

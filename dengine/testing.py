@@ -12,8 +12,7 @@ clause `labels_of_a_fold_move_nothing_in_its_space`. `toy_traces` makes the trac
 and of examples.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -223,7 +222,7 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
     trained = _train_clone(reducer)
     module = trained.module()
     if module is not None:
-        with torch.inference_mode(), runs_as_torchscript():
+        with torch.inference_mode():
             Z = script(module.eval())(torch.from_numpy(QUERIES)).numpy()
         np.testing.assert_allclose(Z, trained.embed(QUERIES), rtol=1e-4, atol=1e-4)
 
@@ -238,8 +237,7 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
     X, y = toy_traces()
     for labels in (y, 1 - y):
         model = ModelPrediction(clone(reducer), folds=FOLDS).fit(X, labels)
-        with runs_as_torchscript():
-            defect = model.defect() or next(filter(None, model.check_answers()), "")
+        defect = model.defect() or next(filter(None, model.check_answers()), "")
         assert not defect, defect
 
 
@@ -310,19 +308,12 @@ def check_reducer(reducer: Any) -> None:
     for check in REDUCER_CHECKS:
         try:
             check(reducer)
-        except AssertionError as error:
-            message = f"{type(reducer).__name__} breaks {check.__name__!r}: {error}"
+        except (AssertionError, torch.jit.Error) as error:
+            problem = str(error)
+            if isinstance(error, torch.jit.Error):
+                problem = f"TorchScript compiles its module and cannot run it: {reason_of(error)}"
+            message = f"{type(reducer).__name__} breaks {check.__name__!r}: {problem}"
             raise AssertionError(message) from error
-
-
-@contextmanager
-def runs_as_torchscript() -> Iterator[None]:
-    """Raise AssertionError in place of an error of TorchScript."""
-    try:
-        yield
-    except torch.jit.Error as error:
-        message = f"TorchScript compiles its module and cannot run it: {reason_of(error)}"
-        raise AssertionError(message) from error
 
 
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:

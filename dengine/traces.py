@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from .errors import DataError, SettingError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .limits import ForceLimits
-from .records import FITS, REASONS, Reason, TraceSpec
+from .records import FITS, REASONS, Reason, TraceArray, TraceSpec
 
 # Words for the clock of a recording, in the languages of recorders. One of CLOCK_WORDS anywhere in
 # a column's name makes it a clock, as in `header.stamp` or `Relative Time`; CLOCK_NAMES are whole
@@ -47,7 +47,7 @@ LARGEST = 1e18  # of a sample; in float32 the squares of larger ones overflow, o
 MIN_SAMPLES = 10  # of a first trace
 
 
-def as_trace(trace: Any, trace_spec: TraceSpec | None) -> NDArray[np.float32]:
+def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
     """Convert one trace to float32 of shape (channels, samples).
 
     Parameters
@@ -91,7 +91,7 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> NDArray[np.float32]:
     return x if x.flags.writeable else x.copy()  # torch warns of read-only, memory-mapped arrays
 
 
-def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> NDArray[np.float32]:
+def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     """Convert many traces to float32 of shape (n, channels, samples).
 
     Parameters
@@ -133,7 +133,7 @@ def as_labels(y: ArrayLike) -> NDArray[np.int64]:
     return labels.astype(np.int64)
 
 
-def spec_of(x: NDArray[np.float32], trace: Any = None) -> TraceSpec:
+def spec_of(x: TraceArray, trace: Any = None) -> TraceSpec:
     """Return the `TraceSpec` of a converted trace `x` (C, T), with defaults for all but its shape.
 
     If `trace`, the same trace before its conversion, is a DataFrame, the columns get the names of
@@ -239,7 +239,7 @@ def _channel_columns(frame: Any) -> list[Any]:
     ]
 
 
-def _as_real(values: ArrayLike) -> NDArray[np.float32]:
+def _as_real(values: ArrayLike) -> TraceArray:
     """Convert numbers to a float32 array; one that is float32 already is returned uncopied.
 
     What float32 cannot hold becomes an infinity. Raises TraceError for values that are no real
@@ -259,7 +259,7 @@ def _as_real(values: ArrayLike) -> NDArray[np.float32]:
         return array.astype(np.float32, copy=False)
 
 
-def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.float32]:
+def _match_spec(x: TraceArray, trace_spec: TraceSpec) -> TraceArray:
     """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
     Traces of that length are returned as they are; others are fitted as `trace_spec.fit` says.
@@ -271,22 +271,21 @@ def _match_spec(x: NDArray[np.float32], trace_spec: TraceSpec) -> NDArray[np.flo
         turn = "; it looks transposed: turn it, trace.T" if is_transposed else ""
         do = f"pass (channels, samples){turn}"
         raise TraceError(f"Expected {trace_spec.channels} channel(s), got {channels}; {do}.")
-    if samples == trace_spec.samples:
+    n = trace_spec.samples
+    if samples == n:
         return x
-    if trace_spec.fit == "strict":
-        form = f"{trace_spec.samples} samples"
-        if (rate := trace_spec.rate_hz) is not None:
-            form = f"{rate:g} Hz x {trace_spec.samples / rate:g} s"
-        new = f"TraceSpec(samples={trace_spec.samples}, fit='pad')"
-        do = f"resample the trace to {form}, or start a new store with {new}"
-        raise TraceError(f"Expected {trace_spec.samples} samples, got {samples}; {do}.")
-    if not can_fit_length(samples, trace_spec.samples, FITS.index(trace_spec.fit)):
-        n = trace_spec.samples
-        wanted = f"at least {n}" if trace_spec.fit == "cut" else f"{-(-n // 2)} to {2 * n}"
+    fit = FITS.index(trace_spec.fit)
+    if not can_fit_length(samples, n, fit):
+        rate = trace_spec.rate_hz
+        form = f"{n} samples" if rate is None else f"{rate:g} Hz x {n / rate:g} s"
+        new = f"TraceSpec(samples={n}, fit='pad')"
+        to_half = f"{-(-n // 2)} to {2 * n}"
+        wanted = (f"{n}", f"at least {n}", to_half, to_half)[fit]
         do = f"{trace_spec.fit} fits no other length: record a whole insertion, and nothing else"
+        if trace_spec.fit == "strict":
+            do = f"resample the trace to {form}, or start a new store with {new}"
         raise TraceError(f"Expected {wanted} samples, got {samples}; {do}.")
-    tensor = torch.from_numpy(np.array(x, order="C"))
-    return np.asarray(fit_length(tensor, trace_spec.samples, FITS.index(trace_spec.fit)))
+    return np.asarray(fit_length(torch.from_numpy(np.array(x, order="C")), n, fit))
 
 
 # Of `clip_extremes`.
@@ -295,7 +294,7 @@ FAR = 64.0
 MOST = 1e15
 
 
-def clip_extremes(traces: NDArray[np.float32]) -> NDArray[np.float32]:
+def clip_extremes(traces: TraceArray) -> TraceArray:
     """Clip samples that are far larger than usual, so that no single trace spoils a training.
 
     Parameters
@@ -482,9 +481,7 @@ class ForceLimitsGate(nn.Module):
         return int(torch.where(kept, 0, self.action).max().item())
 
 
-def convert_trace(
-    trace: Any, trace_spec: TraceSpec | None, may_start_over: bool
-) -> NDArray[np.float32]:
+def convert_trace(trace: Any, trace_spec: TraceSpec | None, may_start_over: bool) -> TraceArray:
     """Convert a trace by `as_trace`; where it raises TraceError, explain how to start over.
 
     Parameters
@@ -519,7 +516,7 @@ def _spec_advice(trace: Any) -> str:
     return f"DataEngine(trace=TraceSpec(samples={samples}, channels={channel_count}))"
 
 
-def infer_trace_spec(x: NDArray[np.float32], trace: Any) -> tuple[TraceSpec, bool]:
+def infer_trace_spec(x: TraceArray, trace: Any) -> tuple[TraceSpec, bool]:
     """Infer the `TraceSpec` of all traces from the first one: its shape and column names.
 
     All else has the defaults of `TraceSpec`; rate and unit are unknown.

@@ -3,13 +3,12 @@ and signature, and the C++ sources that run such a file.
 """
 
 from pathlib import Path
-from typing import Any
 
 import click
 
 from . import options
 from .options import FILE, FOLDER, verb
-from .output import format_size, print_result
+from .output import Record, format_size, print_result
 
 EXPORTERS = ("torchscript", "onnx")
 _FORMAT = "torchscript decides, audits and learns in the cell; onnx only decides."
@@ -76,7 +75,7 @@ def export(
     from ..engine.engine import DataEngine
     from ..export import export_onnx, export_sources, export_torchscript, make_key
 
-    record: dict[str, Any] = {}
+    record: Record = {}
     lines = []
     if new_key is not None:
         key = make_key(new_key)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 Command = Callable[..., Any]
 Option = Callable[[Command], Command]
+Options = Mapping[str, Any]  # the values of options, by name
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(1)
@@ -259,7 +260,7 @@ class RecipeChoice:
     """
 
     name: str | None
-    settings: Mapping[str, Any]
+    settings: Options
 
     def load(self, base: Any = "conv") -> Recipe:
         """Return the recipe, or `base` if no name was given, with the given settings.
@@ -334,16 +335,6 @@ _WINDOW = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 
 
-def _windows(
-    context: click.Context, option: click.Parameter, values: tuple[str, ...]
-) -> tuple[str, ...] | None:
-    """Return the windows that were given, without empty ones; None if the option was not given.
-
-    An empty tuple removes all windows of a recipe. It is a callback of click's.
-    """
-    return tuple(filter(None, values)) if values else None
-
-
 POLICY = {
     "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
     "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
@@ -354,7 +345,13 @@ POLICY = {
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
     "prices": click.option("--prices", type=CommaList(click.FloatRange(0.0)), help=_PRICES),
     "windows": click.option(
-        "--window", "windows", metavar=_WINDOW, multiple=True, callback=_windows, help=_WINDOWS
+        "--window",
+        "windows",
+        metavar=_WINDOW,
+        multiple=True,
+        # None where the option was not given; an empty tuple removes all windows of a recipe.
+        callback=lambda _, option, values: tuple(filter(None, values)) if values else None,
+        help=_WINDOWS,
     ),
 }
 SETTINGS = POLICY | {
@@ -402,9 +399,9 @@ class DataChoice:
 
     data: str
     description: Path | None
-    stated: Mapping[str, Any]
-    options: Mapping[str, Any]
-    live: Mapping[str, Any] = field(default_factory=dict)
+    stated: Options
+    options: Options
+    live: Options = field(default_factory=dict)
 
     @property
     def saved(self) -> Path | None:
@@ -575,7 +572,7 @@ def data_options(
     return bundle_options("source", _data_choice, {"data": data} | DATA | more)
 
 
-def recorder_settings(options: Mapping[str, Any]) -> tuple[dict[str, Any], TraceSpec]:
+def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
     """Return those of the options in `TRACE` that a robot's recorder takes, under its names, and
     the contract of what it records.
     """
@@ -587,7 +584,7 @@ def recorder_settings(options: Mapping[str, Any]) -> tuple[dict[str, Any], Trace
     return settings, replace(spec_of_recording(**settings), **form)
 
 
-def trace_spec_from(options: Mapping[str, Any]) -> TraceSpec | None:
+def trace_spec_from(options: Options) -> TraceSpec | None:
     """Return the contract of live traces, by those options of `TRACE` that were given.
 
     `--channels` with one number gives how many there are; with names, their columns.
@@ -629,16 +626,12 @@ def n_jobs_option(default: int, text: str) -> Option:
 
     0 is turned into -1, one process for each core.
     """
-
-    def all_cores_for_0(context: click.Context, option: click.Parameter, n_jobs: int) -> int:
-        return n_jobs or -1
-
     return click.option(
         "--n-jobs",
         type=int,
         default=default,
         show_default=True,
-        callback=all_cores_for_0,
+        callback=lambda _, option, n_jobs: n_jobs or -1,
         help=text,
     )
 

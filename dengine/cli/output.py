@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from ..decision.certificate import Certificate
 
+Record = dict[str, Any]  # what `--json` prints, by name
 SCREEN_WIDTH = 80  # columns where no terminal says otherwise; every table fits them
 INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
 # The names of two flags, and the keys in click's context that hold whether they were given.
@@ -122,7 +123,7 @@ class Out:
 
 
 def print_result(
-    record: Mapping[str, Any],
+    record: Record,
     *parts: Any,
     out: Out | None = None,
     make_files: Callable[[], Mapping[str, Any]] | None = None,
@@ -302,7 +303,7 @@ FORMATTERS: dict[str, Callable[[float], str]] = {
 }
 
 
-def certificate_record(certificate: "Certificate") -> dict[str, Any]:
+def certificate_record(certificate: "Certificate") -> Record:
     """Return a certificate as a dict for JSON: its numbers, its verdict and its sentences."""
     sentences = ("kept", "sentence", "sentence_on_rejects")
     return asdict(certificate) | {name: getattr(certificate, name) for name in sentences}

@@ -28,6 +28,7 @@ from .options import (
     CommaList,
     DataChoice,
     NameChoice,
+    Options,
     RecipeChoice,
     short_name,
     verb,
@@ -257,9 +258,9 @@ _FEEDBACK = (
 @options.out_option
 def compare(
     names: Sequence[str],
-    settings: Mapping[str, Any],
+    settings: Options,
     paper: bool,
-    lists: Mapping[str, Any],
+    lists: Options,
     feedback: Sequence[str],
     **played: Any,
 ) -> None:
@@ -283,7 +284,7 @@ def compare(
     _replay_and_print(contenders, grid, **played)
 
 
-def _refuse_value_beside_list(settings: Mapping[str, Any], lists: Iterable[str]) -> None:
+def _refuse_value_beside_list(settings: Options, lists: Iterable[str]) -> None:
     """Raise UsageError if a setting has both one value (`--alpha`) and a list to try (`--alphas`).
 
     Parameters
@@ -303,7 +304,7 @@ def _refuse_value_beside_list(settings: Mapping[str, Any], lists: Iterable[str])
 
 def _replay_and_print(
     contenders: Sequence[Contender],
-    grid: Mapping[str, Any],
+    grid: Options,
     source: DataChoice,
     stream: Stream,
     check_seconds: float,
@@ -495,7 +496,7 @@ def costs(
     choice: RecipeChoice,
     part_prices: dict[str, float],
     cost_unit: str,
-    lists: Mapping[str, Any],
+    lists: Options,
     source: DataChoice,
     stream: Stream,
     out: Out | None,

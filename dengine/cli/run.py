@@ -18,6 +18,7 @@ from . import options
 from .options import DataChoice, RecipeChoice, short_name, verb
 from .output import (
     Out,
+    Record,
     StepInterruptedError,
     as_json,
     certificate_record,
@@ -64,7 +65,7 @@ class DrivenRun(NamedTuple):
     """
 
     replay: Replay
-    safe_mode_changes: list[dict[str, Any]]
+    safe_mode_changes: list[Record]
     failure: CellError | None
 
 
@@ -143,7 +144,7 @@ def run(
         cell, name = to_drive.make(engine)
         stack.callback(getattr(cell, "close", lambda: None))
         driven = _drive(engine, cell, cycles, name)
-        record: dict[str, Any] = {
+        record: Record = {
             "check_seconds": check_seconds,
             "safe_mode": engine.safe_mode,
             "safe_mode_changes": driven.safe_mode_changes,
@@ -182,7 +183,7 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
     from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 
     observed = list[ObservedCycle]()
-    changes = list[dict[str, Any]]()
+    changes = list[Record]()
     reason = engine.safe_mode
     failure = None
     try:
@@ -204,7 +205,7 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
     return DrivenRun(to_replay(observed, engine.recipe), changes, failure)
 
 
-def _safe_mode_line(change: Mapping[str, Any]) -> str:
+def _safe_mode_line(change: Record) -> str:
     """Return a sentence: after which cycle safe mode began, and why, or that it ended."""
     event = "safe mode ended"
     if change["reason"]:
@@ -339,7 +340,7 @@ COLUMNS = {  # title -> count of a stretch
 }
 
 
-def _print_run(replay: Replay, record: dict[str, Any], cell: Any, out: Out | None) -> None:
+def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> None:
     """Print the result of a run: a table of stretches, the cell's own report, and sentences.
 
     These say what was saved, how the retrains went, when safe mode was on, and the certificate.

@@ -103,7 +103,7 @@ def serve(
     allow_import: bool,
     robot: str | None,
     trigger: str,
-    trace_options: dict[str, Any],
+    trace_options: options.Options,
     seed: int | None,
     **settings: Any,
 ) -> None:

@@ -279,10 +279,10 @@ def verify(
 
     with progress_bar("rows", None) as advance:
         report = verify_history(store, cell, expect, advance)
-        for item in report.cells if acknowledge else ():
-            with SqlStore(store, item.cell_id) as opened:
-                opened.acknowledge_losses(author)
         if acknowledge:
+            for item in report.cells:
+                with SqlStore(store, item.cell_id) as opened:
+                    opened.acknowledge_losses(author)
             report = verify_history(store, cell, expect, advance)
     record = {"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}
     print_result(record, *_verification_lines(report))

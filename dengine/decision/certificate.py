@@ -34,7 +34,9 @@ References: Ville (1939); Waudby-Smith and Ramdas (2024), JRSS B 86(1); mixtures
 """
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass, replace
+from functools import partial
 
 from ..errors import expect, percent
 
@@ -152,18 +154,12 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     doubled = min(2.0 * share, 0.99)
     odds = math.log((1.0 - share) / (1.0 - doubled))
     step = max(1, round(math.log(doubled / share) / odds))
-    too_low = 1
     limit = 1
     while _run_length(share, step, limit) < parts:
-        too_low = limit
         limit = 2 * limit
-    while limit - too_low > 1:
-        middle = (too_low + limit) // 2
-        if _run_length(share, step, middle) < parts:
-            too_low = middle
-        else:
-            limit = middle
-    return step, limit
+    limits = range(limit + 1)
+    too_low = max(1, limit // 2)
+    return step, bisect_left(limits, parts, too_low, key=partial(_run_length, share, step))
 
 
 def _run_length(share: float, step: int, limit: int) -> float:
@@ -440,20 +436,25 @@ def certify(
     elif audit_rate == 0.0:
         accepted = _bound_outcomes(o.accepted, 0, 0, o.accepted, 0.0, alpha)
     else:
-        n = o.accepted + o.audited_accepts
-        n_bad = o.audited_accepts_bad
-        audit_alpha = (1.0 - share) * alpha
-        accepted = _bound_outcomes(n, o.audited_accepts, n_bad, o.accepted, audit_rate, audit_alpha)
-        upper = max(accepted.upper, (n_bad + o.false_accepts) / max(1, n))
-        shadowed = audit_rate == 1.0 and o.accepted == 0
-        accepted = replace(accepted, upper=upper, shadowed=shadowed)
-    n = o.rejected + o.audited_rejects
-    n_good = o.audited_rejects_good
-    rejected = _bound_outcomes(n, o.audited_rejects, n_good, o.rejected, audit_rate, alpha)
-    upper = max(rejected.upper, (n_good + o.false_rejects) / max(1, n))
-    shadowed = audit_rate == 1.0 and o.rejected == 0
-    rejected = replace(rejected, upper=upper, shadowed=shadowed)
+        accepts = o.accepted, o.audited_accepts, o.audited_accepts_bad, o.false_accepts
+        accepted = _bound_audits(*accepts, audit_rate, (1.0 - share) * alpha)
+    rejects = o.rejected, o.audited_rejects, o.audited_rejects_good, o.false_rejects
+    rejected = _bound_audits(*rejects, audit_rate, alpha)
     return Certificate(alpha, tolerance, accepted, rejected)
+
+
+def _bound_audits(
+    n_unchecked: int, n_audited: int, n_bad: int, n_others: int, audit_rate: float, alpha: float
+) -> OutcomeBound:
+    """Return the bound that rests on audits, about unchecked and audited parts together.
+
+    `n_bad` of the audited parts, and `n_others` of the unchecked ones, are known to be decided
+    wrongly: the bound is never below the share of both.
+    """
+    n = n_unchecked + n_audited
+    bound = _bound_outcomes(n, n_audited, n_bad, n_unchecked, audit_rate, alpha)
+    upper = max(bound.upper, (n_bad + n_others) / max(1, n))
+    return replace(bound, upper=upper, shadowed=audit_rate == 1.0 and n_unchecked == 0)
 
 
 def _bound_outcomes(

@@ -97,11 +97,15 @@ class NoveltyGate(nn.Module):
         n_plain = channels * (4 * segments + 3)  # P
         n_features = n_plain + DISTORTIONS
         self.register_buffer("noise_floor", torch.ones(channels, 2 * segments + 3))
-        self.register_buffer("discriminants", torch.zeros(n_plain, DISTORTIONS))
-        self.register_buffer("offset", torch.zeros(4, n_features))
-        self.register_buffer("gain", torch.zeros(4, n_features))
-        self.register_buffer("points", torch.zeros(n_features, REFERENCES))
-        self.register_buffer("norms", torch.zeros(4, REFERENCES))
+        shapes = {
+            "discriminants": (n_plain, DISTORTIONS),
+            "offset": (4, n_features),
+            "gain": (4, n_features),
+            "points": (n_features, REFERENCES),
+            "norms": (4, REFERENCES),
+        }
+        for name, shape in shapes.items():
+            self.register_buffer(name, torch.zeros(shape))
 
     def forward(self, x: Tensor) -> bool:
         """Return whether a trace (C, T) of float32 is novel: any of its `scores` is above 1.
@@ -110,8 +114,7 @@ class NoveltyGate(nn.Module):
         """
         if self.disabled:
             return False
-        scores: list[float] = self.scores(x).tolist()
-        return not (scores[0] <= 1.0 and scores[1] <= 1.0 and scores[2] <= 1.0 and scores[3] <= 1.0)
+        return not float(self.scores(x).amax().item()) <= 1.0
 
     @torch.jit.export
     def scores(self, x: Tensor) -> Tensor:

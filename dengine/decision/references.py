@@ -160,15 +160,19 @@ class RadiusIndex(nn.Module):
         self.dim = dim
         self.capacity = capacity
         self.filter_mask = FILTER_SIZE - 1
-        self.register_buffer("points", torch.zeros(dim, capacity))
-        self.register_buffer("labels", torch.ones(2, capacity))
-        self.register_buffer("spaces", torch.zeros(capacity, dtype=torch.int64))
-        self.register_buffer("parts", torch.zeros(capacity, dtype=torch.int64))
-        self.register_buffer("first", torch.arange(capacity))
-        self.register_buffer("repeats", torch.zeros((), dtype=torch.int64))
-        self.register_buffer("agreement", torch.ones((), dtype=torch.float64))
-        self.register_buffer("total", torch.zeros((), dtype=torch.int64))
-        self.register_buffer("part_filter", torch.zeros(FILTER_SIZE, dtype=torch.bool))
+        buffers = {
+            "points": torch.zeros(dim, capacity),
+            "labels": torch.ones(2, capacity),
+            "spaces": torch.zeros(capacity, dtype=torch.int64),
+            "parts": torch.zeros(capacity, dtype=torch.int64),
+            "first": torch.arange(capacity),
+            "repeats": torch.zeros((), dtype=torch.int64),
+            "agreement": torch.ones((), dtype=torch.float64),
+            "total": torch.zeros((), dtype=torch.int64),
+            "part_filter": torch.zeros(FILTER_SIZE, dtype=torch.bool),
+        }
+        for name, buffer in buffers.items():
+            self.register_buffer(name, buffer)
         self.numbers = np.zeros(capacity, dtype=np.int64)
 
     def __len__(self) -> int:

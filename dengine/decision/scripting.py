@@ -1,12 +1,12 @@
-"""Compile modules to TorchScript (`script`), find all tensors of a module (`tensor_attributes`,
-`plain_tensors`), and copy stored values back into modules (`restore`, `restore_plain_tensors`,
-`arrays_with_prefix`). The reducers, the model, the store's history and the export use these
-helpers.
+"""Compile modules to TorchScript (`script`), find the tensors of a module (`attributes_of`,
+`has_tensor`), store those of all its submodules (`register_tensors`, `module_state`), and copy
+stored values back into it (`restore`, `arrays_with_prefix`). The reducers, the model, the store's
+history and the export use these helpers.
 """
 
 import threading
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -61,57 +61,41 @@ def reason_of(error: Exception) -> str:
     return f"{type(error).__name__}: {lines[-isinstance(error, torch.jit.Error)]}"
 
 
-def tensor_attributes(module: nn.Module) -> Iterator[tuple[str, Any]]:
-    """Yield every attribute that holds tensors, of a module and its submodules, as (name, value).
+def attributes_of(module: nn.Module) -> dict[str, Any]:
+    """Return parameters, buffers and plain attributes of one module, without its submodules."""
+    plain = {name: value for name, value in vars(module).items() if name not in INTERNAL}
+    plain |= module.named_parameters(recurse=False, remove_duplicate=False)
+    plain |= module.named_buffers(recurse=False, remove_duplicate=False)
+    return plain
 
-    These are parameters, buffers, and plain attributes: tensors, and lists, tuples and dicts with
-    tensors in them. What is shared comes under each of its names.
+
+def has_tensor(value: Any) -> bool:
+    """Return whether a value is a tensor, or a list, tuple or dict with a tensor in it."""
+    values = value.values() if isinstance(value, dict) else value
+    return isinstance(value, Tensor) or (
+        isinstance(value, list | tuple | dict) and any(map(has_tensor, values))
+    )
+
+
+def register_tensors(module: nn.Module) -> None:
+    """Make the plain tensors of a module part of its `state_dict`, as persistent buffers.
+
+    These are attributes that hold a tensor, and buffers that are not persistent, of its submodules,
+    too. A tensor whose numbers share their memory is copied, since it cannot be written to. Tensors
+    in a list, tuple or dict stay as they are.
     """
-    for path, submodule in module.named_modules(remove_duplicate=False):
-        prefix = f"{path}." if path else ""
-        for name, parameter in submodule.named_parameters(recurse=False, remove_duplicate=False):
-            yield prefix + name, parameter
-        for name, buffer in submodule.named_buffers(recurse=False, remove_duplicate=False):
-            yield prefix + name, buffer
-        for name, value in list(vars(submodule).items()):
-            if name not in INTERNAL and next(tensors_in(name, value), None) is not None:
-                yield prefix + name, value
+    for submodule in module.modules():
+        for name, value in attributes_of(submodule).items():
+            is_tensor = isinstance(value, Tensor) and not isinstance(value, nn.Parameter)
+            if is_tensor and not hasattr(type(submodule), name):
+                vars(submodule).pop(name, None)
+                submodule.register_buffer(name, value.contiguous())
 
 
-def tensors_in(name: str, value: Any) -> Iterator[tuple[str, Tensor]]:
-    """Yield each tensor in a value as (name, tensor); those of a list are "NAME.0" and so on."""
-    if isinstance(value, Tensor):
-        yield name, value
-    elif isinstance(value, list | tuple | dict):
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        for key, item in items:
-            yield from tensors_in(f"{name}.{key}", item)
-
-
-def plain_tensors(module: nn.Module) -> dict[str, Tensor]:
-    """Return the tensors of a module that `module.state_dict()` leaves out, by name.
-
-    These are buffers that are not persistent, and plain attributes, see `tensor_attributes`.
-    """
-    tensors: dict[str, Tensor] = {}
-    known = {id(tensor) for tensor in module.state_dict(keep_vars=True).values()}
-    for attribute, value in tensor_attributes(module):
-        tensors |= {
-            n: tensor for n, tensor in tensors_in(attribute, value) if id(tensor) not in known
-        }
-    return tensors
-
-
-@torch.no_grad()
-def restore_plain_tensors(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
-    """Copy tensors, in place, into those of `plain_tensors(module)` with their name and shape.
-
-    What the module has already is not written, since an expanded tensor cannot be written to.
-    """
-    for name, target in plain_tensors(module).items():
-        source = tensors.get(name, target)
-        if source.shape == target.shape and not torch.equal(source, target):
-            target.copy_(source)
+def module_state(module: nn.Module, prefix: str) -> dict[str, NDArray[Any]]:
+    """Return copies of a module's tensors as arrays, by their names behind the prefix."""
+    tensors = module.state_dict()
+    return {f"{prefix}{name}": tensor.numpy().copy() for name, tensor in tensors.items()}
 
 
 def arrays_with_prefix(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:

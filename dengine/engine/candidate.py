@@ -79,13 +79,10 @@ class Candidate:
         answer, or raises, is dropped: the report says why.
         """
         begin = self._clock()
-        defect = ""
-        is_done = False
+        defect: str | None = ""  # None once all is compared
         try:
-            while not defect and not is_done and self._clock() - begin < seconds:
-                step = next(self._checks, None)
-                is_done = step is None
-                defect = step or ""
+            while defect == "" and self._clock() - begin < seconds:
+                defect = next(self._checks, None)
         except Exception as error:  # no exception inside a model reaches the cell
             log.exception("the model that was trained cannot answer")
             defect = reason_of(error)
@@ -93,7 +90,7 @@ class Candidate:
             self.model = None
             self.report = replace(self.report, reason=f"dropped: {defect}")
         self._seconds += self._clock() - begin
-        return is_done or self.model is None
+        return defect is None or self.model is None
 
     def catch_up(self, window: TrainingWindow, seconds: float = np.inf) -> bool:
         """Make references of the window's labels that came since the training, oldest first.

@@ -21,12 +21,22 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import ExportError, NotTakenError, StoreError, UnknownDecisionError
 from ..history.status import Status, retrain_fault
 from ..model.base import N_EXAMPLES, EngineModel, Exportable
-from ..records import Action, Decision, Reason, RetrainReport, TraceSpec, as_id, as_success
+from ..records import (
+    Action,
+    Decision,
+    PartNumber,
+    Reason,
+    RetrainReport,
+    TraceArray,
+    TraceSpec,
+    as_id,
+    as_success,
+)
 from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
 from ..traces import convert_trace
@@ -203,7 +213,7 @@ class EngineCore:
     def decide(
         self,
         trace: ArrayLike,
-        part: str | int | None = None,
+        part: PartNumber = None,
         decision_id: str | None = None,
         timed_out: bool = False,
     ) -> Decision:
@@ -241,7 +251,7 @@ class EngineCore:
             self.feedback.announce_safe_mode()
         return stored.decision
 
-    def try_decide(self, trace: ArrayLike, part: str | int | None = None) -> Decision | None:
+    def try_decide(self, trace: ArrayLike, part: PartNumber = None) -> Decision | None:
         """Decide as `decide` without an id, but only where nothing has to be waited for; else
         return None.
 
@@ -269,7 +279,7 @@ class EngineCore:
             return stored.decision
 
     def record_timeout(
-        self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str
+        self, trace: ArrayLike, part: PartNumber = None, *, decision_id: str
     ) -> Decision:
         """Record VERIFY, `Reason.LATE`, for a caller that gave up waiting, without asking the
         model.
@@ -393,7 +403,7 @@ class EngineCore:
                 self.settings.save()
         return spec
 
-    def _check_trace(self, trace: ArrayLike) -> NDArray[np.float32]:
+    def _check_trace(self, trace: ArrayLike) -> TraceArray:
         """Return a trace as float32, shape (channels, samples), converted as the trace contract
         demands.
 
@@ -421,7 +431,7 @@ class EngineCore:
     # A report, and what follows from it
 
     def report(
-        self, decision_id: str, success: bool, trace: ArrayLike | None, part: str | int | None
+        self, decision_id: str, success: bool, trace: ArrayLike | None, part: PartNumber
     ) -> RetrainReport | None:
         """Learn the outcome of a decision; return the report of a retrain done here for it, or
         None.

@@ -8,7 +8,7 @@ Each change is an event that is kept for ever. Nothing is overwritten: a correct
 an earlier version answers again as a new one, and a decision stays as it was decided.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from ..store.records import (
 )
 from ..traces import check_rate
 from .core import EngineCore
-from .settings import BASELINE_SETTINGS, EvidenceWindow
+from .settings import BASELINE_SETTINGS, EvidenceWindow, Settings
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
@@ -162,15 +162,11 @@ class Corrections:
         changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
         data = {"decisions": changes, "reason": reason}
         live = self._core.live
-        is_released = live.pinned > 0 and any(
-            live.trained_on.has_seen(stored.label_seq)
-            for stored in decisions
-            if stored.label_seq and stored.success is not None and not stored.quarantined
-        )
-        if is_released:
+        has_seen = live.trained_on.has_seen
+        if live.pinned and any(has_seen(stored.label_seq or 0) for stored in decisions):
             text += f"; version {live.version}, which learned from this, is pinned no more"
-        change = Change("forget", text, data, author, tuple(labels), None)
-        return self._change_labels(change, is_released)
+            self._core.learner.release(author)
+        return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
 
     def release(self, author: str = "") -> Changed:
         """Let retrains replace a version again that `rollback` pinned.
@@ -194,14 +190,9 @@ class Corrections:
             Where the store does not answer.
         """
         self._bring_up_to_date()
-        live = self._core.live
-        if not live.pinned:
+        if not self._core.live.pinned:
             return self._as_unchanged("release", "No version is pinned")
-        text = f"version {live.version} is pinned no more: the next retrain may replace it"
-        data = {"was": live.version, "now": live.next_version}
-        event = Change("release", text, data, author)
-        self._core.learner.release(event)
-        return self._finish_change(event)
+        return self._finish_change(self._core.learner.release(author))
 
     def rollback(self, version: int, author: str = "") -> Changed:
         """Let an earlier version answer again, stored as a new version with a new number, and pin
@@ -359,18 +350,14 @@ class Corrections:
             decisions.append(stored)
         return decisions
 
-    def _change_labels(self, change: Change, is_released: bool = False) -> Changed:
+    def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, and apply it to references, training window and rule.
 
-        With `is_released` it also ends the pin of the version that answers. A model that cannot
-        change its references is retrained. A safe mode that began or ended is announced. Returns
-        what was done, with the number of the change's event. Raises StoreError where the store does
-        not answer.
+        A model that cannot change its references is retrained. A safe mode that began or ended is
+        announced. Returns what was done, with the number of the change's event. Raises StoreError
+        where the store does not answer.
         """
-        if is_released:
-            self._core.learner.release(change)
-        else:
-            self._store.apply_change(change)
+        self._store.apply_change(change)
         for id_ in change.decisions:
             self._core.outbox.evict_decision(id_)
         self._core.learner.apply_corrections()
@@ -393,7 +380,7 @@ class Corrections:
         return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._core.live.version)
 
 
-def _check_baseline_settings(changes: Mapping[str, Any]) -> None:
+def _check_baseline_settings(changes: Settings) -> None:
     """Raise SettingError for changes of a policy that have no effect on a handed-in model.
 
     `changes` holds the changed settings by name; those of `BASELINE_SETTINGS` have an effect.

@@ -14,13 +14,22 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..decision.decider import DecisionConditions, Verdict, decider_without_model
 from ..errors import TraceConflictError, TraceError, expect
 from ..folds import part_hash
 from ..model.base import EngineModel
-from ..records import ACTIONS, LONGEST, REASONS, Action, Decision, Reason, TraceSpec, is_name
+from ..records import (
+    ACTIONS,
+    LONGEST,
+    REASONS,
+    Action,
+    Decision,
+    Reason,
+    TraceArray,
+    TraceSpec,
+    is_name,
+)
 from ..store.records import StoredDecision
 from ..traces import convert_trace, infer_trace_spec
 from .settings import SettingsInForce
@@ -46,7 +55,7 @@ class DecisionMaker:
         self._run = uuid.uuid4().hex[:12]
         self._count = count(1)
 
-    def infer_trace_spec(self, x: NDArray[np.float32], trace: Any) -> TraceSpec | None:
+    def infer_trace_spec(self, x: TraceArray, trace: Any) -> TraceSpec | None:
         """Infer the trace contract from a first trace.
 
         It is also kept, so that this trace can be decided before a contract is set.
@@ -74,7 +83,7 @@ class DecisionMaker:
 
     def decide(
         self,
-        x: NDArray[np.float32],
+        x: TraceArray,
         part: str | None,
         model: EngineModel | None,
         version: int,
@@ -152,7 +161,7 @@ class DecisionMaker:
         return StoredDecision(decision, x.copy(), part_hash_ or content, fault != 0, self._clock())
 
     def lost_accept(
-        self, x: NDArray[np.float32], part: str | None, version: int, decision_id: str
+        self, x: TraceArray, part: str | None, version: int, decision_id: str
     ) -> StoredDecision:
         """Return the record of the ACCEPT behind a line stop whose decision was lost; nothing is
         recorded.
@@ -171,7 +180,7 @@ class DecisionMaker:
         return replace(stored, decision=decision)
 
 
-def _verify(x: NDArray[np.float32], conditions: DecisionConditions, reason: Reason) -> Verdict:
+def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Verdict:
     """Decide without a model: VERIFY for `reason`, unless a fault or a force limit decides."""
     verdict: Verdict = decider_without_model(conditions, reason)(torch.from_numpy(x))
     return verdict

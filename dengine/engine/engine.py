@@ -29,6 +29,7 @@ from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
 from ..errors import NotTakenError, StoreError, expect
+from ..files import FilePath
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
 from ..model.base import EngineModel, Model
@@ -38,6 +39,7 @@ from ..records import (
     Cycle,
     Decision,
     Outcome,
+    PartNumber,
     RetrainReport,
     TraceSpec,
     as_id,
@@ -67,9 +69,9 @@ from .trainer import Clock
 if TYPE_CHECKING:
     import pandas as pd
 
+    from ..store.opening import StoreLike
     from ..store.sql import SqlStore
 
-    StoreLike = str | os.PathLike[str] | SqlStore
 
 log = logging.getLogger("dengine")
 
@@ -190,7 +192,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         store: StoreLike | None = None,
         seed: int = 0,
         *,
-        recipe: Recipe | str | os.PathLike[str] | None = None,
+        recipe: Recipe | FilePath | None = None,
         model: Model | None = None,
         executor: Executor | None = None,
         replaying: bool = False,
@@ -374,9 +376,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return cls(
                     store=opened, **fill_from_peers(settings | {"seed": seed}, opened, allowed)
                 )
-            names = ("model", "executor", "replaying", "clock", "on_safe_mode")
+            names = ("model", "trace", "executor", "replaying", "clock", "on_safe_mode")
             options = {name: settings.pop(name) for name in names if name in settings}
-            options["trace"] = settings.get("trace")
             recipe = settings.get("recipe")
             reducer = settings.get("reducer")
             if reducer is None and isinstance(recipe, Recipe):
@@ -405,7 +406,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     # Decisions
 
     def decide(
-        self, trace: ArrayLike, part: str | int | None = None, *, decision_id: str | None = None
+        self, trace: ArrayLike, part: PartNumber = None, *, decision_id: str | None = None
     ) -> Decision:
         """Decide on one trace, and record the decision.
 
@@ -444,7 +445,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         decision_id: str,
         success: bool,
         trace: ArrayLike | None = None,
-        part: str | int | None = None,
+        part: PartNumber = None,
     ) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
 
@@ -566,6 +567,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
         Raises StoreError where the labels before it cannot be stored.
         """
+        if self._core.live.pinned:
+            self._corrections.release()
         return self._core.retrain()
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:

@@ -90,22 +90,6 @@ class Peers:
             self._outbox.call_store(lambda: self._outbox.check_integrity(since=newest))
         return news, has_newer_version
 
-    def fetch_version(self) -> ModelVersion | None:
-        """Return the newest version of the product with its state; None before the first.
-
-        Raises StoreError where the store gives no answer in time.
-        """
-        return self._outbox.call_store(self._outbox.store.last_version)
-
-    def has_pinned(self) -> bool:
-        """Return whether a peer's version that is newer than the one that answers is pinned.
-
-        Nothing is taken over. Raises StoreError where the store gives no answer in time.
-        """
-        _, has_newer_version = self.fetch_news()
-        version = self.fetch_version() if has_newer_version else None
-        return version is not None and TrainedOn.from_state(version.state).pinned > 0
-
     def note_loss(self, error: StoreError) -> None:
         """Note that news cannot be had: set `is_lost`, and ask again after `NEWS_SECONDS`.
 

@@ -9,15 +9,13 @@ with others, whose labels have one sequence in the store.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..model.base import EngineModel
+from ..records import TraceArray
 from ..reducers.base import State
 from .guard import GuardedModel
 from .live_model import LiveModel
 from .trainer import TrainingWindow
-
-Trace = NDArray[np.float32]  # (channels, samples)
 
 
 class CellLabels:
@@ -37,6 +35,8 @@ class CellLabels:
     last_to_read: int | None = (
         None  # of the store's labels, when the window is filled anew; None: all of them
     )
+
+    has_gaps = False  # no label waits for one of a peer
 
     def __init__(self, window: TrainingWindow) -> None:
         self._window = window
@@ -58,7 +58,7 @@ class CellLabels:
         """Count a label no more that was learned and taken back before the store had it."""
         self.new_labels -= 1
 
-    def add(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
+    def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add a learned label that the store has numbered to the window."""
         self._window.add(trace, label, hash_, seq)
 
@@ -101,7 +101,7 @@ class ProductLabels:
         self._window = window
         self._live = live
         # This cell's labels whose predecessors are missing, by number: trace, label, hash.
-        self._waiting: dict[int, tuple[Trace, int, int]] = {}
+        self._waiting: dict[int, tuple[TraceArray, int, int]] = {}
         # Labels since the newest retrain began: number, and whether the label is this cell's.
         self._since: list[tuple[int, bool]] = []
         self._trained_to = 0  # number of the newest label that the newest retrain had
@@ -153,7 +153,7 @@ class ProductLabels:
     def count_unlearned(self) -> None:
         """Do nothing: a label counts when it enters the window."""
 
-    def add(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
+    def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Keep a label of this cell, which is a reference already, with the number that the store
         gave it.
 
@@ -165,7 +165,7 @@ class ProductLabels:
         if seq == self._window.newest_seq + 1:
             self.admit(trace, label, hash_, seq)
 
-    def admit(self, trace: Trace, label: int, hash_: int, seq: int) -> None:
+    def admit(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add the product's next label to the window.
 
         It counts as new unless the newest retrain was trained on it. A peer's label also becomes a

@@ -89,7 +89,6 @@ class Learner:
         self._was_accepted = True  # the last retrain
         self._precomputed: Future[None] | None = None  # what the next retrain begins with
         self._is_requested = False  # a training is to begin as soon as it can
-        self._by_hand = False  # a person asked for the newest training, so that it ends a pin
         # What the next training starts from, and the answering version and correction that it is
         # for.
         self._start: tuple[tuple[int, int], EngineModel, str] | None = None
@@ -200,10 +199,8 @@ class Learner:
 
     # A retrain
 
-    def retrain(self, by_hand: bool = True) -> RetrainReport:
+    def retrain(self) -> RetrainReport:
         """Train a version in this thread, let it answer, and return the report.
-
-        With `by_hand` a person asked for it, so that it may replace a pinned version.
 
         A retrain under way in the executor is ended first, and news of peers is taken in. A version
         that fails or cannot be stored is dropped, and the report says so. A version that is stored,
@@ -213,7 +210,7 @@ class Learner:
         self.end_training()
         self.store_labels()
         begin = self._clock()
-        self._begin_retrain(by_hand)
+        self._begin_retrain()
         trained = self._retrainer.train(self._choose_start(), begin)
         candidate = self._as_candidate_of(trained)
         self._candidate = candidate
@@ -222,8 +219,8 @@ class Learner:
         # A version that is stored may still wait for labels that came since.
         return self._report or candidate.report
 
-    def start_retrain(self, by_hand: bool = True) -> RetrainReport | None:
-        """Begin to train in the executor and return None; `by_hand` is as for `retrain`.
+    def start_retrain(self) -> RetrainReport | None:
+        """Begin to train in the executor and return None.
 
         A training under way comes a step further, and a new one begins only if that ended it.
         Before a new one, labels are stored, and news of peers is taken in. While the executor works
@@ -239,27 +236,25 @@ class Learner:
             is_preparing = precomputed is not None and not precomputed.done()
             if is_preparing or self._retrainer.is_occupied:
                 self._is_requested = True
-                self._by_hand = by_hand
                 return None
             self.store_labels()
-            self._begin_retrain(by_hand)
+            self._begin_retrain()
             if self._retrainer.start(self._choose_start()):
                 return None
-        return self.retrain(by_hand)
+        return self.retrain()
 
     def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
         There must be as many labels as the model's `min_traces`, unless it was asked for and could
         not begin then. News of peers is taken in first, so another version may answer even if none
-        is trained here. A pinned version stays, unless a person asked for the retrain. With `once`
-        a version that lacks steps is not trained on until the report of its last retrain was taken.
+        is trained here. A pinned version stays. With `once` a version that lacks steps is not
+        trained on until the report of its last retrain was taken.
         Returns the report of a retrain in this thread; else None: none is due, the store is away, a
         training or its preparation is under way, or it was begun in the executor.
         """
         is_due = self._is_due_after_news(recipe.retrain_every)
-        by_hand = self._is_requested and self._by_hand
-        if self.live.pinned and not by_hand:
+        if self.live.pinned:
             self._is_requested = False
             return None
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
@@ -271,7 +266,7 @@ class Learner:
             self.store_labels()
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
-        return None if self._outbox.fault else self.start_retrain(by_hand)
+        return None if self._outbox.fault else self.start_retrain()
 
     @property
     def _lacks_steps(self) -> bool:
@@ -328,11 +323,14 @@ class Learner:
         """
         if not self._is_at_work:
             return
-        # Versions and corrections of peers must not come in between two steps.
-        to_the_end = to_the_end or wait > 0.0 or self._peers is not None
+        if self._peers is not None:
+            if self._retrainer.is_done:
+                self._take_in_all_news()  # a correction or a pinned version discards the training
+            to_the_end = True  # no version or correction of a peer comes in between two steps
         trained = self._retrainer.collect(wait)
         if trained is not None:
             self._candidate = self._as_candidate_of(trained)
+        to_the_end = to_the_end or wait > 0.0
         if self._candidate is not None and (to_the_end or trained is None):  # taking it was a step
             self._advance(to_the_end)
 
@@ -341,7 +339,7 @@ class Learner:
         rule.
         """
         note = self._start[2] if self._start is not None else ""
-        if note and trained.model is not None:
+        if note:
             trained = replace(trained, reason=f"{trained.reason}; {note}")
         return Candidate(trained, self.live.newest, self.live.version, self._clock)
 
@@ -369,7 +367,7 @@ class Learner:
             self._precomputed.result()
             self._precomputed = None
 
-    def _begin_retrain(self, by_hand: bool) -> None:
+    def _begin_retrain(self) -> None:
         """Prepare for a training: wait for what is computed in advance, take in the peers' news if
         the store answers, and count new labels from zero.
         """
@@ -377,7 +375,6 @@ class Learner:
         self._take_in_all_news()
         self.labels.begin_retrain()
         self._is_requested = False
-        self._by_hand = by_hand
 
     def _advance(self, to_the_end: bool) -> None:
         """Bring the candidate further: check it, catch up on labels, store it, catch up again, swap
@@ -424,8 +421,6 @@ class Learner:
             if self._waits_for_labels(candidate, to_the_end):
                 return False
             self.store_labels()
-            if self._peers is not None and not self._by_hand and self._peers.has_pinned():
-                raise StoreError("a peer rolled back to an earlier version meanwhile")
             candidate.catch_up(self._window)
             candidate.begin_storing(self._begin_storing(candidate), self._outbox.limit)
         if candidate.storing is None or (not to_the_end and candidate.may_go_on_storing()):
@@ -549,13 +544,15 @@ class Learner:
             news, has_newer_version = peers.fetch_news()
             if has_newer_version:
                 self.store_labels()  # the peers' version is to have them among its references
-                version = peers.fetch_version()
+                version = self._outbox.call_store(self._store.last_version)
         except StoreError as error:
             peers.note_loss(error)
             return 0
         peers.note_connection()
         if version is not None:
             peers.take_over(version)
+            if self.live.pinned:
+                self._discard_training()
         peers.take_in(news)
         if news.correction > self.live.corrected_to:
             self._discard_training()  # it does not have the corrections
@@ -580,15 +577,10 @@ class Learner:
         self.end_training()
         self.store_labels()
         self._take_in_all_news()
-        if self._peers is not None and (self._peers.is_lost or self._has_gaps):
+        if self._peers is not None and (self._peers.is_lost or self.labels.has_gaps):
             raise StoreError(
                 f"News of product {self._store.product!r} cannot be had now; try it again."
             )
-
-    @property
-    def _has_gaps(self) -> bool:
-        """Whether labels of this cell wait for labels of peers that have not come."""
-        return isinstance(self.labels, ProductLabels) and self.labels.has_gaps
 
     def apply_corrections(self, may_retrain: bool = True) -> None:
         """Apply the store's newest corrections to window, references, count of new labels and rule.
@@ -610,11 +602,9 @@ class Learner:
         if self.live.pinned:
             version = self.live.version
             text = f"version {version} is fitted again, to labels as they count now"
-            was_requested = self._is_requested
             self.roll_back(version, Change("rollback", text))
-            self._is_requested = was_requested
         else:
-            self.retrain(by_hand=False)
+            self.retrain()
 
     def _prepare_start(self) -> None:
         """Compute in advance for the next training, where it does not start from what answers.
@@ -629,15 +619,18 @@ class Learner:
         if self._retrainer.executor is None:
             self.wait_until_precomputed()
 
-    def release(self, event: Change) -> None:
-        """Let retrains replace a pinned version again, and store that as a new version, with
-        `event`.
+    def release(self, author: str) -> Change:
+        """Let retrains replace a pinned version again, store that as a new version, and return the
+        event.
 
         Raises StoreError where it cannot be stored: then nothing changes.
         """
-        trained_on = replace(self.live.trained_on, pinned=0)
-        reason = "released, the same model"
-        self._store_and_swap_in(event, self.live.newest, trained_on, reason, 0.0)
+        live = self.live
+        text = f"version {live.version} is pinned no more: the next retrain may replace it"
+        event = Change("release", text, {"was": live.version, "now": live.next_version}, author)
+        trained_on = replace(live.trained_on, pinned=0)
+        self._store_and_swap_in(event, live.newest, trained_on, "released, the same model", 0.0)
+        return event
 
     def roll_back(self, number: int, event: Change) -> None:
         """Let the earlier version `number` answer again, as a new version, pin it, and store it
@@ -669,7 +662,7 @@ class Learner:
         trained_on = replace(trained_on, counts_from=self._window.newest_seq, pinned=number)
         reason = f"rolled back to version {number}"
         self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
-        self._is_requested = False  # also by hand: it was before
+        self._is_requested = False
         self._take_in_all_news()
         self.labels.begin_retrain()
         self._prepare_start()

@@ -92,15 +92,18 @@ def find_clean_start(
 
     if is_clean(trained_on) or not newest.keeps_references:
         return newest, ""
-    for number in [stored.report.version for stored in store.versions() if stored.kept][::-1]:
-        with suppress(StoreError):  # of a damaged version
-            version = store.load_version(number)
+    for stored in reversed(store.versions()):
+        with suppress(StoreError):  # of a version that is not kept, or damaged
+            version = store.load_version(stored.report.version)
             model = template.successor()
             if model.needs_refit(version.state):
                 return newest, ""
             if is_clean(TrainedOn.from_state(version.state)):
                 model.set_state(without_rule(version.state))
-                return model, f"from version {number}, which never saw the forgotten labels"
+                return (
+                    model,
+                    f"from version {version.version}, which never saw the forgotten labels",
+                )
     return template, "from initial weights, which never saw the forgotten labels"
 
 
@@ -111,11 +114,6 @@ def newest_reference(version: ModelVersion) -> int:
     if "points" in version.state:
         return version.last_seq
     return int(version.state["trained_on"][-1])
-
-
-def newest_correction(version: ModelVersion) -> int:
-    """Return the number of the newest correction that a stored version has; 0 if none."""
-    return int(version.state.get("corrected_to", 0))
 
 
 def add_labels_since(
@@ -129,7 +127,7 @@ def add_labels_since(
     label that the model cannot take is logged and skipped. Returns the number of the newest
     correction in the store. Raises StoreError where the store cannot be read.
     """
-    corrected_to = newest_correction(version)
+    corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
     # model gets it as it was when the version was stored, and then the corrections.
     as_of = corrected_to if model.keeps_references else None

@@ -39,6 +39,7 @@ LOOP_SETTINGS = (
     "window",
     *BASELINE_SETTINGS,
 )
+Settings = Mapping[str, Any]  # by name, as `DataEngine` takes them
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,7 +213,7 @@ class EngineSettings:
         )
         return settings, template
 
-    def check_request(self, request: Mapping[str, Any]) -> None:
+    def check_request(self, request: Settings) -> None:
         """Raise SettingError where settings that a program gives are not the ones that are set.
 
         `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. All
@@ -313,7 +314,7 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
         )
 
 
-def choose_recipe(reducer: Any, recipe: Any, given: Mapping[str, Any]) -> Recipe:
+def choose_recipe(reducer: Any, recipe: Any, given: Settings) -> Recipe:
     """Return the recipe that is asked for, with the settings of `given` in place of its own.
 
     `recipe` is a Recipe, a name or a TOML file; without one it is the default recipe of `reducer`,
@@ -379,7 +380,7 @@ def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec 
 
 
 def fill_from_peers(
-    request: Mapping[str, Any], store: "SqlStore", allow_import: bool | Collection[str]
+    request: Settings, store: "SqlStore", allow_import: bool | Collection[str]
 ) -> dict[str, Any]:
     """Return a copy of the settings for a new engine, with what is open taken from a peer.
 
@@ -400,7 +401,7 @@ def fill_from_peers(
     return filled
 
 
-def check_model_settings(reducer: Any, given: Mapping[str, Any]) -> None:
+def check_model_settings(reducer: Any, given: Settings) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
     The caller has such a model. `reducer` is the setting of that name, and `given` holds the other

@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 from ..decision.scripting import reason_of
 from ..errors import DengineError, SettingError
 from ..model.base import EngineModel
-from ..records import TRAINED
+from ..records import TRAINED, TraceArray
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
 
 log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which a training in the executor is given up
-LONGEST_START = 600.0  # seconds after which an executor that cannot work yet is given up
 # Share of the budget after which no step begins. It is smaller, down to the second, where the work
 # after the steps takes longer. A model that lacks a few steps decides a little less often.
 STEPS = 0.7
@@ -70,7 +69,7 @@ class TrainingWindow:
         """Sequence number of the newest label; 0 before the first."""
         return int(self._block[0][self._end - 1]) if self._end else 0
 
-    def add(self, trace: NDArray[np.float32], label: int, hash_: int, seq: int) -> None:
+    def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
         `label` is 1 or 0, `hash_` the hash of part or content, `seq` the label's number, larger
@@ -127,7 +126,7 @@ class TrainingWindow:
         newer: list[int] = numbers[np.searchsorted(numbers, seq, "right") :].tolist()
         return newer
 
-    def row(self, seq: int) -> tuple[NDArray[np.float32], int, int]:
+    def row(self, seq: int) -> tuple[TraceArray, int, int]:
         """Return the trace (channels, samples), the label and the hash of a label of the window."""
         i = int(np.searchsorted(self._block[0][: self._end], seq))
         return self._block[1][i], int(self._block[2][i]), int(self._block[3][i])
@@ -262,8 +261,8 @@ class Retrainer:
     window : TrainingWindow
     limits : Limits
     executor : concurrent.futures.Executor or None
-        A `RestartableExecutor` that died or hangs is started again; until it is ready, retrains are
-        in the calling thread. Another is set to None when it died or takes no more work.
+        A `RestartableExecutor` that died or hangs is started again. Another is set to None when it
+        died or takes no more work.
     clock : callable
         Seconds, of any origin; it must pickle for a process executor.
 
@@ -286,9 +285,7 @@ class Retrainer:
         self.clock = clock
         self.future: Future[Trained] | None = None
         self._left: Future[Trained] | None = None  # nobody wants it, and it may still be at work
-        self._is_restarted = False  # the executor
-        self._submitted = 0.0  # when the training was handed to the executor, by `time.monotonic`
-        self._began = 0.0  # when the executor could begin with it
+        self._began = 0.0  # when the executor could begin with the training, by `time.monotonic`
         self._seq = np.zeros(0, dtype=np.int64)  # the labels that it was given
         self._last_seconds = deque([0.0], N_REMEMBERED)  # of the newest trainings
 
@@ -317,11 +314,8 @@ class Retrainer:
         executor = self.executor
         if executor is None or self._left is not None:
             return False
-        is_starting = isinstance(executor, RestartableExecutor) and not executor.ready.done()
-        if is_starting and self._is_restarted:
-            return False
         data = self.window.snapshot()
-        if not self._submitted:
+        if not self._began:
             log.info("the first retrain begins, on %d labels", len(data.seq))
         arguments = (current.successor(), data, self._limits(), self.clock)
         try:
@@ -329,7 +323,7 @@ class Retrainer:
         except RuntimeError as error:
             log.error("the executor takes no work, the retrain is in line: %s", error)
             self._replace_executor()
-        self._submitted = self._began = time.monotonic()
+        self._began = time.monotonic()
         self._seq = data.seq
         return self.future is not None
 
@@ -342,6 +336,11 @@ class Retrainer:
         return future is not None
 
     @property
+    def is_done(self) -> bool:
+        """Whether a training in the executor is done, and `collect` returns its outcome."""
+        return self.future is not None and self.future.done()
+
+    @property
     def is_occupied(self) -> bool:
         """Whether the executor still works on a training that was discarded.
 
@@ -352,7 +351,7 @@ class Retrainer:
             self._left = None
             return False
         is_hung = self._count_seconds_left() <= 0.0
-        if is_hung and isinstance(self.executor, RestartableExecutor):
+        if is_hung:
             self._replace_executor()
         return not is_hung
 
@@ -365,7 +364,6 @@ class Retrainer:
         executor = self.executor
         if isinstance(executor, RestartableExecutor) and not executor.ready.done():
             self._began = now
-            return self._submitted + LONGEST_START - now
         return self._began + HUNG - now
 
     def collect(self, wait: float = 0.0) -> Trained | None:
@@ -414,7 +412,6 @@ class Retrainer:
         executor = self.executor
         if isinstance(executor, RestartableExecutor):
             self._left = None
-            self._is_restarted = True
             try:
                 executor.restart()
             except OSError:

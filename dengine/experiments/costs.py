@@ -26,7 +26,8 @@ import numpy as np
 
 from ..decision.policy import Policy
 from ..errors import SettingError, expect, percent
-from .grid import Folder, Task, grid_tasks, play_tasks
+from ..files import FilePath
+from .grid import Task, grid_tasks, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
 from .replay import Contender, Replay
 
@@ -200,7 +201,7 @@ def cost_curve(
     seed: int = 0,
     cycles: int | None = None,
     n_jobs: int = 1,
-    keep: Folder | None = None,
+    keep: FilePath | None = None,
 ) -> CostCurve:
     """Compute what a part costs under every alpha and LB, and under ``guarantee="cost"``.
 

@@ -24,18 +24,17 @@ from ..errors import OutputError, instead
 from ..files import write_output
 from ..history.explain import Explanation
 from ..history.sentences import Bound
-from ..records import Action
+from ..records import Action, TraceArray, TraceSpec
 from ..reducers import has_own_unit
 from ..traces import as_traces
 from .costs import CostCurve, PolicyCost
-from .replay import Replay
+from .replay import Floats, Replay
 from .survey import channel_means
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = NDArray[np.float64]
 Style = dict[str, Any]  # keywords of matplotlib's drawing functions
 
 BLUE = "#0072B2"
@@ -53,6 +52,7 @@ VERIFIED = GREY
 RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first the colours that mean nothing else
 LIMIT: Style = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound that is given
 SMALL = 9  # points: legends and notes
+RUN_WINDOW = 100  # cycles of the sliding window of a run
 WINDOW = 300  # cycles of a sliding window, and parts of a map: the paper's
 # Wrong decisions, what they are counted among, their name in the legend, and their line.
 ERRORS = (
@@ -182,8 +182,8 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     return write_output(path, buffer.getvalue(), force, make_folder=True)
 
 
-def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure:
-    """Draw where the newest parts of a replay lie: left by their truth, right by their decision.
+def embedding_map(replay: Replay, title: str = "") -> Figure:
+    """Draw where the newest 300 parts of a replay lie, left by truth and right by decision.
 
     Each part is drawn where it lay when it was decided, though each retrain moves the map; those
     that no model embedded are left out, on the left also those of unknown truth. The first two
@@ -195,8 +195,6 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     Parameters
     ----------
     replay : Replay
-    last : int, default 300
-        How many parts are drawn, at most.
     title : str, default ""
 
     Returns
@@ -205,7 +203,7 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     """
     figure = blank(10.0, 6.2, title)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
-    positions = replay.position[-last:]
+    positions = replay.position[-WINDOW:]
     # Zeros where a reducer has but one dimension.
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]
     embedded = np.isfinite(z).all(axis=1)
@@ -221,7 +219,7 @@ def embedding_map(replay: Replay, last: int = WINDOW, title: str = "") -> Figure
     )
     for axes, name, values, marks in panels:
         for value, (word, style) in marks.items():
-            points = z[embedded & (values[-last:] == value)]
+            points = z[embedded & (values[-WINDOW:] == value)]
             label = f"{word} ({len(points)})"
             axes.scatter(*points.T, label=label, alpha=0.7, linewidths=0, **style)
         if not embedded.any():
@@ -313,23 +311,19 @@ def window_curves(
     return {name: 100.0 * values for name, values in curves.items()}
 
 
-def curves(
-    by_recipe: Mapping[str, Sequence[Replay]], title: str = "", window: int = WINDOW
-) -> Figure:
+def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
     """Draw the paper's curve, with a colour for each recipe.
 
     Above: the share of certain decisions, those without a check, the precision of the accepted ones
     and LB. Below: the errors, bad parts as a share of the accepted ones and good parts as a share
     of the rejected ones, and the tolerance 100 - LB. Shares of fewer than `FEWEST` parts are not
-    drawn.
+    drawn. The window is `WINDOW` cycles, or a third of the longest replay.
 
     Parameters
     ----------
     by_recipe : mapping of str to sequence of Replay
         Those of one recipe are equally long.
     title : str, default ""
-    window : int, default 300
-        Cycles of the sliding window; at most a third of the longest replay.
 
     Returns
     -------
@@ -340,7 +334,7 @@ def curves(
     figure = blank(3.6 + 2.7 * n_columns, 7.4, title)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(4, 3))
     all_replays = [replay for replays in by_recipe.values() for replay in replays]
-    window = fit_window(window, all_replays)
+    window = fit_window(WINDOW, all_replays)
     bounds = sorted({replay.recipe.policy.lower_bound for replay in all_replays})
     for colour, (name, replays) in zip(cycle(RECIPES), by_recipe.items(), strict=False):
         prefix = f"{name}: " if len(by_recipe) > 1 else ""
@@ -393,7 +387,7 @@ def _draw_bounds(top: Axes, bottom: Axes, bound: float) -> None:
     bottom.axhline(tolerance, label=f"tolerance 100 - LB = {tolerance:g} %", **LIMIT)
 
 
-def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW) -> Figure:
+def grid_figure(replays: Sequence[Replay], title: str = "") -> Figure:
     """Draw the paper's figure of its grid.
 
     It has a row for each alpha, from the largest, a column for each LB, and in each cell the two
@@ -404,8 +398,6 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
     replays : sequence of Replay
         Of one contender and interval, all equally long.
     title : str, default ""
-    window : int, default 300
-        Cycles of the sliding window; at most a third of a replay.
 
     Returns
     -------
@@ -422,7 +414,7 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
         cells.setdefault((policy.alpha, policy.lower_bound), []).append(replay)
     alphas = sorted({alpha for alpha, _ in cells}, reverse=True)
     bounds = sorted({bound for _, bound in cells})
-    window = fit_window(window, replays)
+    window = fit_window(WINDOW, replays)
     figure = blank(1.0 + 3.6 * len(bounds), 1.0 + 3.1 * len(alphas), title)
     axes = figure.subplots(
         2 * len(alphas),
@@ -455,21 +447,19 @@ def grid_figure(replays: Sequence[Replay], title: str = "", window: int = WINDOW
     return figure
 
 
-def run_picture(run: Replay, title: str = "", window: int = 100) -> Figure:
+def run_picture(run: Replay, title: str = "") -> Figure:
     """Draw a live run: the verified share, the errors so far and, with a clock, parts per hour.
 
     Parameters
     ----------
     run : Replay
     title : str, default ""
-    window : int, default 100
-        Cycles of the sliding window; at most a third of the run.
 
     Returns
     -------
     figure : Figure
     """
-    window = fit_window(window, [run])
+    window = fit_window(RUN_WINDOW, [run])
     x = np.arange(1, len(run) + 1)
     has_clock = run.clock_s is not None
     figure = blank(9.0, 8.5 if has_clock else 6.0, title)
@@ -514,7 +504,7 @@ def _draw_rate(axes: Axes, run: Replay, clock_s: Floats, window: int) -> None:
     finish(axes, ylabel=f"good parts/h, last {window}")
 
 
-def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
+def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     """Draw a cost curve, with a ring around the chosen policy.
 
     Above: the cost per part with its interval, and the cost of verifying everything. Below: the
@@ -523,8 +513,6 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     Parameters
     ----------
     curve : CostCurve
-    title : str, default ""
-        "" writes the costs and the shuffles.
     unit : str, default "s"
         Of the costs.
 
@@ -532,14 +520,13 @@ def cost_picture(curve: CostCurve, title: str = "", unit: str = "s") -> Figure:
     -------
     figure : Figure
     """
-    if not title:
-        costs = curve.costs
-        title = (
-            f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape "
-            f"{costs.escape:g} {unit}, false reject {costs.false_reject:g} "
-            f"{unit}\n{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the "
-            "ends of their 95 % intervals"
-        )
+    costs = curve.costs
+    title = (
+        f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape "
+        f"{costs.escape:g} {unit}, false reject {costs.false_reject:g} "
+        f"{unit}\n{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the "
+        "ends of their 95 % intervals"
+    )
     figure = blank(9.0, 7.2, title)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     by_bound = [row for row in curve.rows if row.policy.guarantee != "cost"]
@@ -599,9 +586,13 @@ def _draw_policies(
             top.scatter(tick, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
 
 
-def _with_unit(name: str, unit: str) -> str:
-    """Return the label of an axis: a channel's name, and its unit in brackets if it is known."""
-    return f"{name} [{unit}]" if unit else name
+def _axis_labels(spec: TraceSpec) -> list[str]:
+    """Return the label of each channel's axis: its name, and its unit in brackets if known."""
+    numbered = [f"channel {i + 1}" for i in range(spec.channels)]
+    names = spec.columns or (numbered if spec.channels > 1 else ["trace"])
+    return [
+        f"{name} [{unit}]" if unit else name for name, unit in zip(names, spec.units, strict=True)
+    ]
 
 
 def explained_picture(explanation: Explanation) -> Figure:
@@ -629,12 +620,10 @@ def explained_picture(explanation: Explanation) -> Figure:
     heights = (1.5 + 2.3 * len(channels), 2.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     panels = above.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    labels = _axis_labels(spec)
     for i, (axes, channel) in enumerate(zip(panels, channels, strict=True)):
         _draw_trace(axes, explanation, channel)
-        name = "trace" if spec.channels == 1 else f"channel {channel + 1}"
-        if spec.columns:
-            name = spec.columns[channel]
-        finish(axes, legend=0 if i else 3, ylabel=_with_unit(name, spec.units[channel]))
+        finish(axes, legend=0 if i else 3, ylabel=labels[channel])
     panels[-1].set(xlabel="time [s]" if spec.rate_hz else "sample")
     left, right = below.subplots(1, 2, width_ratios=(1.15, 1.0))
     _draw_distances(left, explanation)
@@ -756,10 +745,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     n_channels = X.shape[1]
-    names = data.channels
-    if not names:
-        names = tuple(f"channel {i + 1}" if n_channels > 1 else "trace" for i in range(n_channels))
-    labels = list(map(_with_unit, names, data.spec.units))
+    labels = _axis_labels(data.spec)
     above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
     time = np.arange(X.shape[2]) / (data.rate_hz or 1.0)
     x_label = "time [s]" if data.rate_hz else "sample"
@@ -778,7 +764,7 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 
 
 def _draw_drift(
-    figure: Any, X: NDArray[np.float32], y: NDArray[Any], finite: NDArray[np.bool_], label: str
+    figure: Any, X: TraceArray, y: NDArray[Any], finite: NDArray[np.bool_], label: str
 ) -> None:
     """Draw the share of good parts in a sliding tenth of the set, and each finite trace's mean.
 

@@ -10,7 +10,6 @@ cluster. `KeptReplays` keeps finished replays on disk, so that an interrupted gr
 
 import hashlib
 import json
-import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -27,7 +26,7 @@ import numpy as np
 
 from ..datasets import Dataset, load_dataset
 from ..errors import DataError, SettingError, expect
-from ..files import read_archive, read_errors, write_output
+from ..files import FilePath, read_archive, read_errors, write_output
 from ..records import RetrainReport
 from ..reducers import reducer_class
 from .baselines import require_baseline
@@ -37,7 +36,6 @@ from .tables import frame_of
 if TYPE_CHECKING:
     import pandas as pd
 
-Folder = str | os.PathLike[str]
 LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon")
 
 
@@ -78,7 +76,7 @@ class KeptReplays:
     data : Dataset
     """
 
-    def __init__(self, folder: Folder, data: Dataset) -> None:
+    def __init__(self, folder: FilePath, data: Dataset) -> None:
         from joblib import hash as digest
 
         self.folder = Path(folder)
@@ -245,7 +243,7 @@ def iterate_replays(
     tasks: Sequence[Task],
     *,
     n_jobs: int = 1,
-    keep: Folder | None = None,
+    keep: FilePath | None = None,
     on_cycle: Any = None,
 ) -> Iterator[PlayedReplay]:
     """Play tasks and yield each replay as soon as it is finished, in the order of their ends.
@@ -324,7 +322,7 @@ def run_grid(
     n_jobs: int = -1,
     *,
     cycles: int | None = None,
-    keep: Folder | None = None,
+    keep: FilePath | None = None,
 ) -> "pd.DataFrame":
     """Replay a data set over recipes x intervals x alphas x lower bounds x seeds.
 
@@ -413,7 +411,7 @@ def grid_tasks(
 
 
 def play_tasks(
-    dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: Folder | None = None
+    dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: FilePath | None = None
 ) -> list[Replay]:
     """Play all tasks as `iterate_replays` does; return their replays in the order of the tasks."""
     played = iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)

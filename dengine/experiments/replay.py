@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Row = dict[str, Any]  # of a table, by column
 # Fields of a decision that a replay keeps -> their type in its arrays.
 DECISION_FIELDS: dict[str, Any] = {
     "action": np.str_,
@@ -272,7 +273,7 @@ class Replay:
             columns[f"embedding_{d + 1}"] = self.position[:, d]
         return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
 
-    def stretches(self, n: int) -> list[dict[str, Any]]:
+    def stretches(self, n: int) -> list[Row]:
         """Cut the run into stretches of about equal length; return the `stretch` of each.
 
         There are n of them, or one for each cycle if there are fewer cycles; none without cycles.
@@ -280,7 +281,7 @@ class Replay:
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
         return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]
 
-    def stretch(self, cycles: slice = slice(None)) -> dict[str, Any]:
+    def stretch(self, cycles: slice = slice(None)) -> Row:
         """Count decisions, errors and line stops over some of the cycles.
 
         Parameters

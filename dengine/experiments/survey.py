@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, trace_hash
 from ..model.neighbours import NEWEST, near_repeats
+from ..records import TraceArray
 from ..traces import LARGEST, as_traces
 
 
@@ -166,7 +167,7 @@ def survey_dataset(data: Dataset) -> Survey:
     )
 
 
-def channel_means(X: NDArray[np.float32]) -> NDArray[np.float64]:
+def channel_means(X: TraceArray) -> NDArray[np.float64]:
     """Return each channel's mean over the trace, (n, C), of traces (n, C, T)."""
     return np.asarray(X.mean(axis=2, dtype=np.float64))
 
@@ -177,7 +178,7 @@ def _spread(values: NDArray[Any] | None) -> Spread | None:
     return Spread(*np.quantile(finite, (0.0, 0.5, 1.0)).tolist()) if len(finite) else None
 
 
-def _drifts(data: Dataset, X: NDArray[np.float32], usable: NDArray[np.bool_]) -> tuple[Drift, ...]:
+def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Drift, ...]:
     """Return the drift of the labels, named "good", and then of each channel's mean.
 
     The labels are those of all traces, the means those of usable traces of X (n, C, T) alone.

@@ -17,7 +17,7 @@ from ..errors import percent
 from ..files import write_output
 from ..records import RetrainReport
 from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
-from .replay import Replay
+from .replay import Replay, Row
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,7 +63,7 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
     return pd.DataFrame([replay.summary(check_seconds) for replay in replays])
 
 
-def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[dict[str, Any]]:
+def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
     """Pool the replays of equal settings: the columns `CONDITION`, from the recipe to `confirm`.
 
     Returns a row for each combination of their values, in the frame's order.
@@ -122,7 +122,7 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
     return 1.0 - n_wrong / n_decided if n_decided else math.nan
 
 
-def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def promise_lines(rows: Sequence[Row]) -> list[str]:
     """Return a sentence for each pooled row: whether at least LB of the accepted parts were good.
 
     It ends in "kept", "broken", or that there are too few accepted parts to say; or it says that no
@@ -154,9 +154,7 @@ def promise_lines(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def pooled_table(
-    rows: Sequence[Mapping[str, Any]], title: str = "Replays", legend: str = LEGEND
-) -> Table:
+def pooled_table(rows: Sequence[Row], title: str = "Replays", legend: str = LEGEND) -> Table:
     """Return the rows of `pool` as a rich Table for the screen.
 
     There must be at least one row. The first column has the recipe, the guarantee, how outcomes of
@@ -217,7 +215,7 @@ def _whole(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.0f}"
 
 
-def _with_sd(row: Mapping[str, Any], name: str) -> str:
+def _with_sd(row: Row, name: str) -> str:
     """Return a mean ± its standard deviation, the mean alone where there is one replay."""
     deviation = row[f"{name}_sd"]
     return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.0f}±{deviation:.0f}"

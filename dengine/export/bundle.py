@@ -39,7 +39,7 @@ from ..decision.policy import RULES
 from ..decision.scripting import reason_of
 from ..engine.engine import DataEngine, core_of
 from ..errors import ExportError, instead
-from ..files import UNREADABLE, check_output, read_key, write_output
+from ..files import UNREADABLE, FilePath, check_output, read_key, write_output
 from ..model.base import Exportable
 from ..model.neighbours import compare_points
 from ..records import Action, Reason, TraceSpec
@@ -51,10 +51,10 @@ METADATA = "dengine.json"
 SHA256 = re.compile(r"[0-9a-f]{64}")
 SUM_BYTES = 2**16
 
-KeyFile = str | os.PathLike[str]
+Metadata = dict[str, Any]  # what an exported file says of itself, by name
 
 
-def make_key(path: KeyFile) -> Path:
+def make_key(path: FilePath) -> Path:
     """Write a new random key, 64 hexadecimal digits, to a new file that only its owner can read.
 
     Returns
@@ -83,7 +83,7 @@ def make_key(path: KeyFile) -> Path:
     return target
 
 
-def signature(content: bytes, key: KeyFile) -> str:
+def signature(content: bytes, key: FilePath) -> str:
     """Return the signature of a content with the secret in a key's file: "hmac-sha256:HEX".
 
     Raises ExportError for a file that cannot be read or is too short to be a key.
@@ -92,7 +92,7 @@ def signature(content: bytes, key: KeyFile) -> str:
     return PREFIX + hmac.new(secret, content, hashlib.sha256).hexdigest()
 
 
-def sibling_path(path: str | os.PathLike[str], suffix: str) -> Path:
+def sibling_path(path: FilePath, suffix: str) -> Path:
     """Return the path of a file's checksum (sha256) or signature (sig), PATH.SUFFIX.
 
     `sha256sum --check` reads the former.
@@ -101,7 +101,7 @@ def sibling_path(path: str | os.PathLike[str], suffix: str) -> Path:
 
 
 def prepare_export(
-    engine_or_model: Any, trace: TraceSpec | None, path: str | os.PathLike[str], force: bool
+    engine_or_model: Any, trace: TraceSpec | None, path: FilePath, force: bool
 ) -> tuple[Exportable, DecisionModule]:
     """Check that an engine or a model can be exported, and build its decision module.
 
@@ -175,7 +175,7 @@ def prepare_export(
     return source, DecisionModule(source.trace, decider, shape, source.stops_all)
 
 
-def describe(source: Exportable) -> dict[str, Any]:
+def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
     It names schema, versions, time, trace contract, policy, references (number and SHA-256), the
@@ -217,10 +217,10 @@ def describe(source: Exportable) -> dict[str, Any]:
 
 
 def write_export(
-    path: str | os.PathLike[str],
+    path: FilePath,
     content: bytes,
     force: bool = False,
-    key: KeyFile | None = None,
+    key: FilePath | None = None,
     source: Exportable | None = None,
 ) -> Path:
     """Write a file, its checksum (PATH.sha256) and, with a key, its signature (PATH.sig).
@@ -267,13 +267,13 @@ def write_export(
     return target
 
 
-def _check_outputs(path: str | os.PathLike[str], force: bool) -> None:
+def _check_outputs(path: FilePath, force: bool) -> None:
     """Raise OutputError unless the file, its checksum and its signature may be written."""
     for file in (Path(path), sibling_path(path, "sha256"), sibling_path(path, "sig")):
         check_output(file, force)
 
 
-def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> dict[str, Any]:
+def read_metadata(path: FilePath, *, key: FilePath | None = None) -> Metadata:
     """Read the description in an exported TorchScript file, without loading its code.
 
     Parameters
@@ -295,7 +295,7 @@ def read_metadata(path: str | os.PathLike[str], *, key: KeyFile | None = None) -
     return metadata_of(read_checked(Path(path), key), Path(path))
 
 
-def read_checked(path: Path, key: KeyFile | None = None) -> bytes:
+def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     """Return the content of a file after checking its checksum and, with a key, its signature.
 
     libtorch itself does not notice flipped bits.
@@ -349,7 +349,7 @@ def _read(path: Path, most: int = -1) -> bytes:
         raise ExportError(f"{path} cannot be read: {error}.") from error
 
 
-def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
+def metadata_of(content: bytes, path: Path) -> Metadata:
     """Return the description inside the content of a TorchScript file, a zip archive.
 
     No code of the file is run. Raises ExportError, which names `path`, if there is none or it has
@@ -364,7 +364,7 @@ def metadata_of(content: bytes, path: Path) -> dict[str, Any]:
         return check_schema(json.loads(archive.read(next(names, METADATA))), path)
 
 
-def check_schema(metadata: Any, path: Path) -> dict[str, Any]:
+def check_schema(metadata: Any, path: Path) -> Metadata:
     """Return a description as it is if it has the present schema, `SCHEMA`.
 
     Raises ExportError, naming `path`, for another schema and for what is no dict.

@@ -25,13 +25,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
 from ..errors import DataError, StoreError, instead
+from ..files import FilePath
 from ..recipe import Recipe
-from ..records import FITS, Action, Decision, Reason, TraceSpec, stored_trace_spec
+from ..records import FITS, Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
 from ..store.opening import opening
 from ..traces import as_trace, can_fit_length
 
@@ -63,7 +63,7 @@ class JournalLine:
     """
 
     decision: Decision
-    trace: NDArray[np.float32]
+    trace: TraceArray
     label: bool | None
     late: bool = False
 
@@ -93,7 +93,7 @@ class CellJournal:
     set_aside: str = ""
 
 
-def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
+def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     """Read and check the journal of a cell program.
 
     Rejected parts, and verified ones without a label, are left out. An accepted part whose label
@@ -171,7 +171,7 @@ def read_journal(path: str | os.PathLike[str], spec: TraceSpec) -> CellJournal:
     return CellJournal(lines, next(iter(accepted), None), head[3], len(tail), set_aside)
 
 
-def _missing_at_end(path: str | os.PathLike[str], crcs: list[int]) -> str:
+def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
     """Return a sentence if the head of a journal knows of a line that the journal lacks, else "".
 
     The head is the file PATH.head: the number of lines and the last checksum. `crcs` are the
@@ -263,7 +263,7 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     return JournalLine(decision, trace, LABELS.get(label))
 
 
-def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.float32]:
+def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> TraceArray:
     """Return samples, channel after channel, as a trace of the contract, float32 (C, T).
 
     Another number of samples is fitted as `spec.fit` says. Raises DataError, naming `where`, for
@@ -281,9 +281,7 @@ def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> NDArray[np.fl
     return as_trace(values.reshape(spec.channels, -1), spec)
 
 
-def import_journal(
-    store: "StoreLike", path: str | os.PathLike[str], any_model: bool = False
-) -> ImportReport:
+def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) -> ImportReport:
     """Import what an exported cell learned into the store of its engine.
 
     Each part is imported once, however often its journal is. Rule and certificate count the parts

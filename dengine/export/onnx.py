@@ -15,7 +15,6 @@ a reference that is asked about itself counts itself.
 
 import json
 import logging
-import os
 import warnings
 from importlib import import_module
 from importlib.util import find_spec
@@ -32,13 +31,14 @@ from ..decision.intervals import ARRAY_LIMITS
 from ..decision.neighbours import CERTAIN, UNCERTAIN
 from ..decision.rule import DecisionRule
 from ..errors import ExportError, instead
+from ..files import FilePath
 from ..model.base import Exportable
 from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
 from ..traces import CONSTANT, LARGEST, NOT_FINITE, SATURATED, TOO_LARGE, as_trace, as_traces
 from .bundle import (
     METADATA,
-    KeyFile,
+    Metadata,
     check_schema,
     describe,
     prepare_export,
@@ -59,10 +59,10 @@ N_AT_EDGE = 2
 
 def export_onnx(
     engine_or_model: Any,
-    path: str | os.PathLike[str],
+    path: FilePath,
     *,
     trace: TraceSpec | None = None,
-    key: KeyFile | None = None,
+    key: FilePath | None = None,
     force: bool = False,
 ) -> Path:
     """Write the decision of an engine, or of a fitted model, as ONNX, with its checksum beside it.
@@ -114,7 +114,7 @@ def export_onnx(
     return write_export(path, content, force, key, source)
 
 
-def load_onnx(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> "OnnxModel":
+def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     """Check an ONNX file, load it into onnxruntime on one thread, and warm it up.
 
     Parameters
@@ -179,7 +179,7 @@ class OnnxModel:
         The file's description of itself.
     """
 
-    def __init__(self, content: bytes, metadata: dict[str, Any]) -> None:
+    def __init__(self, content: bytes, metadata: Metadata) -> None:
         runtime = _import_package("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1

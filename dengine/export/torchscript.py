@@ -18,7 +18,6 @@ run an exported file depend on no model, so they come by a verb of their own:
 import copy
 import io
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,12 +31,22 @@ from ..decision.members import SAFE_MODES
 from ..decision.scripting import script
 from ..engine.decide import as_part
 from ..errors import ExportError, instead
+from ..files import FilePath
 from ..folds import part_hash
-from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec, as_success
+from ..records import (
+    ACTIONS,
+    REASONS,
+    Action,
+    PartNumber,
+    Reason,
+    TraceArray,
+    TraceSpec,
+    as_success,
+)
 from ..traces import as_trace, as_traces
 from .bundle import (
     METADATA,
-    KeyFile,
+    Metadata,
     describe,
     metadata_of,
     prepare_export,
@@ -49,7 +58,7 @@ WARM_UP = 3
 TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another order
 
 
-def export_sources(folder: str | os.PathLike[str]) -> Path:
+def export_sources(folder: FilePath) -> Path:
     """Write the C and C++ sources, and a file VERSION, into a folder, which is made if missing.
 
     Parameters
@@ -80,10 +89,10 @@ def export_sources(folder: str | os.PathLike[str]) -> Path:
 
 def export_torchscript(
     engine_or_model: Any,
-    path: str | os.PathLike[str],
+    path: FilePath,
     *,
     trace: TraceSpec | None = None,
-    key: KeyFile | None = None,
+    key: FilePath | None = None,
     force: bool = False,
 ) -> Path:
     """Write the decision of an engine, or of a model, as TorchScript, with its checksum beside it.
@@ -134,7 +143,7 @@ def export_torchscript(
     return write_export(path, content, force, key, source)
 
 
-def _content(module: Any, metadata: dict[str, Any]) -> bytes:
+def _content(module: Any, metadata: Metadata) -> bytes:
     """Return the bytes of a file with this module and description.
 
     They are made in memory because libtorch ends the whole process if a disk is full.
@@ -144,7 +153,7 @@ def _content(module: Any, metadata: dict[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def golden_trace(spec: TraceSpec) -> NDArray[np.float32]:
+def golden_trace(spec: TraceSpec) -> TraceArray:
     """Return the trace, float32 (C, T), on which a loader checks the embedding of its machine.
 
     It is a sine, always the same for a contract, within half of the sensor's limit.
@@ -186,12 +195,12 @@ class ExportedModel:
         Contract of its traces.
     """
 
-    def __init__(self, module: Any, metadata: dict[str, Any]) -> None:
+    def __init__(self, module: Any, metadata: Metadata) -> None:
         self.module = module
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
 
-    def decide(self, trace: ArrayLike, part: str | int | None = None) -> ExportedDecision:
+    def decide(self, trace: ArrayLike, part: PartNumber = None) -> ExportedDecision:
         """Decide on one trace, which becomes the pending decision.
 
         If the description says `stops` "all", this also learns, as good, a part that was accepted
@@ -225,7 +234,7 @@ class ExportedModel:
         """Decide on each trace of (n, T) or (n, C, T), one after the other; as `decide`."""
         return [self.decide(x) for x in as_traces(X, self.trace)]
 
-    def learn(self, trace: ArrayLike, success: bool, part: str | int | None = None) -> int:
+    def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.
 
         The trace becomes a reference, the rule is updated, and `metadata["references"]` follows.
@@ -259,7 +268,7 @@ class ExportedModel:
         self.metadata["references"] = n_references
         return n_references
 
-    def stop(self, trace: ArrayLike, part: str | int | None = None) -> int:
+    def stop(self, trace: ArrayLike, part: PartNumber = None) -> int:
         """Learn that an accepted part was bad and stopped the line; as `learn`."""
         return self.learn(trace, False, part)
 
@@ -268,9 +277,7 @@ class ExportedModel:
         """Why every part is verified at present, in words; "" if it is not."""
         return SAFE_MODES[self.module.safe_mode()]
 
-    def save(
-        self, path: str | os.PathLike[str], *, key: KeyFile | None = None, force: bool = False
-    ) -> Path:
+    def save(self, path: FilePath, *, key: FilePath | None = None, force: bool = False) -> Path:
         """Write the model with all that it learned, and the pending decision, to a file.
 
         Parameters as of `export_torchscript`. Returns the file, which `load_exported` reads.
@@ -286,7 +293,7 @@ def _part_hash(part: Any) -> int:
     return 0 if number is None else part_hash(number)
 
 
-def load_exported(path: str | os.PathLike[str], *, key: KeyFile | None = None) -> ExportedModel:
+def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedModel:
     """Check an exported file, load it and warm it up.
 
     From then on torch uses one thread in this process, which is steadier by far at these sizes.

@@ -9,6 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ..records import TraceArray
+
 CENTRAL = 0.95  # share of the successes that the band contains at each sample
 MIN_SUCCESSES = 20  # the band of fewer would be their outermost values
 MIN_WIDTH = 0.05  # of a channel's median width: where all successes agree, noise is no large excess
@@ -62,18 +64,16 @@ class Envelope:
     """
 
     n: int
-    low: NDArray[np.float32] = field(metadata={"apart": True})
-    median: NDArray[np.float32] = field(metadata={"apart": True})
-    high: NDArray[np.float32] = field(metadata={"apart": True})
+    low: TraceArray = field(metadata={"apart": True})
+    median: TraceArray = field(metadata={"apart": True})
+    high: TraceArray = field(metadata={"apart": True})
     outside: float
     usual: float
     not_finite: int
     excesses: tuple[Excess, ...]
 
 
-def envelope_of(
-    successes: NDArray[np.float32], trace: NDArray[np.float32], rate_hz: float | None
-) -> Envelope | None:
+def envelope_of(successes: TraceArray, trace: TraceArray, rate_hz: float | None) -> Envelope | None:
     """Compute the envelope of successes, and where a trace leaves it.
 
     At each sample the envelope contains the middle 95 % of the successes.

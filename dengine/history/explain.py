@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
-from ..records import Action, Reason, Source, TraceSpec, stored_trace_spec
+from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
 from ..representation import to_html
 from ..store.records import SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
@@ -87,7 +87,7 @@ class Neighbour:
     distance: float
     space: int
     inside: bool
-    trace: NDArray[np.float32] | None = field(metadata={"apart": True})
+    trace: TraceArray | None = field(metadata={"apart": True})
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -119,7 +119,7 @@ class Explanation:
     """
 
     decision: StoredDecision
-    trace: NDArray[np.float32] = field(metadata={"apart": True})
+    trace: TraceArray = field(metadata={"apart": True})
     spec: TraceSpec
     sentences: tuple[str, ...]
     notes: tuple[str, ...]

@@ -5,20 +5,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
 from ..decision.members import CLOSED
 from ..decision.policy import RULES, Policy
 from ..folds import COIN_BITS, audit_salt, content_hash, toss
 from ..recipe import Recipe
-from ..records import Action, Decision, Reason, TraceSpec
+from ..records import Action, Decision, Reason, TraceArray, TraceSpec
 from ..store.records import StoredDecision
 from ..traces import LARGEST, ForceLimitsGate
 from .past_versions import Novelty, Thresholds
@@ -204,9 +203,7 @@ def explain_in_words(
         yield f"The part turned out {item.label}{source}."
 
 
-def _explain_audit(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
+def _explain_audit(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on an audit: what the model alone would have done, the coin.
 
     The coin is computed again from the trace and the engine's seed.
@@ -220,40 +217,24 @@ def _explain_audit(
     return f"{alone}. {coin_fell}; it is a function of the trace and the seed."
 
 
-def _explain_saturated(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
+def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on a saturated trace.
 
     It has the number of samples that touch the sensor's range, and the time and the channel of the
     first.
     """
     spec = circumstances.spec
-    touching: NDArray[Any] = np.zeros((0, 2))
-    if spec.limit is not None:
-        touching = np.argwhere(np.abs(trace) >= spec.limit)
+    limit = math.inf if spec.limit is None else spec.limit
+    touching = np.argwhere(np.abs(trace) >= limit)
     if not len(touching):
         return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
     first = f"first after {spec.time_text(sample)} (channel {channel + 1})"
-    limit = "" if spec.limit is None else spec.value_text(spec.limit, channel)
-    return f": {len(touching)} samples touch the sensor's range of {limit}, {first}."
+    text = spec.value_text(limit, channel)
+    return f": {len(touching)} samples touch the sensor's range of {text}, {first}."
 
 
-def _explain_not_finite(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
-    """Return the rest of the sentence on a trace with NaN or infinity, with their number."""
-    n = int((~np.isfinite(trace)).sum())
-    return (
-        f": {n} of {trace.size} samples are NaN or infinite; a trace that was cut or padded "
-        "too far is."
-    )
-
-
-def _explain_outside(
-    decision: Decision, trace: NDArray[np.float32], circumstances: Circumstances
-) -> str:
+def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
     x = torch.from_numpy(trace)
     windows = circumstances.recipe.policy.windows
@@ -265,12 +246,14 @@ def _explain_outside(
 
 
 # For each reason the rest of the sentence that begins with what was done.
-WHY: dict[Reason, Callable[[Decision, NDArray[np.float32], Circumstances], str]] = {
+WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
     Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
     Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was verified.",
     Reason.AUDIT: _explain_audit,
-    Reason.NOT_FINITE: _explain_not_finite,
+    Reason.NOT_FINITE: lambda decision, trace, circumstances: (
+        f": {(~np.isfinite(trace)).sum()} of {trace.size} samples are NaN or infinite."
+    ),
     Reason.CONSTANT: lambda decision, trace, circumstances: (
         f": every sample is {circumstances.spec.value_text(float(trace.flat[0]), 0)}: a dead "
         "sensor."

@@ -11,6 +11,7 @@ them.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 
 PAGE_SIZE = 500  # decisions read at a time
 MAX_LAST = 10**9  # decisions that can be asked for
+Counts = dict[str, int]  # by name
 NEWEST = 500  # decisions that `Status.newest` counts
 MAX_DROPPED = 3  # dropped retrains in a row that are an alarm: the first may lack labels
 N_EVENTS = 5  # newest events that a status shows
@@ -145,7 +147,7 @@ class Span:
     bad_accepts: ErrorEstimate
     unlabelled: int
     retrains: int
-    dropped: dict[str, int]
+    dropped: Counts
     verified_share: float | None
     novel_share: float | None
 
@@ -232,10 +234,10 @@ class Status:
     newest: Span
     ever: Span
     unreported: int
-    actions: dict[str, int]
-    reasons: dict[str, int]
+    actions: Counts
+    reasons: Counts
     labels: int
-    sources: dict[str, int]
+    sources: Counts
     corrected: int
     forgotten: int
     certificate: Certificate
@@ -281,8 +283,7 @@ class Status:
             [report.reason for report in reports[newest_accepted:]], self.version
         )
         trained = [report.reason for report in reports if report.reason.startswith(TRAINED)]
-        notes = trained[-1].split("; ") if trained else []
-        repeats = next((note.partition(":")[0] for note in notes if REPEATS in note), "")
+        repeats = re.search(rf"[^;:]* {REPEATS}", "".join(trained[-1:]))
         alarms = (
             (self.store_fault, f"The store cannot be written: {self.store_fault}"),
             (self.loss, self.loss),
@@ -298,7 +299,7 @@ class Status:
                 f"more than {rejects.tolerance:.1%}.",
             ),
             (failing, failing),
-            (repeats, f"{repeats}. {REPEATS_MEANING}"),
+            (repeats, f"{repeats and repeats[0].strip()}. {REPEATS_MEANING}"),
             (
                 self.shadow and would_accept.verdict == "broken",
                 f"It would break the tolerance of {would_accept.tolerance:.1%}.",

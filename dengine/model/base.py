@@ -188,12 +188,24 @@ class EngineModel(ABC):
             n_failure, embedding, propensity), as `Decider.forward` returns them. The embedding is
             empty, shape (0, 0).
         """
+        verdict: Verdict = self.decider(conditions)(torch.from_numpy(x), part_hash)
+        return verdict
+
+    def decider(self, conditions: DecisionConditions | None) -> Decider:
+        """Return the decider for these conditions, and keep it.
+
+        It is built anew if none is kept, or if the kept one is for other conditions. None stands
+        for no force limits, no sensor limit and no audits. Raises ValueError if nothing was fitted.
+        """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
-            self._decider = Decider(PythonPredictor(self), conditions)
+            self._decider = self.build_decider(conditions)
             self._conditions = conditions
-        verdict: Verdict = self._decider(torch.from_numpy(x), part_hash)
-        return verdict
+        return self._decider
+
+    def build_decider(self, conditions: Any) -> Decider:
+        """Build a decider of this model for these conditions, which asks `predict_one`."""
+        return Decider(PythonPredictor(self), conditions)
 
     @abstractmethod
     def add_reference(
@@ -436,16 +448,7 @@ class BaselineAdapter(EngineModel):
             )
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
-    def add_reference(
-        self,
-        x: Floats,
-        y: int,
-        hash_: int,
-        number: int = 0,
-        *,
-        embedding: Embedding | None = None,
-        point: Floats | None = None,
-    ) -> Floats:
+    def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
         """Let the baseline take in the labelled trace.
 
         Returns the trace, which serves as its reference point.

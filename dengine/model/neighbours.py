@@ -19,7 +19,6 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from enum import Enum
-from functools import reduce
 from types import BuiltinFunctionType, FunctionType
 from typing import Any, Self
 
@@ -39,12 +38,13 @@ from ..decision.policy import Policy
 from ..decision.references import Counts, RadiusIndex
 from ..decision.rule import DecisionRule
 from ..decision.scripting import (
-    INTERNAL,
     arrays_with_prefix,
+    attributes_of,
+    has_tensor,
     incompatible_model_error,
+    module_state,
     restore,
     script,
-    tensor_attributes,
 )
 from ..errors import ExportError, StoreError, expect, listed
 from ..folds import content_hash, fold_of
@@ -185,24 +185,11 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     `compiled` sets. The classes themselves are part of it, not their names: a notebook cell that is
     run again defines another class.
     """
-    modules = eager.named_modules(remove_duplicate=False)
-    return tuple((name, *_own_structure(module)) for name, module in modules)
-
-
-def _own_structure(module: nn.Module) -> tuple[Any, ...]:
-    """Return the class, the compiled attributes and the tensors' shapes of one module, as a tuple.
-
-    Submodules are left out. Attributes are (name, key) by name, tensors (name, shape); the shapes
-    in a `ForceLimitsGate` are None, because limits may change in number.
-    """
-    attributes = sorted(
-        (name, _as_key(value)) for name, value in vars(module).items() if name not in INTERNAL
+    return tuple(
+        (path, type(module), _as_key(attributes_of(module)))
+        for path, module in eager.named_modules(remove_duplicate=False)
+        if not isinstance(module, ForceLimitsGate)  # limits may change in number
     )
-    # Force limits may change in number without a new module.
-    is_limits = isinstance(module, ForceLimitsGate)
-    tensors = [*module.named_parameters(recurse=False), *module.named_buffers(recurse=False)]
-    shapes = [(name, None if is_limits else tuple(tensor.shape)) for name, tensor in tensors]
-    return (type(module), *attributes, *shapes)
 
 
 def _as_key(value: object) -> object:
@@ -215,10 +202,9 @@ def _as_key(value: object) -> object:
         return value
     if isinstance(value, Tensor):
         return tuple(value.shape)
-    if isinstance(value, list | tuple):
-        return (type(value), *map(_as_key, value))
-    if isinstance(value, dict):
-        return tuple((repr(key), _as_key(item)) for key, item in value.items())
+    if isinstance(value, list | tuple | dict):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return (type(value), *sorted((repr(key), _as_key(item)) for key, item in items))
     return repr(value) if isinstance(value, CONSTANTS) else None
 
 
@@ -245,9 +231,11 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     up on a trace of `warm_up_shape` (C, T), see `template_of`.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
-    for name, value in tensor_attributes(eager):
-        *path, leaf = name.split(".")
-        setattr(reduce(getattr, path, module), leaf, value)
+    submodules = dict(module.named_modules(remove_duplicate=False))
+    for path, submodule in eager.named_modules(remove_duplicate=False):
+        for name, value in attributes_of(submodule).items():
+            if has_tensor(value):
+                setattr(submodules[path], name, value)
     return module
 
 
@@ -592,18 +580,6 @@ class ModelPrediction(EngineModel):
         """The `Predictor` in the decider; ValueError if nothing was fitted."""
         return self.decider(self._conditions).predictor
 
-    def decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Return the decider for these conditions, and keep it.
-
-        It is built anew if none is kept, or if the kept one is for other conditions. None stands
-        for no force limits, no sensor limit and no audits. Raises ValueError if nothing was fitted.
-        """
-        is_same = conditions is self._conditions or conditions == self._conditions
-        if self._decider is None or not is_same:
-            self._decider = self.build_decider(conditions)
-            self._conditions = conditions
-        return self._decider
-
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
         """Make one labelled trace, shape (samples,) or (channels, samples), a reference.
 
@@ -634,22 +610,14 @@ class ModelPrediction(EngineModel):
         Returns the point, float32 (d,), scaled.
         """
         if point is None:
-            point = self._reference_point(x, hash_, embedding)
+            if embedding is None:
+                with torch.inference_mode():
+                    embedding = self.predictor.embed(torch.from_numpy(x)).numpy()
+            point = np.array(embedding[self._fold(hash_)], dtype=np.float32)
         self.index.add_one(
             torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number
         )
         return point
-
-    def _reference_point(self, x: Floats, hash_: int, embedding: Embedding | None) -> Floats:
-        """Return the scaled point of a trace (C, T) in the space of its fold, float32 (d,).
-
-        It is taken from `embedding` (K, d), which is scaled already, or computed where that is
-        None.
-        """
-        if embedding is not None:
-            return np.array(embedding[self._fold(hash_)], dtype=np.float32)
-        with torch.inference_mode():
-            return np.asarray(self.predictor.embed(torch.from_numpy(x))[self._fold(hash_)].numpy())
 
     def renumber_reference(self, old: int, new: int) -> None:
         self.index.renumber(old, new)
@@ -775,9 +743,8 @@ class ModelPrediction(EngineModel):
         counts itself. Raises TraceError for another shape, RuntimeError where the rule is stale,
         and ValueError where nothing was fitted.
         """
-        predictions = self.predict_many(X)
-        n_success = np.array([prediction.n_success for prediction in predictions], dtype=np.int64)
-        n_failure = np.array([prediction.n_failure for prediction in predictions], dtype=np.int64)
+        counts = [(p.n_success, p.n_failure) for p in self.predict_many(X)]
+        n_success, n_failure = np.array(counts, dtype=np.int64).reshape(-1, 2).T
         return n_success, n_failure
 
     def predict_interval(self, X: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -787,9 +754,8 @@ class ModelPrediction(EngineModel):
         trace. Raises TraceError for another shape, RuntimeError where the rule is stale, and
         ValueError where nothing was fitted.
         """
-        predictions = self.predict_many(X)
-        lower = np.array([prediction.lower for prediction in predictions])
-        upper = np.array([prediction.upper for prediction in predictions])
+        bounds = [(p.lower, p.upper) for p in self.predict_many(X)]
+        lower, upper = np.array(bounds, dtype=np.float64).reshape(-1, 2).T
         return lower, upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
@@ -819,8 +785,6 @@ class ModelPrediction(EngineModel):
             return "the embedding of a reference is not finite"
         points = self.spaces.embed(self.examples)
         self._example_points = points / self.scale[:, None]
-        some = self.examples[:: N_EXAMPLES // 4]  # four, since each takes a decision's time
-        expected = self.spaces.embed(some)
         state = self.spaces.get_state()
         for _ in range(N_CHECKS):
             restored = self.spaces
@@ -829,7 +793,7 @@ class ModelPrediction(EngineModel):
                     restored = as_reducer(clone(self.reducer), self.folds).set_state(state)
             except StoreError:  # of the test trace, whose points `set_state` compares
                 return NOT_RESTORED
-            if not is_close(restored.embed(some), expected, SAME_BATCH):
+            if not is_close(restored.embed(self.examples), points, SAME_BATCH):
                 return NOT_RESTORED
         return ""
 
@@ -854,9 +818,9 @@ class ModelPrediction(EngineModel):
         if self.rule_is_stale:
             state["rule_is_stale"] = np.array(True)  # an engine that opens the store rebuilds it
         else:
-            state |= _module_state(self.rule, "rule.")
+            state |= module_state(self.rule, "rule.")
         if not self.gate.disabled:
-            state |= _module_state(self.gate, "novelty.")
+            state |= module_state(self.gate, "novelty.")
         reducer_state = self.spaces.get_state() or {}
         return state | {f"reducer.{name}": values for name, values in reducer_state.items()}
 
@@ -904,13 +868,6 @@ class ModelPrediction(EngineModel):
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
         return self.__dict__ | {"_decider": None}
-
-
-def _module_state(module: nn.Module, prefix: str) -> State:
-    """Return copies of a module's tensors as arrays, by their names behind the prefix."""
-    return {
-        f"{prefix}{name}": tensor.numpy().copy() for name, tensor in module.state_dict().items()
-    }
 
 
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:

@@ -112,16 +112,14 @@ def _check_parameter(default: Any, key: str, value: Any) -> None:
     `folds` lies between 2 and 1000, another integer within 32 bits. Any value will do if the
     default is neither bool, str, int nor float, such as None. Otherwise every retrain would fail.
     """
-    types = {bool: "true or false", str: "a text", int: "an integer", float: "a number"}
-    expected = types.get(type(default))
     integers = (2, 1000) if key == "folds" else (-MAX_INTEGER, MAX_INTEGER)
-    valid = {
-        bool: isinstance(value, bool | np.bool_),
-        str: isinstance(value, str),
-        int: is_whole(value, *integers),
-        float: is_number(value) and value == value,  # no NaN
+    checks = {
+        bool: ("true or false", isinstance(value, bool | np.bool_)),
+        str: ("a text", isinstance(value, str)),
+        int: ("an integer", is_whole(value, *integers)),
+        float: ("a number", is_number(value) and value == value),  # no NaN
     }
-    fits = expected is None or valid[type(default)]
+    expected, fits = checks.get(type(default), ("", True))
     expect(fits, f"{expected} as the reducer's {key}, as {default!r}", value)
 
 

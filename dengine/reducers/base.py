@@ -45,7 +45,7 @@ Ints = NDArray[np.int64]
 State = dict[str, NDArray[Any]]
 OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
 OUTLIER_SHARE = 0.05  # more points than this share are not outliers
-SMALLEST = 1e-10  # that the largest sample must reach
+SMALLEST = 1e-12  # that the largest sample must reach
 SAME_POINTS = 1e-3  # by which points of one trace may differ: between machines, compiled, restored
 
 
@@ -255,6 +255,13 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         return None
 
+    def restore_shape(self, state: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+        """Restore the shape of traces from the array "shape" of a state; return it, (C, T)."""
+        channels, samples = (int(value) for value in state["shape"])
+        self.trace_shape_ = (channels, samples)
+        self.n_features_in_ = channels * samples
+        return channels, samples
+
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned and return self; the parameters must be the same.
 
@@ -293,7 +300,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             and with `reset` if there is no trace.
         TraceError
             If the shape is none of traces, or another than in `fit`, and with `reset` if no sample
-            reaches 1e-10, whose square float32 hardly holds; a plain ValueError for a
+            reaches 1e-12, whose square float32 hardly holds; a plain ValueError for a
             single trace (T,) and for another number of columns of X (n, T).
         """
         if not reset:
@@ -458,20 +465,24 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     return given
 
 
-def single_class_error(fold: int, n: int, classes: int) -> SettingError:
-    """Return, not raise, the error for a fold outside of which all labels are of one class.
+def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
+    """Raise SettingError unless the labels (n,) outside each fold have both classes.
 
-    `n` is the number of traces outside of it, `classes` the number of their classes. With no trace
-    there the message blames the sensor or the unit, as all traces are the same; else it asks for
-    more labels.
+    Row k of `masks`, bool (K, n), tells which labels are outside fold k. With none there the
+    message blames the sensor or the unit, as all traces are the same; else it asks for more labels.
     """
-    problem = f"{n} traces of {classes} class; collect more labels before the first fit."
-    if n == 0:
+    for fold, outside in enumerate(masks):
+        n_classes = len(np.unique(labels[outside]))
         problem = (
-            "0 traces: all are in one fold, since they are the same to 1/65536 of their unit; "
-            "check the sensor and the unit."
+            f"{outside.sum()} traces of {n_classes} class; collect more labels before the first fit"
         )
-    return SettingError(f"Expected both classes outside fold {fold}, got {problem}")
+        if n_classes == 0:
+            problem = (
+                "0 traces: all are in one fold, since they are the same to 1/65536 of their unit; "
+                "check the sensor and the unit"
+            )
+        if n_classes < 2:
+            raise SettingError(f"Expected both classes outside fold {fold}, got {problem}.")
 
 
 def seed_of(random_state: Any) -> int | None:
@@ -489,6 +500,12 @@ def seed_of(random_state: Any) -> int | None:
     raise SettingError(
         f"Expected random_state None, an integer or a RandomState, got {random_state!r}."
     )
+
+
+def draw_seed(random_state: Any) -> int:
+    """Return the seed of a `random_state`, a random one for None."""
+    seed = seed_of(random_state)
+    return int(np.random.default_rng().integers(2**31)) if seed is None else seed
 
 
 def uses_labels(transformer: Any) -> bool:
@@ -607,24 +624,15 @@ class CrossFitted(_Wrapping):
         labels = binary_labels(y, len(traces), type(self.reducer).__name__)
         folds = content_fold(traces, self.folds) if folds is None else folds
         self.clones_ = [clone(self.reducer) for _ in range(self.folds)]
-        for k in range(self.folds):
-            outside = folds != k
-            # Clone k never sees the labels of fold k: they are counted in its space.
-            classes = len(np.unique(labels[outside]))
-            if classes < 2:
-                raise single_class_error(k, int(outside.sum()), classes)
-            self.clones_[k].fit(self.as_input(traces[outside]), labels[outside])
+        masks = folds != np.arange(self.folds)[:, None]
+        check_classes(labels, masks)
+        # Clone k never sees the labels of fold k: they are counted in its space.
+        for fitted, outside in zip(self.clones_, masks, strict=True):
+            fitted.fit(self.as_input(traces[outside]), labels[outside])
         self.dim_ = self.embed(traces[:1]).shape[2]
         return self
 
-    def train(
-        self,
-        X: Floats,
-        y: Ints,
-        folds: Ints,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
-    ) -> Floats:
+    def train(self, X: Floats, y: Ints, folds: Ints, *_: object, **__: object) -> Floats:
         return self.fit(X, y, folds=folds).embed_references(X, folds)
 
     def embed(self, X: Floats) -> Floats:

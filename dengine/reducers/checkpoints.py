@@ -6,7 +6,6 @@ it with `load_checkpoint`. A checkpoint holds tensors alone, so that loading it 
 import re
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -77,21 +76,14 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
     with instead(SettingError, f"The checkpoint {path} cannot be read", OSError):
         content = Path(path).read_bytes()
     try:
-        weights: Any = torch.load(BytesIO(content), map_location="cpu", weights_only=True)
+        weights = torch.load(BytesIO(content), map_location="cpu", weights_only=True)
+        # NumPy refuses what does not hold each of its numbers, such as a sparse tensor.
+        return {name: torch.from_numpy(value.detach().numpy()) for name, value in weights.items()}
     except Exception:  # a damaged file raises many types, one of which advises to run its code
-        weights = None
-    if isinstance(weights, dict) and all(map(is_dense, weights.values())):
-        return dict(weights)
-    raise SettingError(
-        f"Expected a checkpoint of named dense tensors alone, {path} is none; write one with "
-        "training/train_encoder.py."
-    )
-
-
-def is_dense(value: Any) -> bool:
-    """Return whether a value is a tensor that holds each of its numbers, as a network's do."""
-    is_strided = isinstance(value, Tensor) and value.layout is torch.strided
-    return is_strided and not (value.is_quantized or value.is_nested or value.is_meta)
+        raise SettingError(
+            f"Expected a checkpoint of named dense tensors alone, {path} is none; write one with "
+            "training/train_encoder.py."
+        ) from None
 
 
 def shape_of_member(name: str, value: Tensor, count: int) -> torch.Size:

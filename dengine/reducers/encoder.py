@@ -21,6 +21,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
+from ..decision.scripting import register_tensors
 from ..errors import SettingError, expect, instead
 from .preprocessing import Preprocessor
 
@@ -69,13 +70,11 @@ class Members(nn.Module):
                 else Separate([network(channels, samples) for _ in range(count)])
             )
             features = count_features(self.networks, count, channels, samples)
+            register_tensors(self.networks)
         if isinstance(self.networks, Separate):
-            trained = [
-                {id(weight) for weight in network.parameters() if weight.requires_grad}
-                for network in self.networks.networks
-            ]
-            is_apart = sum(map(len, trained)) == len(set().union(*trained))
+            n_of_members = sum(map(count_trained, self.networks.networks))
             wanted = "a network for each member, with weights of its own"
+            is_apart = count_trained(self.networks) == n_of_members
             expect(is_apart, wanted, "one that shares them", "make new layers in each call")
         bound = features**-0.5
         self.weight = nn.Parameter(torch.empty(count, features, 2).uniform_(-bound, bound))
@@ -189,6 +188,11 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
         else:
             layers.append(layer)
     return nn.Sequential(*layers)
+
+
+def count_trained(module: nn.Module) -> int:
+    """Return the number of tensors of a module that are trained; what is shared counts once."""
+    return sum(weight.requires_grad for weight in module.parameters())
 
 
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:

@@ -102,8 +102,7 @@ class PcaReducer(Reducer):
         """
         self.mean_ = np.array(state["mean"])
         self.components_ = np.array(state["components"])
-        self.n_features_in_ = len(self.mean_)
-        self.trace_shape_ = tuple(int(n) for n in state["shape"])
+        self.restore_shape(state)
         return self
 
 

@@ -37,7 +37,7 @@ from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
-from ..decision.scripting import arrays_with_prefix, restore
+from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import expect
 from ..records import is_whole
 from .base import (
@@ -47,10 +47,10 @@ from .base import (
     Reducer,
     StopRule,
     binary_labels,
+    check_classes,
     folds_of,
     points_in_fold_space,
     seed_of,
-    single_class_error,
 )
 from .logistic_heads import fit_heads, masked_loss
 from .preprocessing import averaging
@@ -453,7 +453,8 @@ class RocketReducer(Reducer):
         self.n_component_traces_ = 0
         self.towers_: list[Tower] = []
         self._numbers = np.zeros(0, dtype=np.int64)  # labels whose features are cached
-        self._raw = torch.empty(0, len(encoder.gain))  # the features of these, (n, P)
+        # The features of these, (n, P): an array is pickled at less cost than a tensor.
+        self._raw = np.empty((0, len(encoder.gain)), dtype=np.float32)
 
     def _fit_heads(
         self,
@@ -602,29 +603,18 @@ class RocketReducer(Reducer):
             is_new = np.append(self._numbers, -1)[positions] != numbers
             if is_new.all():
                 positions = np.arange(len(positions))
-                self._raw = compute_raw_features(encoder, traces)
+                self._raw = compute_raw_features(encoder, traces).numpy()
             elif is_new.any():
                 positions[is_new] = len(self._raw) + np.arange(is_new.sum())
-                new_features = compute_raw_features(encoder, traces[is_new])
-                self._raw = torch.cat([self._raw, new_features])
+                new_features = compute_raw_features(encoder, traces[is_new]).numpy()
+                self._raw = np.concatenate([self._raw, new_features])
             self._numbers = numbers
             # A slice copies nothing; it is enough unless a trace in between has left.
             if len(positions) > 0 and (np.diff(positions) == 1).all():
                 self._raw = self._raw[positions[0] : positions[-1] + 1]
             else:
-                self._raw = self._raw[torch.from_numpy(positions)]
-        return self._raw
-
-    def __getstate__(self) -> dict[str, Any]:
-        state: dict[str, Any] = super().__getstate__()
-        if "net_" in vars(self):
-            state = state | {"_raw": self._raw.numpy()}  # an array is pickled at less cost
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        if "net_" in state:
-            state = state | {"_raw": torch.from_numpy(state["_raw"])}
-        super().__setstate__(state)
+                self._raw = self._raw[positions]
+        return torch.from_numpy(self._raw)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Copy the module, which a training changes in place, and share all else.
@@ -676,9 +666,7 @@ class RocketReducer(Reducer):
         }
         for i, tower in enumerate(self.towers_):
             state |= {f"{name}.{i}": value.numpy() for name, value in tower._asdict().items()}
-        for name, value in self.net_.state_dict().items():
-            state[f"net.{name}"] = value.numpy().copy()
-        return state
+        return state | module_state(self.net_, "net.")
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
@@ -686,7 +674,7 @@ class RocketReducer(Reducer):
         The cache of features is empty and `note_` is "" afterwards. Raises StoreError if the sizes
         are not those of the parameters.
         """
-        channels, samples = (int(value) for value in state["shape"])
+        channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = (int(value) for value in state["counts"])
         self.build(channels, samples, average)
         restore(self.net_, arrays_with_prefix(state, "net."))
@@ -734,17 +722,6 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints:
     values = np.arange(n) if numbers is None else numbers
     hashes = values.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.sort(np.argpartition(hashes, MAX_TRAINING_TRACES)[:MAX_TRAINING_TRACES])
-
-
-def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
-    """Raise SettingError unless the labels (n,) within each mask have both classes.
-
-    The masks are the rows of a bool array (K, n), one for each head.
-    """
-    for k, mask in enumerate(masks):
-        n_classes = len(np.unique(labels[mask]))
-        if n_classes < 2:
-            raise single_class_error(k, int(mask.sum()), n_classes)
 
 
 def apply_in_chunks(function: Callable[[Tensor], Tensor], x: Tensor, size: int = CHUNK) -> Tensor:

@@ -39,10 +39,9 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from ..decision.scripting import (
     arrays_with_prefix,
     incompatible_model_error,
-    plain_tensors,
+    module_state,
     reason_of,
     restore,
-    restore_plain_tensors,
     script,
 )
 from ..errors import SettingError, expect
@@ -55,8 +54,8 @@ from .base import (
     Reducer,
     StopRule,
     binary_labels,
+    draw_seed,
     folds_of,
-    seed_of,
 )
 from .checkpoints import load_checkpoint
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
@@ -439,13 +438,12 @@ class TorchReducer(Reducer):
 
         As `torch.optim.swa_utils.update_bn`, from preprocessed traces x (n, C', L): at most 256 of
         them, drawn at random but the same for the same n. No label is read, so each member may see
-        all folds. Other buffers, and tensors that are plain attributes, are copied from the trained
-        members. The averaged members are in evaluation mode afterwards.
+        all folds. Other buffers are copied from the trained members. The averaged members are in
+        evaluation mode afterwards.
         """
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
             buffer.copy_(trained)
-        restore_plain_tensors(members, plain_tensors(self.members_))
         norms = [module for module in members.modules() if isinstance(module, _BatchNorm)]
         for norm in norms:
             norm.reset_running_stats()
@@ -540,8 +538,7 @@ class TorchReducer(Reducer):
 
         They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
         optimiser, so that training can go on, and the points of a test trace, by which `set_state`
-        recognises the network. Tensors of the network that are in no state dict come after
-        "plain.". Raises NotFittedError before a fit.
+        recognises the network. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
@@ -552,18 +549,11 @@ class TorchReducer(Reducer):
             "loss": np.array(self.loss_),
             "points": self._embed_ramp(),
         }
-        tensors: dict[str, Mapping[str, Tensor]] = {
-            "preprocessor": self.preprocessor_.state_dict(),
-            "members": self.members_.state_dict(),
-            "averaged": self.averaged_members_.state_dict(),
-            "plain.members": plain_tensors(self.members_),
-            "plain.averaged": plain_tensors(self.averaged_members_),
-        }
+        for name, module in self._modules().items():
+            state |= module_state(module, name)
         for i, moments in self.optimizer_state_.items():
-            tensors[f"optimizer.{i}"] = moments
-        for prefix, named in tensors.items():
-            for name, value in named.items():
-                state[f"{prefix}.{name}"] = value.detach().numpy().copy()
+            for name, value in moments.items():
+                state[f"optimizer.{i}.{name}"] = value.numpy().copy()
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
@@ -573,21 +563,16 @@ class TorchReducer(Reducer):
         if the network gives other points for the test trace than when the state was taken. A state
         without these points is not checked.
         """
-        channels, samples = (int(value) for value in state["shape"])
+        channels, samples = self.restore_shape(state)
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
-        self.trace_shape_ = (channels, samples)
-        self.n_features_in_ = channels * samples
         self._build(channels, samples, average, seed)
         self.n_steps_ = n_steps
         self.n_steps_left_ = n_steps_left
         self.n_new_steps_ = n_new_steps
         self.loss_ = float(state["loss"])
-        restore(self.preprocessor_, arrays_with_prefix(state, "preprocessor."))
-        for name, members in (("members", self.members_), ("averaged", self.averaged_members_)):
-            restore(members, arrays_with_prefix(state, f"{name}."))
-            plain = arrays_with_prefix(state, f"plain.{name}.")
-            tensors = {key: torch.from_numpy(np.array(value)) for key, value in plain.items()}
-            restore_plain_tensors(members, tensors)
+        for name, module in self._modules().items():
+            # A state of an earlier release lacks buffers that are not persistent.
+            restore(module, module_state(module, "") | arrays_with_prefix(state, name))
         for name, value in arrays_with_prefix(state, "optimizer.").items():
             i, key = name.split(".")
             moments = self.optimizer_state_.setdefault(int(i), {})
@@ -598,6 +583,14 @@ class TorchReducer(Reducer):
         if points is not None and not np.allclose(points, self._embed_ramp(), atol=SAME_POINTS):
             raise incompatible_model_error("network has the same sizes and is another one")
         return self
+
+    def _modules(self) -> dict[str, nn.Module]:
+        """Return the modules whose tensors are the state, by the prefix of their names there."""
+        return {
+            "preprocessor.": self.preprocessor_,
+            "members.": self.members_,
+            "averaged.": self.averaged_members_,
+        }
 
     @torch.inference_mode()
     def _embed_ramp(self) -> Floats:
@@ -617,23 +610,21 @@ class TorchReducer(Reducer):
         negative.
         """
         expect(self.n_components in (1, 2), "n_components 1 or 2", self.n_components)
-        expect(is_whole(self.folds, 2, 1000), "folds >= 2 where labels are used", self.folds)
-        expect(is_whole(self.steps, 1, 10**6), "steps >= 1, an integer", self.steps)
-        expect(is_whole(self.fit_steps, 1, 10**6), "fit_steps >= 1, an integer", self.fit_steps)
-        expect(is_whole(self.batch_size, 2, 10**6), "batch_size >= 2, an integer", self.batch_size)
-        expect(is_whole(self.shift, 0, 10**6), "shift >= 0 frames, an integer", self.shift)
-        not_negative = "weight_decay", "gain", "noise", "mixup"
-        for name in ("learning_rate", "weight_averaging", *not_negative):
+        smallest = {"folds": 2, "steps": 1, "fit_steps": 1, "batch_size": 2, "shift": 0}
+        for name, least in smallest.items():
             value = getattr(self, name)
-            expect(is_number(value), f"{name}, a number", value)
+            expect(is_whole(value, least, 10**6), f"{name} >= {least}, an integer", value)
+        expect(self.folds <= 1000, "folds <= 1000", self.folds)
+        not_negative = "learning_rate", "weight_averaging", "weight_decay", "gain", "noise", "mixup"
+        for name in not_negative:
+            value = getattr(self, name)
+            is_valid = is_number(value) and 0.0 <= value < float("inf")
+            expect(is_valid, f"{name} >= 0, a number", value)
         expect(self.learning_rate > 0.0, "learning_rate > 0", self.learning_rate)
         is_path = isinstance(self.checkpoint, str | PathLike)
         expect(is_path, 'checkpoint, the name of a file, or ""', self.checkpoint)
-        is_share = 0.0 <= self.weight_averaging < 1.0
+        is_share = self.weight_averaging < 1.0
         expect(is_share, "weight_averaging from 0 to below 1", self.weight_averaging)
-        for name in not_negative:
-            value = getattr(self, name)
-            expect(0.0 <= value < float("inf"), f"{name} >= 0", value)
 
 
 def draw_batches(
@@ -686,12 +677,6 @@ def warm_optimizer() -> None:
     weight = nn.Parameter(torch.zeros(1))
     weight.grad = torch.zeros(1)
     torch.optim.AdamW([weight], fused=True).step()
-
-
-def draw_seed(random_state: Any) -> int:
-    """Return the seed of a `random_state`, a random one for None."""
-    seed = seed_of(random_state)
-    return int(np.random.default_rng().integers(2**31)) if seed is None else seed
 
 
 def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:

@@ -35,10 +35,10 @@ from scipy.sparse import csr_matrix
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
-from ..decision.scripting import arrays_with_prefix, restore
+from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import SettingError, expect
 from ..records import is_number, is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, seed_of
+from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, draw_seed
 from .umap_graph import (
     CHUNK,
     Frames,
@@ -331,8 +331,7 @@ class UmapReducer(Reducer):
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
         self.make_frames_.learn(torch.from_numpy(sample))
-        seed = seed_of(self.random_state)
-        self.seed_ = int(np.random.default_rng().integers(2**31)) if seed is None else seed
+        self.seed_ = draw_seed(self.random_state)
         n_features = self.make_frames_.n_features
         self.neighbors_ = Neighbors.empty(n_features, self.n_neighbors - 1)
         self.precomputed_neighbors_ = None
@@ -461,7 +460,7 @@ class UmapReducer(Reducer):
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]
         counts += [self.n_epochs_, self.n_steps_, self.n_new_steps_]
-        state = {
+        return module_state(self.make_frames_, "frames.") | {
             "shape": np.array(self.trace_shape_),
             "counts": np.array(counts),
             "numbers": self.neighbors_.numbers,
@@ -470,18 +469,13 @@ class UmapReducer(Reducer):
             "distances": self.neighbors_.distances.numpy(),
             "embedding": self.embedding_.numpy(),
         }
-        for name, value in self.make_frames_.state_dict().items():
-            state[f"frames.{name}"] = value.numpy().copy()
-        return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         What `precompute` found is dropped. Raises StoreError if the frames are of another size.
         """
-        channels, samples = (int(value) for value in state["shape"])
-        self.trace_shape_ = (channels, samples)
-        self.n_features_in_ = channels * samples
+        channels, samples = self.restore_shape(state)
         n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])
         self.seed_ = seed
         self.n_epochs_ = n_epochs

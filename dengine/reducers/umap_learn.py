@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from ..errors import SettingError
-from .base import Floats, Ints, Reducer, StopRule, as_points, as_rows
+from .base import Floats, Ints, Reducer, as_points, as_rows
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -89,14 +89,7 @@ class UmapLearnReducer(Reducer):
             self.umap_ = UMAP(**self.get_params(), n_jobs=1).fit(as_rows(traces))
         return self
 
-    def train(
-        self,
-        X: Floats,
-        y: Ints,
-        folds: Ints,
-        stop: StopRule | None = None,
-        numbers: Ints | None = None,
-    ) -> Floats:
+    def train(self, X: Floats, y: Ints, folds: Ints, *_: object, **__: object) -> Floats:
         # The fit has placed its traces; `embed` would place them again, slowly.
         return as_points(self.fit(X).umap_.embedding_)
 
@@ -110,11 +103,8 @@ class UmapLearnReducer(Reducer):
         Raises NotFittedError before `fit`.
         """
         check_is_fitted(self, "umap_")
-        traces = self.check_traces(X)
-        points = np.empty((len(traces), 1, self.n_components), dtype=np.float32)
-        for i in range(len(traces)):
-            points[i] = self._transform_batch(traces[i : i + 1])
-        return points
+        points = [self._transform_batch(trace[None]) for trace in self.check_traces(X)]
+        return np.array(points, dtype=np.float32).reshape(-1, 1, self.n_components)
 
     def _transform_batch(self, traces: Floats) -> Floats:
         """Place traces (n, C, T) by umap-learn, together: float32 (n, d)."""

@@ -44,7 +44,7 @@ from ..errors import (
 from ..history.explain import Explanation
 from ..history.map import PartMap
 from ..history.status import Course, Status
-from ..records import Action, Decision
+from ..records import Action, Decision, TraceArray
 from ..representation import to_jsonable
 from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
 from .service import ReportResponse
@@ -194,7 +194,7 @@ def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
         raise Refusal(422, f"{error}, in the query.") from error
 
 
-def as_samples(value: Any, channels: int = 1) -> NDArray[np.float32]:
+def as_samples(value: Any, channels: int = 1) -> TraceArray:
     """Convert a trace as clients send it to an array.
 
     Parameters

@@ -289,6 +289,8 @@ class HttpApi:
             if core.is_retraining:
                 text = "A retrain is under way already; nothing changed."
                 return Changed("retrain", text, None, engine.version)
+            if core.live.pinned:
+                engine.release(by)
             engine.store.put_event("retrain", "asked for by hand", author=by)
             core.start_retrain()
             event = engine.store.events(1)[-1]

@@ -32,6 +32,7 @@ from asyncua.ua.attribute_ids import AttributeIds
 from asyncua.ua.status_codes import StatusCodes
 
 from ..errors import DengineError, SettingError, as_options
+from ..files import FilePath
 from .auth import host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
@@ -181,8 +182,8 @@ async def opcua_server(
     port: int = PORT,
     host: str = "127.0.0.1",
     tokens: Collection[str] | None = None,
-    cert: str | os.PathLike[str] | None = None,
-    key: str | os.PathLike[str] | None = None,
+    cert: FilePath | None = None,
+    key: FilePath | None = None,
 ) -> AsyncIterator[Server]:
     """Serve a cell over OPC UA in this event loop, as long as the context lasts.
 

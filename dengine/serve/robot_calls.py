@@ -21,7 +21,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..errors import (
     BusyError,
@@ -33,7 +33,7 @@ from ..errors import (
     expect,
     shortened,
 )
-from ..records import ACTIONS, Action, Decision, as_id
+from ..records import ACTIONS, Action, Decision, TraceArray, as_id
 from .api import as_samples
 from .service import CellService
 
@@ -88,7 +88,7 @@ class RobotCalls:
     def __init__(self, service: CellService, recorder: Recorder | None = None) -> None:
         self._service = service
         self._recorder = recorder
-        self._pieces: OrderedDict[str, list[NDArray[np.float32]]] = OrderedDict()
+        self._pieces: OrderedDict[str, list[TraceArray]] = OrderedDict()
         self._armed: str | None = None  # id of the part that is recorded
         self._recording: Any = None  # of that part, if its decision could not be recorded
         self._recorder_lock = asyncio.Lock()

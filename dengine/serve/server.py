@@ -29,7 +29,7 @@ from .connections import CONNECTIONS, ConnectionPool
 from .http import Beside, create_app
 from .retraining import END_SIGNALS, RetrainingProcess
 from .robot_calls import Recorder
-from .service import CHECK_SECONDS, DEADLINE, CellService
+from .service import CellService
 
 log = logging.getLogger("dengine")
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
@@ -84,20 +84,20 @@ def serve(
     store: str | None,
     say: Callable[[str], object],
     *,
-    host: str = "127.0.0.1",
-    port: int = 8000,
-    token_file: Path | None = None,
-    cert: Path | None = None,
-    key: Path | None = None,
-    allow_hosts: Sequence[str] = (),
-    deadline: float = DEADLINE,
-    largest: int = Access().largest,
-    rate: float = Access().rate,
-    connections: int = CONNECTIONS,
-    check_seconds: float = CHECK_SECONDS,
-    opcua: int | None = None,
-    opcua_cert: Path | None = None,
-    opcua_key: Path | None = None,
+    host: str,
+    port: int,
+    token_file: Path | None,
+    cert: Path | None,
+    key: Path | None,
+    allow_hosts: Sequence[str],
+    deadline: float,
+    largest: int,
+    rate: float,
+    connections: int,
+    check_seconds: float,
+    opcua: int | None,
+    opcua_cert: Path | None,
+    opcua_key: Path | None,
     beside: Sequence[Beside] = (),
     recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
     **interfaces: bool,
@@ -121,7 +121,7 @@ def serve(
         Opens the recorder of a robot's insertions, or gives None.
     **interfaces : bool
         `xmlrpc` and `page`: whether they are served beside HTTP.
-    host, port, ... : optional
+    host, port, ...
         The options of `dengine serve`, under their names.
 
     Raises

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import queue
 import threading
 import time
@@ -30,8 +29,9 @@ from numpy.typing import ArrayLike
 
 from ..engine.engine import DataEngine, core_of
 from ..errors import BusyError, NotTakenError
+from ..files import FilePath
 from ..history.status import NEWEST, Status, status
-from ..records import Decision, Reason, RetrainReport, as_id, as_success
+from ..records import Decision, PartNumber, Reason, RetrainReport, as_id, as_success
 from ..store.opening import open_store
 from ..store.records import StoredDecision
 
@@ -158,7 +158,7 @@ class CellService:
     def __init__(
         self,
         make: Callable[[], DataEngine],
-        store: str | os.PathLike[str] | None = None,
+        store: FilePath | None = None,
         deadline: float = DEADLINE,
         max_waiting: int = MAX_WAITING,
         check_seconds: float = CHECK_SECONDS,
@@ -194,7 +194,7 @@ class CellService:
                 raise
 
     async def decide(
-        self, trace: ArrayLike, request: str | None = None, part: str | int | None = None
+        self, trace: ArrayLike, request: str | None = None, part: PartNumber = None
     ) -> ServiceResponse:
         """Decide on a trace, in the engine's thread or, where nothing has to wait, at once.
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import OutputError, StoreError, instead
+from ..errors import OutputError, StoreError, expect, instead
 from ..files import output_file
 from .connections import reading
 from .journal import Journal, Record, journal_path, read_undrained
@@ -77,12 +77,9 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
         If `out` exists, or cannot be written.
     """
     with reading(os.fspath(url)) as connection:
-        if connection.dialect.name != "sqlite":
-            do = (
-                "pg_dump copies that, once the engines have ended: their journals lie on "
-                "their machines"
-            )
-            raise StoreError(f"Expected a store in a file, got {connection.dialect.name}; {do}.")
+        do = "pg_dump copies it, once the engines have ended: their journals lie on their machines"
+        dialect = connection.dialect.name
+        expect(dialect == "sqlite", "a store in a file", dialect, do, StoreError)
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.

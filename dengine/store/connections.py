@@ -473,10 +473,9 @@ class Database:
 
     def has_entry(self, number: int, digest: str) -> bool:
         """Return whether the cell's ledger has an entry with this number and hexadecimal digest."""
-        is_entry = (LEDGER.c.cell_id == self.cell_id) & (LEDGER.c.number == number)
-        return [
-            row.digest.hex() for row in self.read(sa.select(LEDGER.c.digest).where(is_entry))
-        ] == [digest]
+        query = sa.select(LEDGER.c.digest).where(LEDGER.c.cell_id == self.cell_id)
+        rows = self.read(query.where(LEDGER.c.number == number))
+        return [row.digest.hex() for row in rows] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
         """Compare what an engine reads of this cell and of its product's others with their ledgers.
@@ -662,16 +661,36 @@ class Database:
         return range(first, first + len(rows))
 
     def insert_corrections(
-        self, connection: sa.Connection, rows: Sequence[Mapping[str, Any]]
-    ) -> None:
-        """Insert rows of corrections in a write transaction, each with the next number.
+        self,
+        connection: sa.Connection,
+        event: Event,
+        success: bool | None,
+        labels: Mapping[str, bool | None],
+    ) -> int:
+        """Insert an event and the corrections that it records, in a write transaction.
 
-        Each also gets the number of the newest label so far, as `newest_seq`.
+        Parameters
+        ----------
+        connection : sqlalchemy.Connection
+        event : Event
+        success : bool or None
+            The new label of all decisions; None: forgotten.
+        labels : mapping of str to bool or None
+            Label until now of each decision, by id; None if it was forgotten.
+
+        Returns
+        -------
+        int
+            Number of the event.
         """
-        newest = self.scope.next_number(connection, LABEL.c.seq) - 1
-        self.insert(
-            connection, CORRECTION.c.number, [{**row, "newest_seq": newest} for row in rows]
-        )
+        (number,) = self.insert(connection, EVENT.c.number, [to_row(event)])
+        if labels:
+            newest = self.scope.next_number(connection, LABEL.c.seq) - 1
+            common = {"event": number, "author": event.author, "time": event.time}
+            common |= {"success": success, "newest_seq": newest}
+            rows = [common | {"decision_id": id_, "was": was} for id_, was in labels.items()]
+            self.insert(connection, CORRECTION.c.number, rows)
+        return number
 
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
         """Return, by id, a row for each of the given decisions that the cell has stored.
@@ -773,28 +792,11 @@ class Database:
         numbers = {id_: row.seq for id_, row in stored.items()}
         numbers |= zip(new_labels, self.insert(connection, LABEL.c.seq, rows), strict=True)
         self.insert(connection, EVENT.c.number, [to_row(event) for event in events])
-        if stopped:
-            self._insert_late_stops(connection, list(dict.fromkeys(stopped)))
-        return [(id_, numbers[id_]) for id_ in dict.fromkeys(labelled)]
-
-    def _insert_late_stops(self, connection: sa.Connection, ids: Sequence[str]) -> None:
-        """Correct the labels of these decisions to failure: their parts stopped the line late.
-
-        Silence had confirmed each of them as a success, which the caller has checked. Insert a
-        correction and an event of kind "late stop" for each.
-        """
-        now = float(self._clock())
         text = "counts as a failure, was a success: its stop came after its confirmation"
-        events = [
-            to_row(Event(0, now, "late stop", f"decision {as_text(id_)} {text}")) for id_ in ids
-        ]
-        numbers = self.insert(connection, EVENT.c.number, events)
-        common = {"author": "", "time": now, "success": False, "was": True}
-        corrections = [
-            common | {"event": number, "decision_id": id_}
-            for number, id_ in zip(numbers, ids, strict=True)
-        ]
-        self.insert_corrections(connection, corrections)
+        for id_ in dict.fromkeys(stopped):
+            event = Event(0, float(self._clock()), "late stop", f"decision {as_text(id_)} {text}")
+            self.insert_corrections(connection, event, False, {id_: True})
+        return [(id_, numbers[id_]) for id_ in dict.fromkeys(labelled)]
 
     def _insert_decisions(
         self, connection: sa.Connection, decisions: Sequence[StoredDecision]

@@ -30,7 +30,7 @@ import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
@@ -89,14 +89,14 @@ def decode_record(blob: bytes) -> Record:
         return from_row(Event, row)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Head:
-    """The content of the small file beside a journal; by default that of an earlier release.
+    """What the small file beside a journal says; by default that of an earlier release.
 
     Attributes
     ----------
     newest : (int, str) or None
-        Number and digest of the newest ledger entry of the store.
+        Number and digest of the newest ledger entry of the store; None: no entry yet.
     n_drained : int
         Number of the last record that the store holds: 1, 2, ... in a journal.
     n_synced : int
@@ -107,7 +107,7 @@ class Head:
         When it was written, in seconds since 1970.
     """
 
-    newest: tuple[int, str] | None
+    newest: tuple[int, str] | None = None
     n_drained: int = 0
     n_synced: int = 0
     digest: str = ""
@@ -131,13 +131,13 @@ class Journal:
     ----------
     end : int
         Offset behind the last record, in bytes.
-    drained_to, n_drained : int
-        Offset up to which the store holds the records, and number of the last of these: 1, 2, ...;
-        set by the outbox.
-    newest_entry : (int, str) or None
-        Number and digest of the newest ledger entry that the header names; None: no entry yet.
+    drained_to : int
+        Offset up to which the store holds the records; set by the outbox.
     head : Head
-        The head beside the journal, as it was at the opening; empty if it is missing or damaged.
+        What the head is to say next; the outbox sets `n_drained`.
+    entries : list of (int, str)
+        Number and digest of the ledger entries that header and head named at the opening: two, or
+        fewer if one of them is missing, new or damaged.
     dropped : int
         Bytes of an unfinished record at the end, left by a killed process and cut off. That record
         was never acknowledged.
@@ -158,12 +158,8 @@ class Journal:
         self.end = HEADER
         self.dropped = 0
         self.loss = ""
-        self.newest_entry: tuple[int, str] | None = None
-        self.head = _read_head(path) or Head(None)
-        self.n_drained = 0
-        self._n_synced = 0
-        self._time = 0.0
-        self._digest = bytes(16)
+        self.head = read_head(path)
+        self.entries: list[tuple[int, str]] = []
         # Guards what header and head hold: two threads write them.
         self._describing = threading.RLock()
         self._owning = owning
@@ -210,7 +206,7 @@ class Journal:
         """
         offsets = []
         framed = bytearray()
-        digest = self._digest
+        digest = bytes.fromhex(self.head.digest)
         for record in records:
             offsets.append(self.end + len(framed))
             digest = _chain_digest(digest, record)
@@ -225,9 +221,9 @@ class Journal:
             )
         with self._describing:
             self.end += len(framed)
-            self._n_synced += len(records)
-            self._time = time
-            self._digest = digest
+            self.head.n_synced += len(records)
+            self.head.time = time
+            self.head.digest = digest.hex()
             self._write_head()
         return offsets
 
@@ -274,43 +270,36 @@ class Journal:
     def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
         """Write the newest ledger entry and `drained_to` to the header and to the head.
 
-        Set `newest_entry`. Nothing is synced: an older header is harmless, since the store ignores
+        Nothing is synced: an older header is harmless, since the store ignores
         a record that it is given twice. Raise StoreError if the header cannot be written; a failure
         of the head is ignored.
         """
         with self._describing, _os_errors(self.path):
-            self.newest_entry = newest
-            self._file.write(self._header(), 0)
+            self.head.newest = newest
+            self._write_header()
             self._write_head()
 
     def _write_head(self) -> None:
         """Write the head as this journal now is, without a sync; a failure is ignored."""
-        fields = {
-            "newest": self.newest_entry,
-            "n_drained": self.n_drained,
-            "n_synced": self._n_synced,
-            "digest": self._digest.hex(),
-            "time": self._time,
-        }
         path = head_path(self.path)
         # An older head is harmless.
         with suppress(OSError), os.fdopen(open_plain(path, os.O_WRONLY | os.O_CREAT), "wb") as head:
-            head.write(_pack_fields(fields).ljust(HEADER))
+            head.write(_pack_fields(asdict(self.head)).ljust(HEADER))
 
     def clear(self) -> None:
         """Remove all records, drained or not; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, which frees the reserved space: call `reserve`
-        afterwards, and also before, so that no disk keeps the cut without the header. Raise
+        The file is cut off behind its header, and space is reserved and synced again. Raise
         StoreError if the file cannot be written.
         """
+        self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):
             self._file.truncate(HEADER)
             self.drained_to = HEADER
-            self.n_drained = self._n_synced
+            self.head.n_drained = self.head.n_synced
             self.end = HEADER
-            self._digest = bytes(16)
-            self._file.write(self._header(), 0)
+            self._write_header()
+        self.reserve()
 
     def reserve(self) -> None:
         """Reserve disk space for at least RESERVE bytes of records, and sync that.
@@ -352,22 +341,22 @@ class Journal:
                 self._file.truncate(HEADER if self.is_drained else self.end)
         self._file.close()
 
-    def _header(self) -> bytes:
-        """Return the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
+    def _write_header(self) -> None:
+        """Write the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
 
-        The JSON has this process as the owner, the drained records and `newest_entry`.
+        The JSON has this process as the owner, the drained records and the newest ledger entry.
         """
         fields = {
             "owner": describe_process()[:60],
             "drained": self.drained_to,
-            "newest": self.newest_entry,
-            "n_drained": self.n_drained,
+            "newest": self.head.newest,
+            "n_drained": self.head.n_drained,
         }
-        return (MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0")
+        self._file.write((MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0"), 0)
 
     def _write_header_and_reserve(self) -> None:
         """Write the header, and reserve disk space for records."""
-        self._file.write(self._header(), 0)
+        self._write_header()
         self.reserve()
 
     def _scan(self) -> None:
@@ -377,7 +366,7 @@ class Journal:
         if the file is no journal.
         """
         head = self.head
-        self.n_drained = head.n_drained
+        fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
         damaged = 0
         if self._file.size:
             header = self._file.read(HEADER, 0)
@@ -388,35 +377,28 @@ class Journal:
             try:
                 fields = _parse_header(header)
                 self.drained_to = int(fields["drained"])
-                self.newest_entry = fields["newest"]
-                self.n_drained = fields["n_drained"]
             except DAMAGES:  # all of it is drained again, which is harmless
                 damaged = 1
-                head = Head(None)
+                head = Head()
         self.end = max(self._file.size, HEADER)
         self.drained_to = min(max(self.drained_to, HEADER), self.end)
-        # Behind the record that the head names nothing was acknowledged.
-        newest = bytes.fromhex(head.digest)
-        is_acknowledged = not newest or head.n_synced > self.n_drained
+        self.entries = [entry for entry in (self.head.newest, fields["newest"]) if entry]
         # The first record's digest is not checked: those before it may be gone.
-        previous: bytes | None = None
+        digests: list[bytes] = []
         begin = self.drained_to
-        digests: set[bytes] = set()
         for offset, end, record in self.undrained_records():
             digest: bytes = FRAME.unpack(self._file.read(FRAME.size, offset))[3]
-            follows = previous is None or digest == _chain_digest(previous, record)
-            damaged += is_acknowledged and (offset > begin or not follows)
-            is_acknowledged &= digest != newest
-            digests.add(digest)
-            previous = digest
+            follows = not digests or digest == _chain_digest(digests[-1], record)
+            damaged += offset > begin or not follows
+            digests.append(digest)
             begin = end
         rest = self._file.read(self.end - begin, begin)
         self.end = begin
         self.dropped = len(rest.rstrip(b"\0"))
-        self._digest = previous or bytes(16)
-        n_known = self.n_drained + len(digests)
-        self._n_synced = max(head.n_synced, n_known)
-        if head.n_synced > self.n_drained and (n_known < head.n_synced or newest not in digests):
+        n_drained = fields["n_drained"]
+        n_known = n_drained + len(set(digests))  # a record may be there twice
+        is_newest_missing = n_known < head.n_synced or bytes.fromhex(head.digest) not in digests
+        if head.n_synced > n_drained and is_newest_missing:
             self.loss = (
                 f"{max(1, head.n_synced - n_known)} records (decisions, labels or events) are "
                 "missing from the journal, though they were on disk; the newest is of "
@@ -426,6 +408,9 @@ class Journal:
             self.loss = (
                 f"the journal was not as it was written in {damaged} places, which were left out."
             )
+        newest = digests[-1].hex() if digests else head.digest
+        n_synced = max(head.n_synced, n_known)
+        self.head = Head(fields["newest"], n_drained, n_synced, newest, head.time)
 
     def _read_record(self, offset: int) -> bytes | None:
         """Return the encoded record at an offset, without its frame.
@@ -521,24 +506,13 @@ def head_path(journal: Path) -> Path:
     return journal.with_name(f"{journal.name}.head")
 
 
-def read_newest_entries(path: Path) -> set[tuple[int, str]]:
-    """Return the ledger entries (number, digest) that a journal's header and its head name.
-
-    They are none, one or two; a file that is missing or damaged names none.
-    """
-    entries = {(_read_head(path) or Head(None)).newest}
-    with suppress(OSError, *DAMAGES), path.open("rb") as file:
-        entries.add(_parse_header(file.read(HEADER))["newest"])
-    return {entry for entry in entries if entry is not None}
-
-
-def read_undrained(path: Path) -> tuple[list[Record], str]:
-    """Return the records of a journal that its store has not taken, and what it lost, in words.
+def read_undrained(path: Path) -> tuple[list[Record], Journal]:
+    """Return the records of a journal that its store has not taken, and the journal, closed.
 
     The records are oldest first, whoever owns the journal; of several decisions with one id only
-    the last is returned, and damaged records are left out. The loss is `Journal.loss`. Nothing is
-    locked or changed. Raise StoreError if the file cannot be read or is no journal, and for a
-    record that another release of dengine wrote.
+    the last is returned, and damaged records are left out. Nothing is locked or changed.
+    Raise StoreError if the file cannot be read or is no journal, and for a record that another
+    release of dengine wrote.
     """
     journal = Journal(path, owning=False)
     try:
@@ -551,14 +525,14 @@ def read_undrained(path: Path) -> tuple[list[Record], str]:
         for record in records
         if not isinstance(record, StoredDecision) or last[record.decision.id] is record
     ]
-    return newest, journal.loss
+    return newest, journal
 
 
-def _read_head(journal: Path) -> Head | None:
-    """Return the content of the head beside a journal; None if it is missing or damaged."""
+def read_head(journal: Path) -> Head:
+    """Return the content of the head beside a journal; an empty one if it is missing or damaged."""
     with suppress(OSError, *DAMAGES):
         return Head(**_unpack_fields(head_path(journal).read_bytes()))
-    return None
+    return Head()
 
 
 def _parse_header(header: bytes) -> dict[str, Any]:

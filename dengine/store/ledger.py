@@ -106,9 +106,13 @@ def _summed_columns(names: tuple[str, ...]) -> list[tuple[str, bytes]]:
 _DOUBLE = struct.Struct(">d").pack
 
 
-def is_intact(table: str, row: Mapping[str, Any]) -> bool:
-    """Return whether a row's stored sum is the one that its values have now."""
-    return bool(row_sum(table, row) == row["sum"])
+def is_intact(table: sa.Table, values: Sequence[Any]) -> bool:
+    """Return whether the stored sum of a row is the one that its values have now.
+
+    `values` are those of the table's columns, in their order; what follows them is ignored.
+    """
+    row = dict(zip(table.c.keys(), values, strict=False))
+    return bool(row_sum(table.name, row) == row["sum"])
 
 
 def state_sum(state: bytes | None) -> bytes | None:
@@ -413,7 +417,7 @@ def _find_table_error(
     rows = connection.execute(query.where(selected).order_by(number))
     for _, group in groupby(rows, lambda row: row.entry):
         entry_rows = [dict(zip(rows.keys(), row, strict=True)) for row in group]
-        if changed := [row for row in entry_rows if not is_intact(name, row)]:
+        if changed := [row for row in entry_rows if row_sum(name, row) != row["sum"]]:
             return f"the {name} {changed[0][number.name]} is not as it was written"
         chain = _extend_chain(chain, [row["sum"] for row in entry_rows])
     return "" if chain == chained else f"the rows of {name} are not those of the ledger"

@@ -197,9 +197,11 @@ class Outbox:
         """
         try:
             self._compare_with_ledger(journal)  # before anything is drained
-            since = "The store held no decision before them."
-            for item in self.store.decisions(HistoryFilter(), limit=1):
-                since = f"They came after decision {item.decision.id} of {item.when:%F %T} UTC."
+            newest = self.store.decisions(HistoryFilter(), limit=1)
+            since = "".join(
+                f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
+                for item in newest
+            )
             for offset, end, blob in journal.undrained_records():
                 record = decode_record(blob)
                 self._appended += 1
@@ -211,16 +213,14 @@ class Outbox:
             while not self.is_drained:
                 self._drain_chunk(journal)
             if journal.loss:
-                self._log_event(DATA_LOST, f"{journal.loss} {since}")
+                self._log_event(DATA_LOST, journal.loss + since)
             elif journal.dropped:
                 self._log_event(
                     "journal",
                     f"{journal.dropped} bytes at its end were dropped: a process was killed as it "
                     "wrote them",
                 )
-            journal.reserve()
             journal.clear()
-            journal.reserve()
             self.n_decisions = self.store.n_decisions()
             self.store.database.on_entry = self._save_newest_entry
             self._save_newest_entry()
@@ -256,18 +256,15 @@ class Outbox:
         and the journal is set to be drained from its beginning. An event is also stored if the
         journal or its head is new though the store is not.
         """
-        entries = [
-            entry for entry in (journal.newest_entry, journal.head.newest) if entry is not None
-        ]
         database = self.store.database
-        if missing := [entry for entry in entries if not database.has_entry(*entry)]:
+        if missing := [entry for entry in journal.entries if not database.has_entry(*entry)]:
             self._log_event(
                 DATA_LOST,
                 f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: the "
                 "store was cut off, or restored from a copy; labels may be missing.",
             )
             journal.drained_to = HEADER  # the journal may still hold some of them
-        elif len(entries) < 2 and database.newest_entry is not None:
+        elif len(journal.entries) < 2 and database.newest_entry is not None:
             self._log_event(
                 "journal",
                 f"the journal {journal.path}, or its head beside it, is new here, and the store is "
@@ -872,11 +869,8 @@ class Outbox:
                 self._to_drain = max(self._to_drain, self._synced)
                 self._changed.notify_all()
                 is_drained = self._changed.wait_for(lambda: journal.is_drained, BATCH_SECONDS)
-            if is_drained:  # syncs without the lock: a disk that hangs would hang the cell
-                journal.reserve()
-                with self._changed:
-                    journal.clear()
-                journal.reserve()
+            if is_drained:  # without the lock: a disk that hangs would hang the cell
+                journal.clear()
         blobs = [encode_record(record) for record in batch]
         try:
             offsets = journal.append(blobs, self.store.clock())
@@ -985,7 +979,7 @@ class Outbox:
             )
         with self._changed:
             journal.drained_to = chunk[-1][1]
-            journal.n_drained += len(chunk)
+            journal.head.n_drained += len(chunk)
             self._save_newest_entry()
             self._remove_drained(records, numbers)
             for _ in chunk:

@@ -119,32 +119,27 @@ def list_cells(url: str) -> list[CellSummary]:
 
     Raise StoreError if it is no store. Nothing is written.
     """
-    accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version)).where(
-        VERSION.c.accepted == sa.true()
-    )
+    accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))
+    accepted = accepted.where(VERSION.c.accepted == sa.true()).group_by(VERSION.c.cell_id)
     with reading(url) as connection:
         settings = connection.execute(sa.select(*SETTING.c["cell_id", "key", "value"])).all()
         decisions = _count_by_cell(connection, DECISION)
         labels = _count_by_cell(connection, LABEL)
-        versions = {
-            row[0]: row[1] for row in connection.execute(accepted.group_by(VERSION.c.cell_id))
-        }
+        versions = {row[0]: row[1] for row in connection.execute(accepted)}
     products = {cell_id: value for cell_id, key, value in settings if key == PRODUCT_KEY}
-    product_versions: dict[str | None, int] = {}  # the newest version, by product
-    for name, version in versions.items():
-        product = products.get(name)
-        product_versions[product] = max(version, product_versions.get(product, 0))
     summaries = []
     for name in sorted({row.cell_id for row in settings}):
         product = products.get(name)
-        times = [counts[name][1] for counts in (decisions, labels) if name in counts]
+        cells = {name, *(cell for cell, other in products.items() if other == product)}
+        n_decisions, last_decision = decisions.get(name, (0, 0.0))
+        n_labels, last_label = labels.get(name, (0, 0.0))
         summary = CellSummary(
             cell_id=name,
             product=product,
-            decisions=decisions[name][0] if name in decisions else 0,
-            labels=labels[name][0] if name in labels else 0,
-            version=versions.get(name) if product is None else product_versions.get(product),
-            last_seen=max(times, default=None),
+            decisions=n_decisions,
+            labels=n_labels,
+            version=max((versions[cell] for cell in cells & versions.keys()), default=None),
+            last_seen=max(last_decision, last_label) if n_decisions else None,
         )
         summaries.append(summary)
     return summaries
@@ -158,4 +153,4 @@ def _count_by_cell(connection: sa.Connection, table: sa.Table) -> dict[str, tupl
     query = sa.select(table.c.cell_id, sa.func.count(), sa.func.max(table.c.time)).group_by(
         table.c.cell_id
     )
-    return {row[0]: (row[1], row[2]) for row in connection.execute(query)}
+    return {name: (n, last) for name, n, last in connection.execute(query)}

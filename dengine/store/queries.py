@@ -62,10 +62,9 @@ class Scope:
         """
         if self.product is not None:  # by their numbers, or all would be read to be sorted
             return self.newest(connection, LABEL.c.seq) + 1 - 2 * window
-        trains = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
         query = (
             sa.select(LABEL.c.seq)
-            .where(trains)
+            .where(LABEL.c.cell_id == self.cell_id, TRAINS)
             .order_by(LABEL.c.seq.desc())
             .limit(1)
             .offset(window - 1)
@@ -90,13 +89,11 @@ class Scope:
 
         With `conditions`, only over the rows that fulfil them all. 0 if there is none.
         """
-        if self.product is not None:
-            return connection.execute(newest_of(self.product, column, *conditions)).scalar() or 0
         is_own = column.table.c.cell_id == self.cell_id
-        return (
-            connection.execute(sa.select(sa.func.max(column)).where(is_own, *conditions)).scalar()
-            or 0
-        )
+        query = sa.select(sa.func.max(column)).where(is_own, *conditions)
+        if self.product is not None:
+            query = newest_of(self.product, column, *conditions)
+        return connection.execute(query).scalar() or 0
 
     def newest_version(self, connection: sa.Connection) -> int:
         """Return the number of the newest accepted version; 0 before the first."""
@@ -184,6 +181,10 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
 
 
 LABEL_OF_DECISION = (LABEL.c.cell_id == DECISION.c.cell_id) & (LABEL.c.decision_id == DECISION.c.id)
+TRAINS = LABEL.c.quarantined == sa.false()
+CORRECTION_OF_LABEL = (CORRECTION.c.cell_id == LABEL.c.cell_id) & (
+    CORRECTION.c.decision_id == LABEL.c.decision_id
+)
 WITH_LABELS = DECISION.outerjoin(LABEL, LABEL_OF_DECISION)
 TRACE_OF_DECISION = (TRACE.c.cell_id == DECISION.c.cell_id) & (TRACE.c.decision_id == DECISION.c.id)
 WITH_TRACES = DECISION.outerjoin(TRACE, TRACE_OF_DECISION)
@@ -202,11 +203,7 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
     value = sa.func.coalesce(
         sa.cast(CORRECTION.c.success, sa.Integer), sa.literal_column(str(FORGOTTEN))
     )
-    # Along the index `correction_of`.
-    is_of_label = (CORRECTION.c.cell_id == LABEL.c.cell_id) & (
-        CORRECTION.c.decision_id == LABEL.c.decision_id
-    )
-    query = sa.select(value).where(is_of_label)
+    query = sa.select(value).where(CORRECTION_OF_LABEL)  # along the index `correction_of`
     query = query if corrected_to is None else query.where(CORRECTION.c.number <= corrected_to)
     newest = query.order_by(CORRECTION.c.number.desc()).limit(1).correlate(LABEL).scalar_subquery()
     return sa.func.coalesce(newest, sa.cast(LABEL.c.success, sa.Integer))
@@ -266,9 +263,7 @@ def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[A
     """
     label = corrected_label(corrected_to)
     query = sa.select(LABEL.c.seq, label.label("success"), *LABEL.c["content_hash", "decision_id"])
-    return query.where(
-        scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false(), label != FORGOTTEN
-    )
+    return query.where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
 
 
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:

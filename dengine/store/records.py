@@ -132,28 +132,6 @@ def as_text(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
 
 
-def check_state(
-    report: RetrainReport, state: Mapping[str, NDArray[Any]] | None
-) -> dict[str, NDArray[Any]] | None:
-    """Return a copy of a version's arrays, by name; None for a dropped candidate without arrays.
-
-    Raises StoreError for an accepted version without arrays, and for an array of Python objects,
-    which would need a pickle.
-    """
-    if state is None and report.accepted:
-        raise StoreError(
-            f"Expected the arrays of accepted version {report.version}, got None; pass its state."
-        )
-    copies = None if state is None else {name: np.array(values) for name, values in state.items()}
-    for name, values in (copies or {}).items():
-        if values.dtype.hasobject:
-            raise StoreError(
-                f"Expected plain arrays, got dtype {values.dtype} for {name!r}; store numbers "
-                "or strings."
-            )
-    return copies
-
-
 @dataclass(frozen=True, slots=True)
 class NewLabel:
     """A label on its way into a store.
@@ -321,22 +299,17 @@ def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     failure (upper < 1). So there are none, one or two. Their `seq` is 0, the other side's bound is
     1 or 0, and `predicted` is VERIFY unless the model alone would have acted on that side.
     """
+    accepts = int(decision.predicted is Action.ACCEPT)
+    rejects = 2 * int(decision.predicted is Action.REJECT)
     outcomes = []
     if decision.lower > 0.0:
-        accepts = int(decision.predicted is Action.ACCEPT)
-        outcomes.append(
-            OutcomeRecord(
-                0, decision.lower, 1.0, False, False, 0, accepts, decision.inclusion_probability
-            )
-        )
+        outcomes.append((decision.lower, 1.0, False, accepts))
     if decision.upper < 1.0:
-        rejects = 2 * int(decision.predicted is Action.REJECT)
-        outcomes.append(
-            OutcomeRecord(
-                0, 0.0, decision.upper, True, False, 0, rejects, decision.inclusion_probability
-            )
-        )
-    return outcomes
+        outcomes.append((0.0, decision.upper, True, rejects))
+    return [
+        OutcomeRecord(0, lower, upper, good, False, 0, predicted, decision.inclusion_probability)
+        for lower, upper, good, predicted in outcomes
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -648,7 +621,7 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
     """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
     Integers are compressed, of which a state repeats many; weights hardly get smaller. Raise
-    ValueError for an array of Python objects.
+    StoreError for an array of Python objects.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -656,7 +629,10 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
             info = zipfile.ZipInfo(f"{name}.npy")
             if values.dtype.kind in "iu":
                 info.compress_type = zipfile.ZIP_DEFLATED
-            with archive.open(info, "w", force_zip64=True) as member:
+            with (
+                instead(StoreError, f"Expected plain arrays, not {name!r}", ValueError),
+                archive.open(info, "w", force_zip64=True) as member,
+            ):
                 np.save(member, values, allow_pickle=False)
     return buffer.getvalue()
 

@@ -16,24 +16,26 @@ import os
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from ..errors import StoreError, expect, instead, listed, shortened
+from ..errors import StoreError, expect, instead, listed
 from ..records import Action, Reason, RetrainReport, Source
 from .connections import Database
 from .journal import Journal, Record, journal_path
 from .ledger import is_intact, read_settings, state_sum
 from .peers import check_peer_settings
 from .queries import (
+    CORRECTION_OF_LABEL,
     LABEL_OF_DECISION,
     SOURCE,
     SUCCESS,
     TRACE_OF_DECISION,
+    TRAINS,
     WITH_LABELS,
     Scope,
     audit_columns,
@@ -63,7 +65,6 @@ from .records import (
     VersionError,
     as_data,
     as_text,
-    check_state,
     chunks,
     from_npz,
     from_row,
@@ -96,8 +97,6 @@ log = logging.getLogger("dengine")
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 # Of the environment: seconds for all stores that are given none.
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"
-# For a store in memory, about 0.5 MB each; a replay of 1,503 parts has fewer.
-MAX_UNWRITTEN_VERSIONS = 40
 
 
 class SqlStore(AbstractContextManager["SqlStore"]):
@@ -177,7 +176,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.before_use: Callable[[], None] = self._write_memory
         # Of a store in memory: what was given and is written to the database when it is first read.
         self._unwritten: list[Record] = []
-        self._unwritten_versions: list[tuple[Any, ...]] = []
         self._has_label: dict[str, bool] = {}  # of every decision, by id
         self._newest_label = 0
         self.database = Database(
@@ -187,6 +185,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self._scope = self.database.scope
         self.product = self._scope.product
         self._journal: Journal | None = None
+
+    def _own(self, table: sa.FromClause) -> sa.ColumnElement[bool]:
+        """Return the SQL condition that a row of a table is this cell's."""
+        return table.c.cell_id == self.cell_id
 
     # Settings
 
@@ -218,7 +220,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             lock(connection, PRODUCT, self.product)
             for name, peer_settings in self._read_peers(connection).items():
                 check_peer_settings(settings, peer_settings, name, self.product)
-        is_replaced = (SETTING.c.cell_id == self.cell_id) & SETTING.c.key.not_in(RESERVED)
+        is_replaced = self._own(SETTING) & SETTING.c.key.not_in(RESERVED)
         connection.execute(sa.delete(SETTING).where(is_replaced))
         rows = [
             {"cell_id": self.cell_id, "key": key, "value": value} for key, value in settings.items()
@@ -275,9 +277,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         )
         if not rows:
             return None
-        if trace and not is_intact(
-            TRACE.name, dict(zip(TRACE.c.keys(), rows[0][-len(TRACE.c) :], strict=True))
-        ):
+        if trace and not is_intact(TRACE, rows[0][-len(TRACE.c) :]):
             where = f"as it was stored in {self.database.name}, its bytes have changed"
             do = "see `dengine verify`, and restore the store from a copy"
             raise StoreError(f"Expected the trace of decision {decision_id!r} {where}; {do}.")
@@ -288,7 +288,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         A read transaction stays open meanwhile.
         """
-        query = sa.select(DECISION.c.id).where(DECISION.c.cell_id == self.cell_id)
+        query = sa.select(DECISION.c.id).where(self._own(DECISION))
         with self.database.reading() as connection:
             yield from (
                 connection.execute(query.execution_options(yield_per=CHUNK)).scalars().partitions()
@@ -405,45 +405,37 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         or not as they were stored; these are left out. Raise StoreError if traces have different
         shapes, or a label is not 0 or 1.
         """
-        positions = {row.seq: i for i, row in enumerate(rows)}  # the forgotten are not among them
-        traces = np.zeros((0, 0, 0), dtype=np.float32)
-        is_kept = np.zeros(len(rows), dtype=bool)
+        labels = {row.seq: row for row in rows}  # the forgotten are not among them
+        traces: dict[int, NDArray[np.float32]] = {}
         is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
             TRACE.c.decision_id == LABEL.c.decision_id
         )
         query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, is_of_label))
-        query = query.where(scope.shared(LABEL.c.cell_id), LABEL.c.quarantined == sa.false())
+        query = query.where(scope.shared(LABEL.c.cell_id), TRAINS)
         first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
         query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
-        names = TRACE.c.keys()
-        for *values, seq in connection.execute(query.execution_options(yield_per=CHUNK)):
-            row = dict(zip(names, values, strict=True))
-            if seq not in positions or not is_intact(TRACE.name, row):
-                continue
-            shape = row["channels"], row["samples"]
-            if not len(traces):
-                traces = np.empty((len(rows), *shape), dtype=np.float32)
-            if shape != traces.shape[1:]:
-                shapes = sorted({traces.shape[1:], shape})
-                raise StoreError(
-                    f"Expected one shape in a cell's store, found {shapes}; give each kind its "
-                    "own cell_id."
-                )
-            traces[positions[seq]] = unpack(row["data"]).reshape(shape)
-            is_kept[positions[seq]] = True
-        labels = [row.success for row in rows]
-        if not all(label in (0, 1) for label in labels):
+        for row in connection.execute(query.execution_options(yield_per=CHUNK)):
+            if row.seq in labels and is_intact(TRACE, row):
+                traces[row.seq] = unpack(row.data).reshape(row.channels, row.samples)
+        shapes = sorted({trace.shape for trace in traces.values()})
+        if len(shapes) > 1:
+            raise StoreError(
+                f"Expected one shape in a cell's store, found {shapes}; give each kind its own "
+                "cell_id."
+            )
+        if not all(row.success in (0, 1) for row in rows):
             raise StoreError(
                 "Expected labels that are True or False, found another: the store is damaged; "
                 "restore a copy."
             )
+        kept = [labels[seq] for seq in traces]
         labelled = LabelledTraces(
-            seq=np.array([row.seq for row in rows], dtype=np.int64)[is_kept],
-            traces=traces if is_kept.all() else traces[is_kept[: len(traces)]],
-            labels=np.array(labels, dtype=np.int8)[is_kept],
-            hashes=np.array([row.content_hash for row in rows], dtype=np.int64)[is_kept],
+            seq=np.array([row.seq for row in kept], dtype=np.int64),
+            traces=np.stack([*traces.values()]) if traces else np.zeros((0, 0, 0), np.float32),
+            labels=np.array([row.success for row in kept], dtype=np.int8),
+            hashes=np.array([row.content_hash for row in kept], dtype=np.int64),
         )
-        return labelled, [rows[i].decision_id for i in np.flatnonzero(~is_kept)]
+        return labelled, [row.decision_id for row in rows if row.seq not in traces]
 
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
         """Record as damage that the trace or label of some decisions was left out.
@@ -498,8 +490,12 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         query = sa.select(*fields, known_overdue).select_from(
             LABEL.join(DECISION, LABEL_OF_DECISION)
         )
-        query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.quarantined == sa.false())
-        query = query.where(LABEL.c.seq > int(seq), LABEL.c.source != Source.INSPECTION.value)
+        query = query.where(
+            self._own(LABEL),
+            TRAINS,
+            LABEL.c.seq > int(seq),
+            LABEL.c.source != Source.INSPECTION.value,
+        )
         query = query.where(label != FORGOTTEN, DECISION.c.model_version >= since_version)
         rows = self._read(query.order_by(LABEL.c.seq))
         overdue: deque[StoredDecision] = deque()
@@ -572,13 +568,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         -------
         int
         """
-        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(
-            DECISION.c.cell_id == self.cell_id
-        )
+        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(self._own(DECISION))
         last = self._read(newest.order_by(DECISION.c.number.desc()).limit(1))
-        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(
-            LABEL.c.cell_id == self.cell_id
-        )
+        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL))
         by_labels = self._read(of_labels)[0][0] or 0
         is_in_force = bool(last) and last[0].model_version >= since_version
         return max(by_labels, last[0].number - within) if is_in_force else by_labels
@@ -599,9 +591,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             .select_from(WITH_LABELS)
             .where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
         )
-        query = query.where(
-            DECISION.c.cell_id == self.cell_id, DECISION.c.quarantined == sa.false()
-        )
+        query = query.where(self._own(DECISION), DECISION.c.quarantined == sa.false())
         return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def silent_total(self, since_version: int = 0) -> int:
@@ -618,10 +608,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             The sum of `silent`; labels of quarantined traces are left out.
         """
         query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
-        is_counted = (LABEL.c.cell_id == self.cell_id) & (LABEL.c.quarantined == sa.false())
-        return int(
-            self._read(query.where(is_counted, LABEL.c.model_version >= since_version))[0][0]
-        )
+        query = query.where(self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version)
+        return int(self._read(query)[0][0])
 
     def status(self, tally: Tally | None = None) -> dict[str, Any]:
         """Return counts of all decisions and labels of the cell.
@@ -646,7 +634,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             sources[group.source] += group.n if group.success is not None else 0
         forgotten = tally.by("label")["forgotten"]
         query = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
-        corrected = self._read(query.where(CORRECTION.c.cell_id == self.cell_id))[0][0]
+        corrected = self._read(query.where(self._own(CORRECTION)))[0][0]
         return {
             "decisions": tally.count(),
             "actions": {action.value: actions[action] for action in Action},
@@ -665,16 +653,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ) -> int:
         """Commit a retrain, and delete the states of older versions that are no longer kept.
 
-        A store in memory without a product keeps the copied arrays, and writes them when it is next
-        read, or when 40 retrains wait.
-
         Parameters
         ----------
         report : RetrainReport
         last_seq : int
             Number of the newest label that the retrain knew of.
         state : mapping of str to array, or None
-            The version's arrays, which are copied; None for a dropped candidate.
+            The version's arrays; None for a dropped candidate.
 
         Returns
         -------
@@ -688,31 +673,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             For an accepted version without arrays, for an array of Python objects, and if the
             database fails.
         """
-        arguments = report, last_seq, check_state(report, state), float(self.clock())
-        if self.wait is None and self.product is None:
-            self._unwritten_versions.append(arguments)
-            if len(self._unwritten_versions) == MAX_UNWRITTEN_VERSIONS:
-                self._write_versions()
-            return report.version
-        return self._commit_version(*arguments)
-
-    def _commit_version(self, *arguments: Any) -> int:
-        """Commit the row of a retrain and delete stored states that are no longer kept.
-
-        The arguments are report, last_seq, state and now, as of `_version_row`. Return the
-        version's number, which is higher than the one given if a peer has taken that.
-        """
-        row = self._version_row(*arguments)
+        row = self._version_row(report, last_seq, state, float(self.clock()))
         return self.database.write(
             lambda connection: self._insert_version(connection, row), flush_first=False
         )
-
-    def _write_versions(self) -> None:
-        """Write the versions that a store in memory was given, and has not written yet."""
-        unwritten = self._unwritten_versions
-        self._unwritten_versions = []
-        for arguments in unwritten:
-            self._commit_version(*arguments)
 
     def _version_row(
         self,
@@ -726,8 +690,12 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
         an accepted version without arrays, and for an array of Python objects.
         """
-        arrays = check_state(report, state)
-        blob = None if arrays is None else to_npz(arrays)
+        if state is None and report.accepted:
+            raise StoreError(
+                f"Expected the arrays of accepted version {report.version}, got None; pass its "
+                "state."
+            )
+        blob = None if state is None else to_npz(state)
         return {
             "time": now,
             "last_seq": int(last_seq),
@@ -899,7 +867,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         If the store cannot be written, the text is logged instead, and nothing raised.
         """
-        query = sa.select(EVENT.c.number).where(EVENT.c.cell_id == self.cell_id)
+        query = sa.select(EVENT.c.number).where(self._own(EVENT))
         query = query.where(EVENT.c.kind == "damaged", EVENT.c.text == as_text(text))
         if not self._read(query.limit(1)):
             try:
@@ -935,10 +903,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         list of Event
         """
         query = (
-            sa.select(EVENT)
-            .where(EVENT.c.cell_id == self.cell_id)
-            .order_by(EVENT.c.number.desc())
-            .limit(limit)
+            sa.select(EVENT).where(self._own(EVENT)).order_by(EVENT.c.number.desc()).limit(limit)
         )
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
@@ -955,12 +920,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             None if there was no change, or there is no such decision. The order is the ledger's,
             whatever the clock said.
         """
-        is_decision = (DECISION.c.cell_id == self.cell_id) & (DECISION.c.id == decision_id)
+        is_decision = self._own(DECISION) & (DECISION.c.id == decision_id)
         decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
         kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
-        query = sa.select(EVENT).where(
-            EVENT.c.cell_id == self.cell_id, kinds, EVENT.c.entry > decided
-        )
+        query = sa.select(EVENT).where(self._own(EVENT), kinds, EVENT.c.entry > decided)
         rows = self._read(query.order_by(EVENT.c.number).limit(1))
         return from_row(Event, rows[0]._mapping) if rows else None
 
@@ -990,11 +953,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         def add_rows(connection: sa.Connection) -> int:
             """Insert the event and everything that it changes; return the event's number."""
-            (number,) = self.database.insert(connection, EVENT.c.number, [to_row(event)])
-            if change.decisions:
-                self._correct_labels(
-                    connection, change, {"author": author, "event": number, "time": now}
-                )
+            labels = self._labels_to_correct(connection, change.decisions)
+            number = self.database.insert_corrections(connection, event, change.success, labels)
             if version is not None:
                 stored = self._insert_version(connection, version)
                 if stored != version["version"]:
@@ -1009,25 +969,21 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
         return self.database.write(add_rows)
 
-    def _correct_labels(
-        self, connection: sa.Connection, change: Change, event: Mapping[str, Any]
-    ) -> None:
-        """Insert a correction for each decision of a change.
+    def _labels_to_correct(
+        self, connection: sa.Connection, ids: Sequence[str]
+    ) -> dict[str, bool | None]:
+        """Return the present label of each of these decisions; None if it was forgotten.
 
-        `event` has the columns that they share: author, event and time. Raise ReportError for a
-        decision that is unknown or has no label.
+        Raise ReportError for a decision that is unknown or has no label.
         """
-        stored = self.database.stored_labels(connection, change.decisions)
-        for id_ in change.decisions:
+        stored = self.database.stored_labels(connection, ids)
+        for id_ in ids:
             if id_ not in stored:
                 raise unknown_decision(id_)
             if stored[id_].corrected is None:
                 raise nothing_to_correct(id_)
         labels = {0: False, 1: True, FORGOTTEN: None}
-        common = {**event, "success": change.success}
-        corrections = {id_: labels[stored[id_].corrected] for id_ in change.decisions}
-        rows = [common | {"decision_id": id_, "was": was} for id_, was in corrections.items()]
-        self.database.insert_corrections(connection, rows)
+        return {id_: labels[stored[id_].corrected] for id_ in ids}
 
     def corrections(self, after: int = 0) -> list[Correction]:
         """Return corrections of labels, oldest first, also those that a later one replaced.
@@ -1042,11 +998,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         list of Correction
             Of all cells of the product.
         """
-        is_of_label = (LABEL.c.cell_id == CORRECTION.c.cell_id) & (
-            LABEL.c.decision_id == CORRECTION.c.decision_id
-        )
         query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(
-            CORRECTION.join(LABEL, is_of_label)
+            CORRECTION.join(LABEL, CORRECTION_OF_LABEL)
         )
         query = query.where(
             self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after)
@@ -1095,7 +1048,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         number = DECISION.c.number
         if start_after is not None:
             other = DECISION.alias("other")
-            is_other = (other.c.cell_id == self.cell_id) & (other.c.id == start_after)
+            is_other = self._own(other) & (other.c.id == start_after)
             limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
             conditions.append(number < limit_number if newest else number > limit_number)
         query = (
@@ -1126,16 +1079,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """
         query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
         query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
-        query = query.where(LABEL.c.cell_id == self.cell_id, LABEL.c.seq > int(after)).order_by(
-            LABEL.c.seq
-        )
+        query = query.where(self._own(LABEL), LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
-        names = LABEL.c.keys()
-        damaged = {
-            row.decision_id
-            for row in rows
-            if not is_intact(LABEL.name, dict(zip(names, row, strict=False)))
-        }
+        damaged = {row.decision_id for row in rows if not is_intact(LABEL, row)}
         self._record_left_out(sorted(damaged), "label")
         rows = [row for row in rows if row.decision_id not in damaged]
         return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
@@ -1181,9 +1127,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             .select_from(WITH_LABELS)
             .group_by(*columns, "aged", SUCCESS, SOURCE)
         )
-        query = query.where(
-            DECISION.c.cell_id == self.cell_id, DECISION.c.model_version >= since_version
-        )
+        query = query.where(self._own(DECISION), DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = (
             [row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1)
@@ -1284,12 +1228,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return numbers
 
     def _write_memory(self) -> None:
-        """Write the versions and records that a store in memory was given to its database.
+        """Write the records that a store in memory was given to its database.
 
         It is called before every read and most writes; a replay, which reads nothing, never calls
         it.
         """
-        self._write_versions()
         unwritten = self._unwritten
         self._unwritten = []
         for part in chunks(unwritten):
@@ -1311,17 +1254,10 @@ def _checked_wait(wait: float | None) -> float:
 
     It is the argument, else the environment's DENGINE_STORE_WAIT, else 0.4.
     """
-    text = os.environ.get(WAIT_VARIABLE) if wait is None else None
-    name = "a wait" if text is None else WAIT_VARIABLE
-    seconds = WAIT if wait is None else wait
-    try:
-        if text:
-            seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0.0 < seconds < math.inf:
-        raise StoreError(
-            f"Expected {name} above 0 seconds, got {shortened(text or wait)}; {WAIT} is the "
-            "default."
-        )
+    value = (os.environ.get(WAIT_VARIABLE) or WAIT) if wait is None else wait
+    seconds = math.nan
+    with suppress(ValueError):
+        seconds = float(value)
+    wanted = f"{WAIT_VARIABLE if wait is None else 'a wait'} above 0 seconds"
+    expect(0.0 < seconds < math.inf, wanted, value, f"{WAIT} is the default", StoreError)
     return seconds

@@ -12,6 +12,7 @@ history anew, which a keyed ledger shows, or again a digest from elsewhere.
 """
 
 import json
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -25,7 +26,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from .connections import reading, run_integrity_check
-from .journal import journal_path, read_newest_entries, read_undrained
+from .journal import journal_path, read_head, read_undrained
 from .ledger import (
     START,
     check_key,
@@ -60,6 +61,10 @@ ROW_SUMS = struct.Struct("<q32s32s")
 SUMS = np.dtype([("entry", "<i8"), ("stored", "V32"), ("now", "V32")])  # the same
 # A row of the first table needs one of the second.
 REQUIRED = ((DECISION, TRACE), (TRACE, DECISION), (LABEL, DECISION))
+CUT_OFF = (
+    "is not there, though the cell's journal knows it: the history was cut off, or put back from a "
+    "copy"
+)
 SHOWN = 20  # missing entries that are named one by one
 
 
@@ -163,17 +168,15 @@ def verify_history(
         digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names.
     """
     expected = "" if expect is None else expect.strip().lower()
-    if expect is not None and (
-        not 8 <= len(expected) <= 64 or set(expected) - set("0123456789abcdef")
-    ):
+    if expect is not None and not re.fullmatch("[0-9a-f]{8,64}", expected):
         raise StoreError(
             f"Expected a digest of 64 hexadecimal digits, or its first 8 or more, got {expect!r}."
         )
     with reading(str(url)) as connection:
         names = _selected_cells(connection, cell_id)
-        journals = {name: journal_path(connection.engine.url, name) for name in names}
-        journal_entries = {name: read_newest_entries(path) for name, path in journals.items()}
-        inspected = {name: _inspect_journal(path) for name, path in journals.items()}
+        journals = {
+            name: _inspect_journal(journal_path(connection.engine.url, name)) for name in names
+        }
     with reading(str(url)) as connection:  # a later snapshot: it has what the journals knew
         pages = run_integrity_check(connection) if connection.dialect.name == "sqlite" else []
         faults = [HistoryFault("", "file", "", finding) for finding in pages]
@@ -181,21 +184,14 @@ def verify_history(
         for check in checks:
             check_key(connection, check.cell_id, check.key)
             faults += check.run()
-            if loss := inspected[check.cell_id][1]:
+            entries, _, loss = journals[check.cell_id]
+            if loss:
                 problem = f"is damaged: {loss} The next engine records that as an alarm"
                 faults.append(HistoryFault(check.cell_id, "journal", "", problem))
-            missing = [
-                number
-                for number, digest in journal_entries[check.cell_id]
-                if digest not in check.digests
-            ]
-            problem = (
-                "is not there, though the cell's journal knows it: the history was cut off, "
-                "or put back from a copy"
-            )
             faults += [
-                HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", problem)
-                for number in missing
+                HistoryFault(check.cell_id, LEDGER.name, f"entry {number}", CUT_OFF)
+                for number, digest in sorted(set(entries))
+                if digest not in check.digests
             ]
     if expected and not any(
         digest.startswith(expected) for check in checks for digest in check.digests
@@ -208,24 +204,23 @@ def verify_history(
             entries=len(check.digests),
             rows=check.rows,
             digest="".join(check.digests[-1:]),
-            waiting=inspected[check.cell_id][0],
+            waiting=journals[check.cell_id][1],
         )
         for check in checks
     ]
     return HistoryReport(tuple(cells), tuple(faults))
 
 
-def _inspect_journal(path: Path) -> tuple[int | None, str]:
-    """Return the number of records in a journal that its store has not taken, and what it lost.
+def _inspect_journal(path: Path) -> tuple[list[tuple[int, str]], int | None, str]:
+    """Return what a journal knows: ledger entries, number of records for its store, what it lost.
 
-    None and "" if there is no journal, or it cannot be read.
+    If there is no journal, or it cannot be read, the entry is that of its head, the number None.
     """
-    with suppress(StoreError):  # it is damaged, or another user's
-        if path.exists():
-            records, loss = read_undrained(path)
-            # Read again, since a running engine may have emptied it meanwhile.
-            return len(records), loss and read_undrained(path)[1]
-    return None, ""
+    with suppress(StoreError):  # it is missing, damaged, or another user's
+        records, journal = read_undrained(path)
+        return journal.entries, len(records), journal.loss
+    newest = read_head(path).newest
+    return [newest] if newest else [], None, ""
 
 
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:

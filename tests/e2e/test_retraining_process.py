@@ -160,7 +160,7 @@ def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_ta
 
 
 @pytest.mark.parametrize("fault", ["killed", "hung"])
-def test_a_process_that_was_given_up_is_started_again_and_retrains_in_line_until_it_is_ready(
+def test_a_process_that_was_given_up_is_started_again_and_retrains(
     fault: str, data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     others = set(multiprocessing.active_children())
@@ -181,6 +181,7 @@ def test_a_process_that_was_given_up_is_started_again_and_retrains_in_line_until
             assert not engine.store.retrains()[-1].accepted
             core_of(engine).start_retrain()
             monkeypatch.undo()
+        settle(engine)
         assert engine.version == 1
         assert process.ready.result(300) is None
         assert process.submit(os.getpid).result(300) != first.pid

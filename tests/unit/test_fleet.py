@@ -276,7 +276,7 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
     first, second = taught(fleet, parts, 90)
     with ThreadPoolExecutor(1) as executor:
         third = fleet.engine("c", executor=executor)
-        core_of(third).learner.start_retrain(by_hand=False)  # it does not know of the rollback
+        core_of(third).learner.start_retrain()  # it does not know of the rollback
         first.rollback(1)
         executor.shutdown()
     pinned = first.version

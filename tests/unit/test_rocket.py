@@ -16,6 +16,7 @@ from dengine.decision.scripting import script
 from dengine.engine.engine import core_of
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.folds import content_fold
+from dengine.model.base import N_EXAMPLES
 from dengine.reducers.base import StopRule
 from dengine.reducers.logistic_heads import fit_heads, masked_loss
 from dengine.reducers.preprocessing import averaging
@@ -389,7 +390,8 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(
     where, raw = set(), RocketEncoder.raw_features
 
     def told(self, x):
-        where.add(threading.current_thread().name)
+        if len(x) > N_EXAMPLES:  # so many are embedded to check a version
+            where.add(threading.current_thread().name)
         return raw(self, x)
 
     monkeypatch.setattr(RocketEncoder, "raw_features", told)

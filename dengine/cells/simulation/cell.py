@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ...errors import DengineError, expect
-from ...records import Outcome, TraceSpec
+from ...records import Outcome, TraceArray, TraceSpec
 from .conditions import (
     RATE_HZ,
     SAMPLES,
@@ -53,7 +53,7 @@ def read_sensor(
     faults: SensorFaults,
     parameters: CellParameters,
     rng: np.random.Generator,
-) -> NDArray[np.float32]:
+) -> TraceArray:
     """Return what the sensor reports of a true force: low-pass, faults, quantisation, lost samples.
 
     A lost sample repeats the last one that was not lost. `rng` is advanced.
@@ -112,7 +112,7 @@ class SimulatedInsertion:
         Faults of the sensor that were drawn.
     """
 
-    trace: NDArray[np.float32]
+    trace: TraceArray
     success: bool
     cause: str
     height_mm: float
@@ -246,7 +246,7 @@ class SimulatedCell:
         """Whether the newest part is good; False before the first."""
         return self.last is not None and self.last.success
 
-    def insert(self) -> NDArray[np.float32]:
+    def insert(self) -> TraceArray:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
         It is in newtons, 2 s at 500 Hz. `last` is set, and the clock goes on by `cycle_s`. Raise

@@ -20,12 +20,9 @@ from dataclasses import replace
 from enum import IntEnum
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ...datasets.triggers import Trigger
 from ...errors import CellError
-from ...records import Outcome
+from ...records import Outcome, TraceArray
 from .recorder import InsertionRecord, RtdeRecorder
 from .stream import Row, StreamReport
 
@@ -152,7 +149,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Return the counts of packages since the opening, and of traces with missing samples."""
         return replace(self.recorder.report(), incomplete=self.incomplete)
 
-    def insert(self) -> NDArray[np.float32]:
+    def insert(self) -> TraceArray:
         """Have a part inserted, wait for it, and return its trace, (T,) or (C, T).
 
         Lost samples are NaN; all are if no insertion was seen, as when its start was lost or the

@@ -14,11 +14,10 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...datasets.triggers import Start, StartFinder, Trigger, as_trigger, place
 from ...errors import CellError, expect
-from ...records import TraceSpec
+from ...records import TraceArray, TraceSpec
 from .protocol import CHANNELS, PORT
 from .stream import Row, RtdeStream, StreamReport
 
@@ -39,7 +38,7 @@ class InsertionRecord:
         Reconnections during the insertion.
     """
 
-    trace: NDArray[np.float32]
+    trace: TraceArray
     missing: int
     repeated: int
     reconnects: int
