@@ -6,7 +6,10 @@ from .cells.ur.controller import FakeController as FakeController
 from .cells.ur.controller import RobotProgram as RobotProgram
 from .cells.ur.recorder import RtdeRecorder as RtdeRecorder
 from .datasets import Dataset as Dataset
+from .datasets import Description as Description
+from .datasets import describe as describe
 from .datasets import load_dataset as load_dataset
+from .datasets import make_dataset as make_dataset
 from .datasets.importing import import_labelled as import_labelled
 from .decision.classifier import WilsonRadiusClassifier as WilsonRadiusClassifier
 from .decision.intervals import INTERVALS as INTERVALS

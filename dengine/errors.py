@@ -21,10 +21,7 @@ URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
 # In the query of a URL, or as libpq writes it.
 PASSWORD = re.compile(r"\b(password|passwd|sslpassword)=[^&\s'\"]+", re.IGNORECASE)
 QUOTES = ("'", '"')
-OPTIONS = (
-    "channels?|label_map|labels?|part|time|fit|samples|rate_hz|unit|trigger|topic|columns"
-    "|decimal|thousands|encoding"
-)
+OPTIONS = "channels?|fit|samples|rate_hz|unit|trigger"
 OPTION = re.compile(
     rf"(?<![\w=])'[^']*'|(?<!:)\b({OPTIONS})=('[^']*'|\"[^\"]*\"|[\w.]+)|(?<=\()({OPTIONS})=?(?=\))"
 )

@@ -411,7 +411,7 @@ def check_rate(windows: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> 
     in_seconds = [window for window in windows if window.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
         why = f"because force limits are in seconds ({listed(in_seconds)})"
-        do = "start the engine with TraceSpec(samples=..., rate_hz=...) first"
+        do = "state time.rate_hz of recordings, or start with TraceSpec(samples=..., rate_hz=...)"
         raise SettingError(f"Expected the rate of the traces, {why}, got an unknown one; {do}.")
 
 

@@ -53,7 +53,7 @@ LONG = (
     "test_fleet",
     "test_serve_http",
     "test_reducers",
-    "test_recordings",
+    "test_reading",
     "test_export",
     "test_engine",
     "test_corrections",

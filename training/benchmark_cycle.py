@@ -181,7 +181,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     recipe = Recipe.load(arguments.recipe).with_policy(**POLICY)
-    data = load_dataset(arguments.data, arguments.samples)
+    data = load_dataset(arguments.data, samples=arguments.samples)
     with busy_cores() if arguments.burn else nullcontext():
         rows = measure(data, recipe, arguments.replays, arguments.repeats, arguments.umap_repeats)
     print_table(rows, "A cycle's times", arguments.out / "benchmark_cycle.csv")

@@ -389,7 +389,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     recipe = Recipe.load(arguments.recipe).with_policy(**POLICY)
-    data = load_dataset(arguments.data, arguments.samples)
+    data = load_dataset(arguments.data, samples=arguments.samples)
     with tempfile.TemporaryDirectory() as folder:
         plan = Plan(
             url=arguments.store or str(Path(folder) / "fleet.db"),

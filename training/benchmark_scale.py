@@ -87,7 +87,7 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=5, help="retrains at each size")
     arguments = parser.parse_args()
-    data = load_dataset(arguments.data, arguments.samples)
+    data = load_dataset(arguments.data, samples=arguments.samples)
     recipe = Recipe.load(arguments.recipe).with_policy(**POLICY)
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         rows = [

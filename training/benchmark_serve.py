@@ -284,7 +284,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="kinds of requests whose names begin so")
     parser.add_argument("--pace", type=float, default=0.002, help="seconds between two parts")
     arguments = parser.parse_args()
-    data = load_dataset(arguments.data, arguments.samples)
+    data = load_dataset(arguments.data, samples=arguments.samples)
     recipe = Recipe.load(arguments.recipe).with_policy(**POLICY)
     with tempfile.TemporaryDirectory(dir=arguments.folder) as name:
         folder = Path(name)

@@ -153,7 +153,7 @@ def load_set(name: str, seed: int, screw_driving: Path | None = None) -> Dataset
 def _load_recorded(name: str, screw_driving: Path | None) -> Dataset:
     """Return a set that is not generated, loaded once."""
     if name == "screw driving":
-        return load_dataset(screw_driving, N_SAMPLES)
+        return load_dataset(screw_driving, samples=N_SAMPLES)
     data = load_dataset("insertion")
     if name == "insertion":
         return data

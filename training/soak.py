@@ -213,7 +213,7 @@ def main() -> None:
     parser.add_argument("--pace", type=float, default=0.02, help="seconds between two cycles")
     parser.add_argument("--every", type=int, default=1000, help="cycles of a row")
     args = parser.parse_args()
-    data = load_dataset(args.data, args.samples)
+    data = load_dataset(args.data, samples=args.samples)
     with tempfile.TemporaryDirectory(dir=args.folder) as name:
         folder = Path(name)
         recipe = Recipe.load(args.recipe).with_settings(window=args.window)

@@ -304,7 +304,7 @@ def parse_arguments() -> argparse.Namespace:
 def main() -> None:
     """Train on a data set; write checkpoint, curve and card."""
     arguments = parse_arguments()
-    data = load_dataset(arguments.data, arguments.samples)
+    data = load_dataset(arguments.data, samples=arguments.samples)
     training, held_out = split_parts(data, arguments.held_out, arguments.seed)
     torch.manual_seed(arguments.seed)
     _, _, channels, samples = training.tensors[0].shape

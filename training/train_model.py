@@ -55,7 +55,7 @@ def main() -> None:
     """Parse the command line, train, print the table and write the files."""
     out = Path("out/model")
     args = options(__doc__, data="insertion", samples=None, recipe="conv", out=out).parse_args()
-    data = load_dataset(args.data, args.samples)
+    data = load_dataset(args.data, samples=args.samples)
     recipe = Recipe.load(args.recipe)
     args.out.mkdir(parents=True, exist_ok=True)
     print_table(learning(data, recipe), f"{args.recipe} on {data.name}", args.out / "learning.csv")

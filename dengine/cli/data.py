@@ -3,13 +3,13 @@ which imports one into a store and trains an engine on it.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import as_options
 from . import options
 from .options import DataChoice, RecipeChoice, fault_lines, short_name, verb
 from .output import (
@@ -24,59 +24,129 @@ from .output import (
 )
 
 if TYPE_CHECKING:
-    from ..experiments.survey import Drift
+    from ..datasets import Dataset, Description
+    from ..experiments.survey import Drift, Survey
 
 MOST_FAULTS = 10  # that are shown
+_SAVE = "Write the description, recordings.toml in a folder or FILE.toml beside a file."
 SIGNIFICANT = 0.01  # p-values below it are called drift
 
 
 @verb("dengine data insertion --out out/")
 @options.data_options(argument=True)
+@click.option("--save", is_flag=True, help=_SAVE)
+@click.option("--check", is_flag=True, help="End with exit code 1 if there is any fault.")
 @options.out_option
-def data(source: DataChoice, out: Out | None) -> None:
-    """Describe a data set, and list what is wrong with it.
+@click.pass_context
+def data(
+    context: click.Context, source: DataChoice, save: bool, check: bool, out: Out | None
+) -> None:
+    """Describe recordings, and list what is wrong with them.
 
-    A table counts traces, labels, faults and repeats, one says how the data were read, and one
-    shows drift; --out draws the traces too.
+    DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
+    .npz, .ts or .mcap. Shown are the saved description or, without one, a proposal, in which ? is
+    what you have to state with --set; then what was read by it, and drift; --out draws the traces.
+    Look at them, and write the description with --save: every other verb reads by it.
 
-    DATA is one of: a folder of CSV files, one for each insertion, with the label in its name or in
-    a column; a wide .csv, .parquet or .jsonl file, with a row for each insertion; a long one, with
-    a row for each sample, read by --part, --time and --label; an .npz file with X (traces, samples)
-    and y (1 success, 0 failure); one long .mcap file, cut by --trigger; the file of a store, for
-    its labelled traces; or the bundled set, insertion.
+    DATA may also be what needs no description: a bundled set, the file of a store, or an .npz file
+    with X (traces, samples) and y (1 success, 0 failure).
     """
-    from ..datasets import load_dataset
+    from ..datasets.description import Seen
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey_dataset
-    from ..model.neighbours import MANY_REPEATS
-    from ..records import REPEATS, REPEATS_MEANING
 
-    dataset = load_dataset(source.data, **source.options)
+    description = source.describe(propose=True)
+    if description is not None and description.open_keys:
+        _print_open_keys(source, description, _save(source, description, save, context))
+        context.exit(int(check))
+    dataset = source.load(description)
     survey = survey_dataset(dataset)
-    rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
-    if not survey.rate_hz:
-        rows.append(("rate", "unknown"))
-    if not survey.unit:
-        rows.append(("unit", "unknown"))
-    parts: list[Any] = [table_of_rows(survey.name, rows), *map(as_options, dataset.notes)]
-    parts.append(table_of_rows("How it was read", dataset.reading.items()))
-    if dataset.ordered:
-        drifts = map(_drift_row, survey.drift)
-        parts.append(table_of_rows("By tenths of the recorded order", drifts, ("", "means", "")))
-    else:
-        parts.append(
-            "The files are in the order of their labels, not of their recording: drift cannot be "
-            "seen."
-        )
-    if survey.near_repeats > MANY_REPEATS:
-        parts.append(f"{survey.near_repeats} {REPEATS}. {REPEATS_MEANING}")
+    path = None
+    shown = ""
+    if description is not None:
+        n_found = len(dataset) + dataset.unlabelled + len(dataset.faults)
+        seen = Seen(recordings=n_found, good=survey.good, bad=survey.bad)
+        path = _save(source, replace(description, seen=seen), save, context)
+        shown = description.to_toml()
+    is_new = description is not None and source.saved is None
+    do = "Look at the traces (--out FOLDER); if they are right, write the description with --save."
+    last_line = f"Wrote {path}." if path else do if is_new else ""
     print_result(
-        {"data": source.data, "survey": survey, "notes": dataset.notes, "reading": dataset.reading},
-        *parts,
+        {"data": source.data, "description": shown, "survey": survey, "notes": dataset.notes},
+        *filter(None, [shown, *_survey_parts(dataset, survey), last_line]),
         *fault_lines(dataset, MOST_FAULTS),
         out=out,
         make_files=lambda: {"data.png": data_picture(dataset, survey.name)},
     )
+    if check and dataset.faults:
+        context.exit(1)
+
+
+def _print_open_keys(source: DataChoice, description: "Description", path: Path | None) -> None:
+    """Print a description with `?` in it, and what is to be stated.
+
+    path : the file to which it was written, if it was.
+    """
+    notes = description.notes
+    questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]
+    record = {"data": source.data, "description": description.to_toml()}
+    print_result(
+        {**record, "open": description.open_keys},
+        description.to_toml(),
+        f"Wrote {path}." if path else "",
+        "Still open, so nothing was read; state each with --set KEY=VALUE:",
+        *questions,
+    )
+
+
+def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
+    """Yield tables and sentences on what was read."""
+    from ..datasets.checks import tolerance_note
+    from ..decision.policy import Policy
+    from ..model.neighbours import MANY_REPEATS
+    from ..records import REPEATS, REPEATS_MEANING
+
+    rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
+    rows += [] if survey.rate_hz else [("rate", "unknown")]
+    rows += [] if survey.unit else [("unit", "unknown")]
+    rows += [("first", _trace_line(dataset, 0)), ("last", _trace_line(dataset, -1))]
+    yield table_of_rows(survey.name, rows)
+    yield from dataset.notes
+    if dataset.ordered:
+        drifts = map(_drift_row, survey.drift)
+        yield table_of_rows("By tenths of the recorded order", drifts, ("", "means", ""))
+    else:
+        yield (
+            "All parts of one label come first, so this is not the order of their recording: drift "
+            "cannot be seen."
+        )
+    if survey.near_repeats > MANY_REPEATS:
+        yield f"{survey.near_repeats} {REPEATS}. {REPEATS_MEANING}"
+    yield tolerance_note(dataset, Policy().lower_bound)
+
+
+def _save(
+    source: DataChoice, description: "Description", save: bool, context: click.Context
+) -> Path | None:
+    """Write the description if `--save` asks for it, and return its path; else None.
+
+    It replaces another one only with `--force`.
+    """
+    from ..datasets.loading import saved_description
+
+    if not save:
+        return None
+    path = source.description or saved_description(source.data)
+    return description.save(path, bool(context.params.get("force")))
+
+
+def _trace_line(dataset: "Dataset", i: int) -> str:
+    """Return a trace in words: its source, its label, and its first and last samples."""
+    trace = dataset.X[i] if dataset.X.ndim == 2 else dataset.X[i, 0]
+    samples = [f"{value:.4g}" for value in (*trace[:3], *trace[-2:])]
+    source = "" if dataset.source is None else f"{dataset.source[i]}, "
+    label = "good" if dataset.y[i] else "bad"
+    return f"{source}{label}: {', '.join(samples[:3])}, ..., {', '.join(samples[3:])}"
 
 
 def _drift_row(drift: "Drift") -> tuple[str, str, str]:
@@ -159,14 +229,15 @@ def train(
     and a version answers, nothing is trained. If the new version is not used, the exit code is 1.
     Ctrl-C keeps what was imported; the same command continues there.
     """
-    from ..datasets.importing import import_labelled, stored_form
+    from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine, core_of
     from ..experiments.tables import retrain_line
     from ..store.opening import LONG_WAIT
 
-    # The form of the store's earlier traces holds where no other one was asked for.
-    earlier_form = stored_form(store, source.data)
-    dataset = replace(source, options={**earlier_form, **source.options}).load()
+    description = source.describe()
+    if description is not None:
+        description = in_form_of(store, description)
+    dataset = source.load(description)
     recipe = choice.load_if_given()
     try:
         with interruptible_steps(f"importing {dataset.name}", len(dataset)) as count:

@@ -6,8 +6,10 @@ settings), `DataChoice` (which data set, read how), a store's address, or an `Ou
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,11 +17,11 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from ..errors import SettingError, as_options
-from .output import Out, as_json, json_option
+from ..errors import DataError, SettingError, as_options
+from .output import Out, as_json, json_option, progress_bar
 
 if TYPE_CHECKING:
-    from ..datasets import Dataset
+    from ..datasets import Dataset, Description
     from ..experiments.replay import Contender
     from ..recipe import Recipe
     from ..records import TraceSpec
@@ -56,9 +58,8 @@ def names_of(kind: str) -> tuple[str, ...]:
     ----------
     kind : str
         guarantee, interval, stops, recipe, baseline, method (recipes and baselines), fit (of live
-        traces), form (of recordings), label, action or reason.
+        traces), label, action or reason.
     """
-    from ..datasets.dataset import PAD_ALL
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
     from ..experiments.baselines import BASELINES
@@ -74,7 +75,6 @@ def names_of(kind: str) -> tuple[str, ...]:
         "baseline": BASELINES,
         "method": [*RECIPES, *BASELINES],
         "fit": FITS,
-        "form": (*FITS, PAD_ALL),
         "label": LABELS,
         "action": [action.value for action in Action],
         "reason": [reason.value for reason in Reason],
@@ -387,33 +387,72 @@ class DataChoice:
     ----------
     data : str
         A name, file or folder, as `load_dataset` takes it.
+    description : Path or None
+        The file of its description; None: the one that was saved.
+    stated : mapping
+        Keys of the description that were stated, like `label.column`.
     options : mapping
-        The options of `load_dataset` that were given.
+        `channel` and `samples`, if they were given.
+    live : mapping
+        Those options of live traces that were given.
     """
 
     data: str
+    description: Path | None
+    stated: Options
     options: Options
+    live: Options = field(default_factory=dict)
 
-    def load(self) -> Dataset:
+    @property
+    def saved(self) -> Path | None:
+        """The file of the description; None if there is none."""
+        from ..datasets.loading import saved_description
+
+        path = self.description or saved_description(self.data)
+        return path if self.description or path.is_file() else None
+
+    def describe(self, *, propose: bool = False) -> Description | None:
+        """Return the description with the stated keys; None for a source that is ours.
+
+        Parameters
+        ----------
+        propose : bool
+            Whether a description is proposed if none was saved; else that is a DataError.
+        """
+        from ..datasets import Description, describe
+        from ..datasets.loading import missing_text, own_reader
+
+        path = self.saved
+        if path is not None:
+            return Description.load(path).with_values(self.stated)
+        if not self.stated and own_reader(self.data) is not None:
+            return None
+        proposal = describe(self.data, self.stated)
+        if not propose:
+            raise DataError(missing_text(Path(self.data), proposal))
+        return proposal
+
+    def load(self, description: Description | None = None) -> Dataset:
         """Load the data set and return it.
 
-        How it was read, its notes and the first recordings that were left out are printed to
-        stderr, but not with `--json`.
+        Its notes and the first recordings that were left out are printed to stderr, but not with
+        `--json`. Raises DataError if it cannot be read.
 
-        Raises
-        ------
-        DataError
-            It cannot be read, or an option does not apply to it.
-        SettingError
-            The text of `--trigger` names no trigger.
+        description : None: that of `describe`.
         """
-        from ..datasets import BUNDLED, load_dataset
+        from ..datasets import load_dataset
+        from ..datasets.loading import count_files
 
-        data = load_dataset(self.data, **self.options)
+        description = description or self.describe()
+        with progress_bar(f"reading {self.data}", count_files(self.data, description)) as advance:
+            data = load_dataset(
+                self.data,
+                description,
+                channels=self.options.get("channel"),
+                samples=self.options.get("samples"),
+                progress=advance,
+            )
         if not as_json():
-            about = "; ".join(f"{name}: {text}" for name, text in data.reading.items())
-            if self.data not in BUNDLED:
-                click.echo(f"How it was read: {about}.", err=True)
             for line in (*map(as_options, data.notes), *fault_lines(data, 3)):
                 click.echo(line, err=True)
         return data
@@ -436,94 +475,76 @@ def fault_lines(data: Dataset, most: int) -> list[str]:
     return lines
 
 
-_SAMPLES = (
-    "Samples of a trace; of recordings only the first so many are used, which decides earlier.  "
-    "[default: all]"
+_SAMPLES = "Samples of a trace: the first so many, which decides earlier.  [default: all]"
+_CHANNELS = "FZ_Base, or several with commas between.  [default: those that are described]"
+_DESCRIPTION = (
+    "What the recordings are.  [default: recordings.toml in a folder, FILE.toml beside a file]"
 )
-_CHANNELS = "FZ_Base, or several with commas between.  [default: FZ_Base, or the only one]"
-_LABEL = (
-    "For a folder a regular expression whose group is the label, as in '_(OK|NOK)_', or a column "
-    "of its files; for a table its column, for .npz its array; of --labels the column.  "
-    "[default: True/False, OK/NOK, ... at the end of a file's name; y or label]"
+_SET = (
+    "State a key of the description for this command, like label.column=verdict; the value is "
+    "TOML, or a text. `dengine data` shows the keys."
 )
-_LABELS = (
-    "A CSV file of labels: of a folder's files, of a long table's parts, or of an .npz file's "
-    "traces in their order."
-)
-_LABEL_MAP = (
-    "What other words mean, as in 'heil=good,Riss=bad'; 1=good,0=bad where a file's name ends in "
-    "the label; 0= for a part that is not checked yet."
-)
-_TIME = (
-    "The column of times: of recordings, or of a long table, which has a row for each sample and "
-    "needs --part too."
-)
-_HERTZ = "Samples per second.  [default: from the timestamps; of a robot: 500; live: unknown]"
-_UNIT = (
-    "Unit of the samples; those that are in another one, kN for N, are converted.  "
-    "[default: the header's, else N; live: unknown]"
-)
-_COLUMNS = "The names of the columns of text files without a header, as in time,fx,fz or c0..c99."
-_DECIMAL = "The decimal mark in text files, . or ,  [default: detected in each file]"
-_THOUSANDS = (
-    "What groups thousands in text files, as the point in 1.043,5.  "
-    "[default: detected in each file]"
-)
-_ENCODING = (
-    "The encoding of text files that are not UTF-8, as cp932.  [default: Windows-1252, if it fits]"
-)
-_FIT = (
-    "What to do with traces of another length.  [default: strict where all have one length, else "
-    "pad; live: strict]"
-)
+_HERTZ = "Samples per second of live traces."
+_UNIT = "Unit of live traces, one for all channels or kN,mm."
+_FIT = "What to do with live traces of another length.  [default: strict]"
 _NAMES = CommaList(click.STRING)
 _RATE = click.FloatRange(0.0, min_open=True)
 _TRIGGER = (
-    "When an insertion begins, in an .mcap file or on a robot: contact=5 (newtons), register@NAME "
-    "(not zero), bit=0 (a digital output), motion=0.01 (m/s)."
-)
-_TOPIC = "The topic of the wrench in an .mcap file.  [default: the only one]"
-_PART = (
-    "The array or column of part numbers, or columns to join, as day,nr. A part "
-    "measured again has one vote; a repeat with equal samples and label is left out.  "
-    "[default: part]"
+    "When an insertion begins on a robot: contact=5 (newtons), register@NAME (not zero), bit=0 (a "
+    "digital output), motion=0.01 (m/s)."
 )
 _DATA = (
-    "The bundled set, insertion; a folder of CSV files, one for each insertion, with the label in "
-    "its name; a .csv or .parquet file, wide or long; .npz with X (traces, samples) and y (1 "
-    "success, 0 failure); .mcap with --trigger; or a store's .db."
+    "The bundled set, insertion; a folder or file of recordings with its description (see `dengine "
+    "data`); an .npz file with X (traces, samples) and y (1 success, 0 failure); or a store's .db."
 )
-TRACE = {
+CHOICE = {
     "samples": click.option("--samples", type=COUNT, help=_SAMPLES),
-    "rate_hz": click.option("--rate-hz", type=_RATE, metavar="HZ", help=_HERTZ),
-    "unit": click.option("--unit", metavar="TEXT", help=_UNIT),
     "channel": click.option(
         "--channels", "--channel", "channel", type=_NAMES, metavar="NAMES", help=_CHANNELS
     ),
+}
+LIVE = {
+    "rate_hz": click.option("--rate-hz", type=_RATE, metavar="HZ", help=_HERTZ),
+    "unit": click.option("--unit", metavar="TEXT", help=_UNIT),
     "fit": click.option("--fit", type=NameChoice("fit"), help=_FIT),
 }
-DATA = TRACE | {
-    "fit": click.option("--fit", type=NameChoice("form"), help=_FIT),
-    "label": click.option("--label", metavar="PATTERN", help=_LABEL),
-    "labels": click.option("--labels", metavar="FILE", help=_LABELS),
-    "label_map": click.option("--label-map", metavar="WORDS", help=_LABEL_MAP),
-    "columns": click.option("--columns", type=_NAMES, metavar="NAMES", help=_COLUMNS),
-    "decimal": click.option("--decimal", metavar="MARK", help=_DECIMAL),
-    "thousands": click.option("--thousands", metavar="MARK", help=_THOUSANDS),
-    "encoding": click.option("--encoding", metavar="NAME", help=_ENCODING),
-    "time": click.option("--time", metavar="COLUMN", help=_TIME),
-    "trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER),
-    "topic": click.option("--topic", metavar="NAME", help=_TOPIC),
-    "part": click.option("--part", metavar="KEY", help=_PART),
+TRACE = CHOICE | LIVE
+TRIGGER = {"trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER)}
+DATA = CHOICE | {
+    "description": click.option("--description", type=FILE, help=_DESCRIPTION),
+    "stated": click.option("--set", "stated", metavar="KEY=VALUE", multiple=True, help=_SET),
 }
 
 
-def _data_choice(data: str, **options: Any) -> DataChoice:
-    """Return the choice of a data set from the values of `--data` and of the options in `DATA`."""
-    return DataChoice(data, drop_none(**options))
+def parse_stated(items: Iterable[str]) -> dict[str, Any]:
+    """Return the keys and values of `--set KEY=VALUE`: a value is TOML, else a text.
+
+    Raises click.UsageError for a text without `=`.
+    """
+    stated = dict[str, Any]()
+    for item in items:
+        name, mark, text = item.partition("=")
+        if not mark:
+            raise click.UsageError(f"Expected --set KEY=VALUE, got {item!r}.")
+        value: Any = text
+        with suppress(tomllib.TOMLDecodeError):
+            value = tomllib.loads(f"value = {text}")["value"]
+        stated[name.strip()] = value
+    return stated
 
 
-def data_options(default: str | None = "insertion", argument: bool = False) -> Option:
+def _data_choice(
+    data: str, description: Path | None, stated: tuple[str, ...], **options: Any
+) -> DataChoice:
+    """Return the choice of a data set from the values of `--data` and of its options."""
+    given = drop_none(**options)
+    chosen = {name: given.pop(name) for name in CHOICE if name in given}
+    return DataChoice(data, description, parse_stated(stated), chosen, given)
+
+
+def data_options(
+    default: str | None = "insertion", argument: bool = False, live: bool = False
+) -> Option:
     """Return a decorator that adds `--data` and the options of how it is read.
 
     They are handed on as one `DataChoice`, the verb's argument `source`.
@@ -535,6 +556,8 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> O
     argument : bool, default False
         The data set is the verb's argument DATA, required, instead of an option; `default` is not
         used.
+    live : bool, default False
+        Whether to add the options of live traces.
     """
     metavar = "NAME|FILE|FOLDER"
     if argument:
@@ -545,7 +568,8 @@ def data_options(default: str | None = "insertion", argument: bool = False) -> O
         data = click.option(
             "--data", metavar=metavar, help=_DATA, default=default, show_default=True
         )
-    return bundle_options("source", _data_choice, {"data": data} | DATA)
+    more = LIVE | TRIGGER if live else {}
+    return bundle_options("source", _data_choice, {"data": data} | DATA | more)
 
 
 def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:

@@ -88,7 +88,7 @@ _SHADOW = "Verify every part; what the model would have done is only recorded."
     help=_CELL,
 )
 @click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
-@options.data_options()
+@options.data_options(live=True)
 @options.scenario_option
 @options.check_option
 @click.option("--cycles", type=options.COUNT, default=300, show_default=True, help=_CYCLES)
@@ -236,7 +236,7 @@ def _simulated_cell(
         cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=parameters)
         return cell, f"simulated cell, {scenario}"
 
-    stated = options.trace_spec_from(source.options)
+    stated = options.trace_spec_from({**source.options, **source.live})
     spec = SimulatedCell.spec if stated is None else stated.completed(SimulatedCell.spec)
     return CellToDrive(spec, make)
 
@@ -292,8 +292,9 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
         raise SettingError(
             "Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none."
         )
-    settings, spec = options.recorder_settings(source.options)
-    settings |= options.drop_none(trigger=source.options.get("trigger"))
+    stated = {**source.options, **source.live}
+    settings, spec = options.recorder_settings(stated)
+    settings |= options.drop_none(trigger=stated.get("trigger"))
     name, port = host_and_port(host)
     return CellToDrive(
         spec, lambda engine: (UrCell(name, port=port, **settings), f"robot at {host}")

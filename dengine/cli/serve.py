@@ -140,8 +140,7 @@ def serve(
                     f"Expected a new file to keep the demonstration in, {store} exists; choose "
                     f"another file."
                 )
-            form = {name: value for name, value in trace_options.items() if name != "channel"}
-            data = load_dataset("insertion", **form)
+            data = load_dataset("insertion", samples=trace_options.get("samples"))
             trace = data.spec
             settings["beside"] = [partial(playing, data=data, speed=speed, seed=seed or 0)]
             settings["deadline"] = max(settings["deadline"], DEMO_DEADLINE)

@@ -1,14 +1,25 @@
-"""Read labelled traces from folders of CSV files, tables, arrays, archives and bags.
+"""Read labelled traces: recordings by a description, and what is ours without one.
 
->>> load_dataset("insertion")  # 1503 simulated insertions, shipped with the package
->>> load_dataset("recorded.npz", samples=400)  # X (n, T) or (n, C, T), y (n,)
->>> load_dataset("cell_3/", channel="FZ_Base,FX_Base")  # a CSV file for each insertion
+    description = describe("cell_3/")  # proposes what the recordings are
+    description.save("cell_3/recordings.toml")
+    load_dataset("cell_3/")  # a Dataset, read exactly by that file
 
-`load_dataset` reads them into one `Dataset`, `make_dataset` makes one of arrays;
-`importing.import_labelled` puts them into a store.
+    load_dataset("insertion")  # 1503 simulated insertions, shipped with the package
+
+`make_dataset` makes a `Dataset` of arrays; `importing.import_labelled` puts one into a store.
 """
 
 from .dataset import Dataset, Fault, make_dataset
+from .describe import describe
+from .description import Description
 from .loading import BUNDLED, load_dataset
 
-__all__ = ["BUNDLED", "Dataset", "Fault", "load_dataset", "make_dataset"]
+__all__ = [
+    "BUNDLED",
+    "Dataset",
+    "Description",
+    "Fault",
+    "describe",
+    "load_dataset",
+    "make_dataset",
+]

@@ -12,7 +12,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,7 +39,8 @@ from ..store.opening import LONG_WAIT, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
-from .loading import holds_table
+from .description import Description
+from .loading import description_of, own_reader
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
@@ -50,32 +50,27 @@ CHUNK = 500  # traces committed together
 RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestamps
 
 
-def stored_form(store: "StoreLike", source: Any) -> dict[str, Any]:
-    """Return the options `samples` and `fit` by which recordings get the form of those in a store.
+def in_form_of(store: "StoreLike", description: Description) -> Description:
+    """Return a description by which recordings get the form of the traces in a store.
 
-    Without them files that are added would change the median length to which all are padded: all
-    would come out changed, and count again. `fit` is None if the store's is strict. The dict is
-    empty for a new store, and for other sources than folders and tables. The store is read, and
-    closed if it was given by its address.
+    Otherwise all would count again if they came out in another length. For a new store it is
+    returned as it is. The store is read, and closed if it was given by its address.
     """
-    if not isinstance(source, str | os.PathLike):
-        return {}
-    path = Path(source)
-    if not (path.is_dir() or (path.is_file() and holds_table(path))):
-        return {}
     try:
         with opening(store, must_exist=True) as opened:
             trace_spec = stored_trace_spec(opened.settings())
             if opened is not store:
                 opened.close()
     except StoreError:
-        return {}  # a new store; any other error comes again when it is opened to be written
+        return (
+            description  # a new store; any other error comes again when it is opened to be written
+        )
     if trace_spec is None:
-        return {}
-    return {
-        "samples": trace_spec.samples,
-        "fit": None if trace_spec.fit == "strict" else trace_spec.fit,
-    }
+        return description
+    stated: dict[str, Any] = {"traces.samples": trace_spec.samples}
+    if trace_spec.fit != "strict":
+        stated["traces.lengths"] = trace_spec.fit
+    return description.with_values(stated)
 
 
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
@@ -150,7 +145,7 @@ def import_labelled(
     store : path, URL or store
         A new store, which is created, or a used one. A store object stays open.
     dataset : object
-        Anything `load_dataset` takes.
+        Anything `load_dataset` takes. Described recordings get the form of the store's traces.
     recipe, seed : optional
         Of a new store's engine, by default conv and 0. A used store has its own; others are a
         SettingError.
@@ -168,7 +163,10 @@ def import_labelled(
     TraceError
         If the traces do not agree with those of the store.
     """
-    data = load_dataset(dataset, **stored_form(store, dataset))
+    description = None
+    if own_reader(dataset) is None:
+        description = in_form_of(store, description_of(dataset, None))
+    data = load_dataset(dataset, description)
     with opening(store, wait=LONG_WAIT) as opened:
         agreed = agreed_trace_spec(opened, data.spec)
         engine = DataEngine.open_or_create(
@@ -221,11 +219,8 @@ def import_parts(
     """
     gate = TraceGate(trace_spec)
     counts = Counter[str]()
-    n_silent = 0  # accepted parts since the last label of which nothing was heard
     counts_silence = policy.stops == "some"
-    if counts_silence:
-        since = int(store.settings().get("policy_since", 0))
-        n_silent = len(store.unreported_accepts(since)) - store.silent_total(since)
+    n_silent = _count_silent(store, policy)
     for start in range(0, len(parts), CHUNK):
         new: dict[str, StoredDecision] = {}
         labels: list[NewLabel] = []
@@ -233,28 +228,21 @@ def import_parts(
             fault, hash_of_content = gate(torch.from_numpy(trace))
             earlier = new.get(decision.id) or store.get_decision(decision.id)
             if earlier is not None and earlier.source is not None:  # a forgotten one has a label
-                if label is not None:
-                    counts["repeated" if label == earlier.success else "contradicted"] += 1
+                counts[_repeat_of(label, earlier)] += 1
                 continue
             stored = earlier
             if stored is None:
-                is_certain = decision.predicted is not Action.VERIFY
-                propensity = policy.audited_share if is_certain else 1.0
-                # A trace with a fault is stored, but never used for training.
-                reason = REASONS[fault] if fault else decision.reason
-                stored = StoredDecision(
-                    replace(decision, reason=reason, propensity=propensity),
-                    trace.copy(),
-                    trace_hash(hash_of_content, decision.part),
-                    bool(fault),
-                    store.clock(),
-                )
+                stored = _as_stored(decision, trace, fault, hash_of_content, policy, store.clock())
                 new[decision.id] = stored
             if counts_silence and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as silent.
                 n_silent += (label is None) - (earlier is not None)
             if label is None:
                 continue
+            silent = 0
+            if not fault:
+                silent = n_silent
+                n_silent = 0
             labels.append(
                 NewLabel(
                     decision.id,
@@ -262,13 +250,12 @@ def import_parts(
                     source_of(decision.action, decision.audit, label),
                     model_version=0,
                     point=None,
-                    silent=0 if fault else n_silent,
+                    silent=silent,
                     time=store.clock(),
                     content_hash=stored.content_hash,
                     decided=stored.time,
                 )
             )
-            n_silent = n_silent if fault else 0
             counts["quarantined" if fault else "imported"] += 1
         store.apply_records([*new.values(), *labels])
         if on_traces is not None:
@@ -280,6 +267,44 @@ def import_parts(
         resumed=True,
         contradicted=counts["contradicted"],
     )
+
+
+def _count_silent(store: "SqlStore", policy: Policy) -> int:
+    """Return how many accepted parts there are since the last label of which nothing was heard.
+
+    If silence confirms a part, there is none.
+    """
+    if policy.stops != "some":
+        return 0
+    since = int(store.settings().get("policy_since", 0))
+    return len(store.unreported_accepts(since)) - store.silent_total(since)
+
+
+def _repeat_of(label: bool | None, earlier: StoredDecision) -> str:
+    """Return what the label of a part that has one in the store counts as; "" without a label."""
+    if label is None:
+        return ""
+    return "repeated" if label == earlier.success else "contradicted"
+
+
+def _as_stored(
+    decision: Decision,
+    trace: NDArray[np.float32],
+    fault: int,
+    hash_of_content: int,
+    policy: Policy,
+    time: float,
+) -> StoredDecision:
+    """Return the record of a decision; a trace with a fault never trains, and is its reason.
+
+    fault : position in `REASONS`, 0 for none.
+    """
+    is_certain = decision.predicted is not Action.VERIFY
+    propensity = policy.audited_share if is_certain else 1.0
+    reason = REASONS[fault] if fault else decision.reason
+    made = replace(decision, reason=reason, propensity=propensity)
+    part_hash = trace_hash(hash_of_content, decision.part)
+    return StoredDecision(made, trace.copy(), part_hash, bool(fault), time)
 
 
 def _verifying_decisions(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:

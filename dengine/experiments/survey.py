@@ -1,7 +1,7 @@
 """A survey of a data set before anything is learned from it: counts, faults, repeats and drift. The
 verb `data` prints it.
 
-    survey_dataset(load_dataset("cell_3/", channel="FZ_Base"))
+    survey_dataset(load_dataset("cell_3/"))
 
 It counts traces, labels, faults and repeats, and looks for drift in the recorded order.
 """
@@ -21,7 +21,7 @@ from ..traces import LARGEST, as_traces
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """The smallest, median and largest of the lengths or rates of a data set's recordings."""
+    """The smallest, median and largest of the lengths of a data set's recordings."""
 
     low: float
     median: float
@@ -67,8 +67,8 @@ class Survey:
     seconds, rate_hz : float or None
         Duration of a trace, and samples per second; None where not known.
     unit, fit : str
-    lengths, rates : Spread or None
-        Of the recordings; None where not known.
+    lengths : Spread or None
+        Samples of the recordings; None where not known.
     good, bad : int
         Labels.
     unlabelled : int
@@ -101,7 +101,6 @@ class Survey:
     unit: str
     fit: str
     lengths: Spread | None
-    rates: Spread | None
     good: int
     bad: int
     unlabelled: int
@@ -153,7 +152,6 @@ def survey_dataset(data: Dataset) -> Survey:
         names=data.channels,
         seconds=None if data.rate_hz is None else X.shape[2] / data.rate_hz,
         lengths=_spread(data.lengths),
-        rates=_spread(data.rates),
         good=n_good,
         bad=len(data) - n_good,
         not_finite=int((~finite).sum()),

@@ -389,8 +389,8 @@ def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) 
     )
 
 
-FAILING = """status missing.db; replay --data missing.npz; replay --recipe missing.toml --data DATA; data DATA --label ((
-replay --data DATA --cycles 5000; replay --data DATA --part serial; simulate --n 1 --out x.npz --scenario missing
+FAILING = """status missing.db; replay --data missing.npz; replay --recipe missing.toml --data DATA; data DATA --set traces.samples=x
+replay --data DATA --cycles 5000; replay --data DATA --channel FX; simulate --n 1 --out x.npz --scenario missing
 run --cell replay --data DATA --store e.db --reducer nowhere:Nothing"""
 
 
@@ -434,12 +434,14 @@ def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected(words: str, expe
 def test_limits_in_seconds_need_a_rate_that_the_recordings_or_an_option_state(
     verb: str, data: Path, tmp_path: Path
 ) -> None:
+    data = Path(shutil.copy(data, tmp_path / "parts.npz"))
     words = (*verb.split(), "--data", data, "--reducer", "pca", *POLICY, "--store")
     limits = ("--window", "0.01:0.02:-500:")
     refused = dengine(*words, tmp_path / "new.db", *limits)
     assert refused.exit_code == 1
-    assert "start the engine with --samples ..., --rate-hz ... first" in refused.stderr
-    succeed(*words, tmp_path / "new.db", *limits, "--rate-hz", 100, "--unit", "kN")
+    assert "state time.rate_hz of recordings" in refused.stderr
+    succeed("data", data, "--set", "time.rate_hz=100", "--set", "channels.X=kN", "--save")
+    succeed(*words, tmp_path / "new.db", *limits)
     with DataEngine.open(tmp_path / "new.db") as engine:
         assert (engine.trace.rate_hz, engine.trace.unit) == (100.0, "kN")
         assert engine.policy.windows
@@ -480,17 +482,9 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
 ) -> None:
     parts, store = easy_parts(700, 1, wave=slice(300, 400)), tmp_path / "engine.db"
     np.savez(tmp_path / "changing.npz", X=parts.X, y=parts.y, serial=parts.part)
-    words = [
-        "run",
-        "--data",
-        tmp_path / "changing.npz",
-        "--part",
-        "serial",
-        "--store",
-        store,
-        "--reducer",
-        "pca",
-    ]
+    data = tmp_path / "changing.npz"
+    succeed("data", data, "--set", "part.column=serial", "--set", "channels.X=N", "--save")
+    words = ["run", "--data", data, "--store", store, "--reducer", "pca"]
     shown = document(*words, *KNOWN, "--audit-rate", 0.1, "--cycles", 320)
     (change,) = shown["safe_mode_changes"]
     assert 300 < change["cycle"] <= 320

@@ -187,8 +187,6 @@ def test_a_bomb_is_refused_by_what_it_claims(
         for _ in range(64):
             member.write(bytes(2**20))
     assert path.stat().st_size < 2**17
-    with pytest.raises(DataError, match="Expected arrays X and y"):
-        load_dataset(path)
     monkeypatch.setattr("dengine.files.MAX_BYTES", 2**20)
     with pytest.raises(DataError, match=r"at most 1\.0 MB of arrays in .*, got 64\.0 MB"):
         read_archive(path)

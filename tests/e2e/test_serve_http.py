@@ -356,7 +356,7 @@ def test_limits_in_seconds_are_refused_in_one_sentence_while_the_rate_is_unknown
         assert (trace["rate_hz"], trace["unit"]) == (None, None)
         asked = {"windows": ["0.01:0.02:-5:"], "author": "Kim"}
         problem = must_be_problem(client.post("/policy", json=asked), 422)
-        assert "start the engine with --samples ..., --rate-hz ... first" in problem["detail"]
+        assert "or start with --samples ..., --rate-hz ..." in problem["detail"]
         assert service.core.settings.now.recipe.policy.windows == ()
 
 

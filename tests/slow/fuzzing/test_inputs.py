@@ -13,7 +13,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dengine import DataEngine, DengineError, Recipe, TraceSpec, load_dataset, open_store
+from dengine import (
+    DataEngine,
+    DengineError,
+    Recipe,
+    TraceSpec,
+    describe,
+    load_dataset,
+    open_store,
+)
 from dengine.datasets.importing import import_labelled
 from dengine.engine.engine import core_of
 from dengine.export.cell_journal import read_journal
@@ -177,12 +185,9 @@ def test_a_damaged_file_of_data_is_read_or_refused(name: str, tmp_path_factory, 
     cell.mkdir()
     (cell / "1_OK.csv").write_bytes(FILES["cell/1_OK.csv"][0])
     (here / name).write_bytes(data.draw(st.sampled_from(FILES[name]).flatmap(spoilt)))
-    whole, labels = (
-        name in ("data.npz", "table.csv"),
-        here / "labels.csv" if name == "labels.csv" else None,
-    )
+    source = here / name if name in ("data.npz", "table.csv") else cell
     with suppress(DengineError):
-        load_dataset(here / name) if whole else load_dataset(cell, labels=labels)
+        load_dataset(source, describe(source))
 
 
 @given(

@@ -1,0 +1,62 @@
+"""The files that a description names, and their content."""
+
+import gzip
+import re
+import zlib
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from ...errors import DataError, instead
+from ..description import FOLDER_FILE, Description
+from ..table import UnreadableError
+
+GZIP = ".gz"
+BAD = (ValueError, NotImplementedError, OSError)  # what an unusable pattern raises
+Key = list[tuple[int, int, str]]
+
+
+def natural_key(text: str) -> Key:
+    """Return a key that sorts numbers in texts by their size: run_2 before run_10."""
+    pieces = re.split(r"([0-9]+)", text)
+    return [(1, int(p), "") if p.isascii() and p.isdecimal() else (0, 0, p) for p in pieces if p]
+
+
+def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
+    """Return the files of a description below a folder, each with its path as seen from there.
+
+    They are in the order of their names, with numbers by their size. Of a single file, that file.
+    Raises DataError if there is none.
+    """
+    if root.is_file():
+        return [(root, root.name)]
+    listings = [source.listing for source in (description.label, *description.check)]
+    listings += [description.windows.listing, FOLDER_FILE]
+    others = {Path(listing).as_posix() for listing in listings}
+    names: dict[str, Path] = {}
+    for pattern in description.files:
+        with instead(DataError, f"Expected patterns below a folder in files, got {pattern}", *BAD):
+            names |= {path.relative_to(root).as_posix(): path for path in root.glob(pattern)}
+    found = [(path, name) for name, path in names.items() if path.is_file() and name not in others]
+    for pattern in description.exclude:
+        found = [item for item in found if not fnmatchcase(item[1], pattern)]
+    if not found:
+        do = f"is it the description of another folder? See `dengine data {root}`"
+        wanted = f"files {', '.join(description.files)} in {root}"
+        raise DataError(f"Expected {wanted}, found none; {do}.")
+    return sorted(found, key=lambda item: (natural_key(item[0].name), natural_key(item[1])))
+
+
+def read_file(path: Path) -> bytes:
+    """Return the content of a file, unpacked if it is gzipped.
+
+    Raises UnreadableError if it cannot be read, or changed while it was read.
+    """
+    with instead(UnreadableError, f"Cannot read {path.name}", OSError, EOFError, zlib.error):
+        before = path.stat()
+        content = path.read_bytes()
+        after = path.stat()
+        if path.suffix.lower() == GZIP:
+            content = gzip.decompress(content)
+    if (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
+        raise UnreadableError("Expected a file that stays, it changed while it was read")
+    return content

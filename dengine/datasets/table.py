@@ -1,0 +1,201 @@
+"""`Table`, columns of cells as a file holds them, and `Recording`, what one part's samples are.
+
+Reading a cell as a number is strict: what does not follow the description raises
+`UnreadableError`, which names the line and the column, and becomes a `Fault`.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError, listed, shortened
+from .description import TextForm
+
+Cells = NDArray[Any]
+Floats = NDArray[np.float64]
+LARGEST = 3.4028235e38  # of a sample, which is a float32
+# A minus sign that typographers use, which Excel writes in some languages.
+MINUS = str.maketrans({"−": "-"})
+
+
+class UnreadableError(DataError):
+    """A file or a recording that does not follow the description.
+
+    line : of the file, 0 if it is the whole.
+    column : "" if it is none.
+    """
+
+    def __init__(self, message: str, line: int = 0, column: str = "") -> None:
+        super().__init__(message)
+        self.line = line
+        self.column = column
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Columns of cells.
+
+    Parameters
+    ----------
+    source : str
+        The file, as seen from the folder.
+    columns : mapping of str to array, shape (rows,)
+        Numbers, times, or texts as objects. In a file of a single part a column of one cell holds
+        for all rows.
+    lines : sequence of int
+        Line of each row in the file, or the one line of all.
+    units : mapping of str to str
+        Units that the file states for its columns.
+    above : sequence of str
+        Lines above the header.
+    header : int
+        Line of the header; 0 for none.
+    damage : mapping of int to str
+        What is wrong with lines of another number of cells; their rows have empty cells.
+    origin : mapping of str to sequence of str
+        The columns of the file that the cells of a column stood in, if they are others.
+    """
+
+    source: str
+    columns: Mapping[str, Cells]
+    lines: Sequence[int]
+    units: Mapping[str, str] = field(default_factory=dict)
+    above: Sequence[str] = ()
+    header: int = 0
+    damage: Mapping[int, str] = field(default_factory=dict)
+    origin: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+    def column(self, name: str) -> Cells:
+        """Return a column; raise UnreadableError if there is none of this name."""
+        if name not in self.columns:
+            found = listed(self.columns) or "none"
+            raise UnreadableError(f"Expected a column {name}, got {found}", self.header, name)
+        return self.columns[name]
+
+    def take(self, rows: Any) -> "Table":
+        """Return a table of some rows: a slice, or an array of positions or booleans."""
+        lines = self.lines
+        if len(lines) > 1:
+            lines = lines[rows] if isinstance(rows, slice) else np.asarray(lines)[rows]
+        columns = {name: c[rows] if len(c) > 1 else c for name, c in self.columns.items()}
+        return replace(self, columns=columns, lines=lines)
+
+    def words(self, name: str) -> Cells:
+        """Return a column as texts, shape (rows,), without blanks around them.
+
+        Whole numbers have no decimal point: 1.0 is "1". NaN and None are "".
+        """
+        import pandas as pd
+
+        codes, cells = pd.factorize(self.column(name), use_na_sentinel=False)
+        texts = np.array([as_word(cell) for cell in cells.tolist()], dtype=object)
+        return np.asarray(texts[codes])
+
+    def numbers(self, name: str, form: TextForm) -> Floats:
+        """Return a column as numbers, shape (rows,); a missing one is NaN.
+
+        Raises UnreadableError for a cell that is no finite number of this form, and no word for a
+        missing one.
+        """
+        cells = self.column(name)
+        if cells.dtype.kind in "iuf":
+            values = cells.astype(np.float64)
+        else:
+            values = np.array([_number(cell, form) for cell in cells.tolist()], dtype=np.float64)
+        groups = f" and groups by {form.thousands!r}" if form.thousands else ""
+        wanted = f"a number with the decimal mark {form.decimal}{groups}"
+        self.refuse(np.abs(values) > LARGEST, wanted, name)
+        return values
+
+    def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:
+        """Raise UnreadableError for the first cell of a column that is bad, if one is."""
+        if is_bad.any():
+            row = int(is_bad.argmax())
+            found = shortened(self.columns[name][row : row + 1].tolist()[0])
+            column = self.origin[name][row] if name in self.origin else name
+            raise UnreadableError(f"Expected {wanted}, got {found}", self.line(row), column)
+
+    def line(self, row: int) -> int:
+        """Return the line of a row; 0 if it is not known."""
+        row = row if len(self.lines) > 1 else 0
+        return int(self.lines[row]) if row < len(self.lines) else 0
+
+    def one_word(self, name: str, at: str = "same") -> str:
+        """Return the word of a column that holds for a recording; see `LabelSource.at`.
+
+        Raises UnreadableError if it changes although it must be the same.
+        """
+        cells = self.column(name)
+        if not len(cells):
+            raise UnreadableError(f"Expected a word in column {name}, got no rows", column=name)
+        if at == "same" and (cells != cells[0]).any():
+            words = self.words(name)
+            self.refuse(words != words[0], f"one word in all rows, {words[0]!r}", name)
+        return as_word(cells[-1 if at == "last" else 0])
+
+
+@dataclass(slots=True)
+class Recording:
+    """The samples of one part, as a file holds them.
+
+    Parameters
+    ----------
+    source : str
+        The file, or the file and row.
+    samples : array of float64, shape (C, n)
+    seconds : array of float64, shape (n,), optional
+        Time of each sample since the first.
+    start : float
+        Time of the first sample in seconds, by the clock's own zero; NaN without a clock.
+    part : str
+        Number of the part; "" if none is stated.
+    label : int or None
+        1 good, 0 bad, None not checked.
+    order : str
+        Word of the column by which the recordings are put in order.
+    lines : sequence of int
+        Line of each sample; empty if they are not known.
+    """
+
+    source: str
+    samples: Floats
+    seconds: Floats | None = None
+    start: float = np.nan
+    part: str = ""
+    label: int | None = None
+    order: str = ""
+    lines: Sequence[int] = ()
+
+
+def as_word(cell: Any) -> str:
+    """Return a cell as a text: "" for NaN and None, no decimal point for whole numbers."""
+    if cell is None or cell != cell:
+        return ""
+    is_whole = isinstance(cell, float) and cell.is_integer()
+    return str(int(cell) if is_whole else cell).strip()
+
+
+@lru_cache
+def _pattern(form: TextForm) -> re.Pattern[str]:
+    """Return the pattern of a number with the marks of a form."""
+    mark, decimal = re.escape(form.thousands), re.escape(form.decimal)
+    groups = rf"|\d{{1,3}}(?:{mark}\d{{3}})+" if mark else ""
+    digits = rf"(?:(?:\d+{groups})(?:{decimal}\d*)?|{decimal}\d+)"
+    return re.compile(rf"[-+−]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)
+
+
+def _number(cell: Any, form: TextForm) -> float:
+    """Return the number in a cell, NaN for a word that stands for a lost one, inf for others."""
+    if isinstance(cell, int | float) and not isinstance(cell, bool):
+        return np.inf if abs(cell) > LARGEST else float(cell)
+    text = "null" if cell is None else str(cell).strip()
+    if not _pattern(form).fullmatch(text):
+        return np.nan if text in form.missing else np.inf
+    if form.thousands:
+        text = text.replace(form.thousands, "")
+    return float(text.replace(form.decimal, ".").translate(MINUS))

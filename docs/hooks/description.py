@@ -1,0 +1,45 @@
+"""Writes the reference page of descriptions from the fields of `Description` themselves."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, fields
+from typing import Any
+
+from dengine.datasets.description import SECTIONS, Description
+
+MARK = "<!-- every key of a description -->"
+TITLES = {"rows": "rows.COLUMN", "check": "[check]"}
+
+
+def on_page_markdown(markdown: str, **others: Any) -> str:
+    """Return a page of MkDocs with all keys in the place of the mark."""
+    return markdown.replace(MARK, keys()) if MARK in markdown else markdown
+
+
+def keys() -> str:
+    """Return a section for the keys at the top, and one for each section of the file."""
+    text = ["## At the top\n", table(Description)]
+    for name, section in SECTIONS.items():
+        if section is not None:
+            words = (section.__doc__ or "").split("\n")[0].partition(":")[0]
+            text += [f"\n## [{TITLES.get(name, name)}]\n", f"{words}.\n", table(section)]
+    return "\n".join(text)
+
+
+def table(section: type) -> str:
+    """Return the keys of a section with their defaults and their sentences."""
+    rows = [
+        f"| `{f.name}` | {default(f.default)} | {f.metadata['doc']} |"
+        for f in fields(section)  # type: ignore[arg-type]
+        if "doc" in f.metadata
+    ]
+    return "\n".join(["| key | default | what it says |", "| --- | --- | --- |", *rows])
+
+
+def default(value: Any) -> str:
+    """Return a default as a cell of Markdown."""
+    if value in (MISSING, "", ()):
+        return ""
+    if isinstance(value, tuple):
+        return ", ".join(f"`{item}`" for item in value)
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
