@@ -105,6 +105,8 @@ class Table:
         cells = self.column(name)
         if cells.dtype.kind in "iuf":
             values = cells.astype(np.float64)
+        elif (plain := _plain_numbers(cells.tolist(), form)) is not None:
+            return plain
         else:
             values = np.array([_number(cell, form) for cell in cells.tolist()], dtype=np.float64)
         groups = f" and groups by {form.thousands!r}" if form.thousands else ""
@@ -187,6 +189,20 @@ def _pattern(form: TextForm) -> re.Pattern[str]:
     groups = rf"|\d{{1,3}}(?:{mark}\d{{3}})+" if mark else ""
     digits = rf"(?:(?:\d+{groups})(?:{decimal}\d*)?|{decimal}\d+)"
     return re.compile(rf"[-+−]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)
+
+
+def _plain_numbers(cells: list[Any], form: TextForm) -> Floats | None:
+    """Return cells as numbers if all are plain texts, without groups; None if one may not be."""
+    if form.thousands or not all(isinstance(cell, str) for cell in cells):
+        return None
+    text = "\n".join(cells)
+    if not text.isascii() or "_" in text or (form.decimal != "." and "." in text):
+        return None
+    try:
+        values = np.array(text.replace(form.decimal, ".").split("\n"), dtype=np.float64)
+    except ValueError:
+        return None
+    return values if len(values) == len(cells) and np.isfinite(values).all() else None
 
 
 def _number(cell: Any, form: TextForm) -> float:
