@@ -70,6 +70,7 @@ from .reducers.torch_reducer import TorchReducer as TorchReducer
 from .reducers.umap import UmapReducer as UmapReducer
 from .reducers.umap_learn import UmapLearnReducer as UmapLearnReducer
 from .store.backup import backup_store as backup_store
+from .store.backup import restore_store as restore_store
 from .store.opening import open_store as open_store
 from .store.sql import SqlStore as SqlStore
 from .store.verification import verify_history as verify_history

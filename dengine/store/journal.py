@@ -329,16 +329,20 @@ class Journal:
         finally:
             lost.close()
 
-    def close(self) -> None:
+    def close(self, waiting: bool = True) -> None:
         """Cut off the reserved space, and the records if all are drained; close, unlock the file.
+
+        With `waiting=False` no disk is waited for, and the records stay.
 
         The file stays with its header, for the next engine to compare with the ledger. A journal
         that was opened for reading is only closed, and so is one whose disk fails.
         """
         if self._owning and not self._file.closed:
             with suppress(OSError):
-                self._file.sync()  # the header, or a disk might keep the cut without it
-                self._file.truncate(HEADER if self.is_drained else self.end)
+                if self.is_drained and waiting:
+                    self._file.sync()  # the header, or a disk might keep the cut without it
+                    self.end = HEADER
+                self._file.truncate(self.end)
         self._file.close()
 
     def _write_header(self) -> None:

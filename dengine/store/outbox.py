@@ -826,7 +826,7 @@ class Outbox:
             self.store.database.close(
                 waiting=False
             )  # else its lease on the cell would outlive the engine
-            self._journal.close()
+            self._journal.close(waiting=False)
 
     # The thread that writes the journal
 

@@ -83,6 +83,8 @@ CALLS = [  # every verb that takes a store, and what click repeats
     f"explain {NOBODY} last", f"correct {NOBODY} a bad", f"forget {NOBODY} a", f"rollback {NOBODY} 1",
     f"policy {NOBODY} --alpha 0.1 --shadow on", f"history {NOBODY}", f"verify {NOBODY}", f"retrain {NOBODY}",
     f"backup {NOBODY} --out copy.db",
+    f"restore copy.db --store {NOBODY}",
+    f"release {NOBODY}",
     NOBODY, f"status --store={NOBODY}", f"import-labels {NOBODY} --store a.db",
     f"status a.db {NOBODY}", f"data {NOBODY}",
 ]  # fmt: skip
