@@ -806,15 +806,16 @@ class Outbox:
             self.flush()
         except NotTakenError as error:
             log.error("closed without the newest records, which no report acknowledged: %s", error)
+        # A sync that is under way hangs: nothing that waits for the disk would end.
+        seconds = CLOSE_SECONDS if math.isinf(self._sync_began) else 0.0
         with self._changed:
             self._changed.wait_for(
-                lambda: self.is_drained or bool(self._journal_fault or self._store_error),
-                CLOSE_SECONDS,
+                lambda: self.is_drained or bool(self._journal_fault or self._store_error), seconds
             )
             self._closed = True
             self._changed.notify_all()
         for thread in self._threads[:2]:
-            thread.join(CLOSE_SECONDS)
+            thread.join(seconds)
         if self.is_drained and not any(thread.is_alive() for thread in self._threads[:2]):
             self.store.close()
         elif self._journal is not None:
@@ -823,10 +824,10 @@ class Outbox:
                 self._journal.path,
                 self.fault,
             )
-            self.store.database.close(
-                waiting=False
-            )  # else its lease on the cell would outlive the engine
-            self._journal.close(waiting=False)
+            if seconds:
+                # Its lease on the cell would outlive the engine.
+                self.store.database.close(waiting=False)
+                self._journal.close(waiting=False)
 
     # The thread that writes the journal
 
