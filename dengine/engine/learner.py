@@ -350,6 +350,8 @@ class Learner:
         store fails meanwhile, that is logged, and the training starts from initial weights.
         """
         live = self.live
+        if not live.corrected_to:  # nothing was ever forgotten, so the store need not be read
+            return live.newest
         key = (live.version, live.corrected_to)
         if self._start is None or self._start[0] != key:
             start = live.template, "from initial weights"

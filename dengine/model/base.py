@@ -29,7 +29,7 @@ from ..reducers.base import FitReport, Floats, Ints, State, StopRule
 from ..traces import clip_extremes
 
 Embedding = tuple[tuple[float, ...], ...]  # (K, d)
-N_EXAMPLES = 16  # traces on which the answers of a version are compared with what was trained
+N_EXAMPLES = 8  # traces on which the answers of a version are compared with what was trained
 NO_TRACES: Floats = np.zeros((0, 1, 1), np.float32)
 
 

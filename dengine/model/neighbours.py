@@ -777,8 +777,8 @@ class ModelPrediction(EngineModel):
     def defect(self) -> str:
         """Return why an engine could not open a store with this version; "" if it could.
 
-        The references, and the points of some training traces, must be finite, and twice a reducer
-        that is restored from this one's state must give these points. A reducer without a state
+        The references, and the points of some training traces, must be finite, and a reducer that
+        is restored from this one's state must give these points, twice. A reducer without a state
         must give them again itself.
         """
         if not np.isfinite(self.index.column("points")).all():
@@ -786,16 +786,14 @@ class ModelPrediction(EngineModel):
         points = self.spaces.embed(self.examples)
         self._example_points = points / self.scale[:, None]
         state = self.spaces.get_state()
-        for _ in range(N_CHECKS):
-            restored = self.spaces
-            try:
-                if state is not None:
-                    restored = as_reducer(clone(self.reducer), self.folds).set_state(state)
-            except StoreError:  # of the test trace, whose points `set_state` compares
-                return NOT_RESTORED
-            if not is_close(restored.embed(self.examples), points, SAME_BATCH):
-                return NOT_RESTORED
-        return ""
+        restored = self.spaces
+        try:
+            if state is not None:
+                restored = as_reducer(clone(self.reducer), self.folds).set_state(state)
+        except StoreError:  # of the test trace, whose points `set_state` compares
+            return NOT_RESTORED
+        answers = (restored.embed(self.examples) for _ in range(N_CHECKS))
+        return "" if all(is_close(z, points, SAME_BATCH) for z in answers) else NOT_RESTORED
 
     def scaled_points(self, X: Floats) -> Floats:
         """Return the scaled embeddings (n, K, d) of traces (n, C, T), by the reducer itself."""

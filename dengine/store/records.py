@@ -132,6 +132,25 @@ def as_text(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
 
 
+def check_state(
+    report: RetrainReport, state: Mapping[str, NDArray[Any]] | None
+) -> dict[str, NDArray[Any]] | None:
+    """Return copies of a version's arrays, by name; None for a dropped candidate without arrays.
+
+    Raise StoreError for an accepted version without arrays, and for an array of Python objects,
+    which would need a pickle.
+    """
+    if state is None and report.accepted:
+        raise StoreError(
+            f"Expected the arrays of accepted version {report.version}, got None; pass its state."
+        )
+    copies = None if state is None else {name: np.array(values) for name, values in state.items()}
+    for name, values in (copies or {}).items():
+        if values.dtype.hasobject:
+            raise StoreError(f"Expected plain arrays, not {name!r}, which has {values.dtype}.")
+    return copies
+
+
 @dataclass(frozen=True, slots=True)
 class NewLabel:
     """A label on its way into a store.
@@ -621,7 +640,7 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
     """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
     Integers are compressed, of which a state repeats many; weights hardly get smaller. Raise
-    StoreError for an array of Python objects.
+    ValueError for an array of Python objects.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -629,10 +648,7 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
             info = zipfile.ZipInfo(f"{name}.npy")
             if values.dtype.kind in "iu":
                 info.compress_type = zipfile.ZIP_DEFLATED
-            with (
-                instead(StoreError, f"Expected plain arrays, not {name!r}", ValueError),
-                archive.open(info, "w", force_zip64=True) as member,
-            ):
+            with archive.open(info, "w", force_zip64=True) as member:
                 np.save(member, values, allow_pickle=False)
     return buffer.getvalue()
 

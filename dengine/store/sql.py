@@ -65,6 +65,7 @@ from .records import (
     VersionError,
     as_data,
     as_text,
+    check_state,
     chunks,
     from_npz,
     from_row,
@@ -97,6 +98,7 @@ log = logging.getLogger("dengine")
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 # Of the environment: seconds for all stores that are given none.
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"
+MAX_UNWRITTEN_VERSIONS = 40  # of a store in memory, about 1.5 MB each
 
 
 class SqlStore(AbstractContextManager["SqlStore"]):
@@ -176,6 +178,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self.before_use: Callable[[], None] = self._write_memory
         # Of a store in memory: what was given and is written to the database when it is first read.
         self._unwritten: list[Record] = []
+        self._unwritten_versions: list[tuple[Any, ...]] = []
         self._has_label: dict[str, bool] = {}  # of every decision, by id
         self._newest_label = 0
         self.database = Database(
@@ -653,13 +656,16 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ) -> int:
         """Commit a retrain, and delete the states of older versions that are no longer kept.
 
+        A store in memory without a product keeps the copied arrays, and writes them when it is next
+        read, or when 40 retrains wait: packing them takes as long as many decisions.
+
         Parameters
         ----------
         report : RetrainReport
         last_seq : int
             Number of the newest label that the retrain knew of.
         state : mapping of str to array, or None
-            The version's arrays; None for a dropped candidate.
+            The version's arrays, which are copied; None for a dropped candidate.
 
         Returns
         -------
@@ -673,10 +679,27 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             For an accepted version without arrays, for an array of Python objects, and if the
             database fails.
         """
-        row = self._version_row(report, last_seq, state, float(self.clock()))
+        version = report, last_seq, check_state(report, state), float(self.clock())
+        if self.wait is not None or self.product is not None:
+            return self._commit_version(*version)
+        self._unwritten_versions.append(version)
+        if len(self._unwritten_versions) == MAX_UNWRITTEN_VERSIONS:
+            self._write_versions()
+        return report.version
+
+    def _commit_version(self, *version: Any) -> int:
+        """Commit a retrain, of which `_version_row` makes a row; return its version's number."""
+        row = self._version_row(*version)
         return self.database.write(
             lambda connection: self._insert_version(connection, row), flush_first=False
         )
+
+    def _write_versions(self) -> None:
+        """Write the versions that a store in memory was given, and has not written yet."""
+        unwritten = self._unwritten_versions
+        self._unwritten_versions = []
+        for version in unwritten:
+            self._commit_version(*version)
 
     def _version_row(
         self,
@@ -690,12 +713,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
         an accepted version without arrays, and for an array of Python objects.
         """
-        if state is None and report.accepted:
-            raise StoreError(
-                f"Expected the arrays of accepted version {report.version}, got None; pass its "
-                "state."
-            )
-        blob = None if state is None else to_npz(state)
+        arrays = check_state(report, state)
+        blob = None if arrays is None else to_npz(arrays)
         return {
             "time": now,
             "last_seq": int(last_seq),
@@ -1233,6 +1252,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         It is called before every read and most writes; a replay, which reads nothing, never calls
         it.
         """
+        self._write_versions()
         unwritten = self._unwritten
         self._unwritten = []
         for part in chunks(unwritten):
