@@ -88,8 +88,9 @@ proof: $(VENV)/.dev
 	cp $(OUT)/proof/proof.csv docs/explanation/
 
 # Hours: it says how many before it begins, and goes on where it was killed. SCREW names the screw-driving set, an .npz file.
-RESULTS = index.md replays.csv differences.csv curves.png net_seconds.png
+RESULTS = index.md replays.csv differences.csv guarantees.csv curves.png net_seconds.png
 evidence: $(VENV)/.dev
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python training/evidence_guarantees.py --out $(OUT) $(if $(SCREW),--screw $(SCREW))
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python training/evidence.py --out $(OUT) $(if $(SCREW),--screw $(SCREW))
 	cp $(addprefix $(OUT)/evidence/,$(RESULTS)) docs/results/
 

@@ -46,6 +46,16 @@ POLICY_COLUMNS = ["set", "interval", "alpha", "lower_bound"]
 TOO_FEW = "Too few replays to compare."
 LABELS_PER_POINT = 50  # labels between two points of a learning curve
 PAPER_REDUCERS = ("umap", "conv")
+# Policies of `evidence_guarantees.py`, and the limits that it computes. At LB 95.8 % an accepted
+# part costs as much as its check, by the default prices.
+GUARANTEES: dict[str, dict[str, Any]] = {
+    "local, LB 90 %": {"alpha": 0.1, "lower_bound": 0.9},
+    "local, LB 95 %": {"alpha": 0.1, "lower_bound": 0.95},
+    "local, LB 95.8 %": {"alpha": 0.1, "lower_bound": 1.0 - VERIFY_SECONDS / STOP_SECONDS},
+    "pooled, LB 90 %": {"alpha": 0.1, "lower_bound": 0.9, "guarantee": "pooled"},
+    "cost": {"alpha": 0.1, "guarantee": "cost"},
+}
+HINDSIGHT = ("hindsight, scores of each moment", "hindsight, final scores")
 # Variants of conv, each with something that the paper's rule does not promise or need.
 VARIANTS = {
     "conv, no novelty": "without the novelty gate: also a trace unlike all others is decided",
@@ -117,13 +127,19 @@ def write_results(replays: pd.DataFrame, folder: Path) -> None:
     replays : DataFrame
         A row for each replay, as `evidence.py` writes them to `replays.csv`.
     folder : Path
-        Created if it is missing; files in it are replaced.
+        Created if it is missing; files in it are replaced. The page also shows `guarantees.csv`, if
+        `evidence_guarantees.py` has written it there.
     """
     differences = compare_with_reference(replays)
     write_csv(differences.round(3), folder / "differences.csv", force=True)
     save(draw_learning_curves(replays), folder / "curves.png", dpi=80, force=True)
     save(draw_net_seconds(differences), folder / "net_seconds.png", dpi=80, force=True)
-    page = "\n".join(page_lines(replays, differences)) + "\n"
+    lines = page_lines(replays, differences)
+    guarantees = folder / "guarantees.csv"
+    if guarantees.exists():
+        i = lines.index("## What was played")
+        lines[i:i] = guarantee_lines(pd.read_csv(guarantees, dtype={"commit": str}))
+    page = "\n".join(lines) + "\n"
     write_output(folder / "index.md", page.encode(), force=True)
 
 
@@ -520,6 +536,40 @@ def variant_lines(differences: pd.DataFrame) -> list[str]:
         "",
         *table_lines(["set", "variant", "certain", "bad of the accepted", "net seconds"], table),
     ]
+
+
+def guarantee_lines(played: pd.DataFrame) -> list[str]:
+    """Return the table of all guarantees on all sets, from the rows of guarantees.csv."""
+    names = [*GUARANTEES, *HINDSIGHT]
+    columns = ["certain", "accepted", "false_positive", "net_s"]
+    table = []
+    for set_name, group in played.groupby("set", sort=False):
+        means = group.groupby("guarantee")[
+            ["certain", "accepted", "false_positive", "net_s"]
+        ].mean()
+        cells = [guarantee_cell(means.loc[name]) for name in names]
+        table.append([set_name, f"{group['cycles'].max():.0f}", *cells])
+    commits = ", ".join(sorted(played["commit"].unique()))
+    return [
+        "## What each guarantee saves",
+        "",
+        '`conv` where every bad accepted part stops the line and is known (`stops="all"`), by '
+        f"`python training/evidence_guarantees.py` at commit {commits}: means over "
+        f"{played['seed'].nunique()} shuffles. An entry is: **net seconds** / certain decisions / "
+        "share of the accepted parts that were bad. The two columns on the right are limits: with "
+        "all labels known, the best two thresholds on the scores that the parts had when they were "
+        "decided, and on scores of a model that was trained beforehand on all labels of the set. "
+        "No engine can know these thresholds. [guarantees.csv](guarantees.csv) has a row for each "
+        "replay.",
+        "",
+        *table_lines(["set", "parts", *names], table),
+    ]
+
+
+def guarantee_cell(means: pd.Series) -> str:
+    """Return net seconds, certain decisions and the bad share of the accepted parts."""
+    share = 100.0 * means["false_positive"] / max(means["accepted"], 1.0)
+    return f"**{means['net_s']:.0f}** / {means['certain']:.0f} / {share:.1f} %"
 
 
 def provenance_lines(replays: pd.DataFrame, differences: pd.DataFrame) -> list[str]:
