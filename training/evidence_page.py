@@ -544,9 +544,7 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
     columns = ["certain", "accepted", "false_positive", "net_s"]
     table = []
     for set_name, group in played.groupby("set", sort=False):
-        means = group.groupby("guarantee")[
-            ["certain", "accepted", "false_positive", "net_s"]
-        ].mean()
+        means = group.groupby("guarantee")[columns].mean()
         cells = [guarantee_cell(means.loc[name]) for name in names]
         table.append([set_name, f"{group['cycles'].max():.0f}", *cells])
     commits = ", ".join(sorted(played["commit"].unique()))
