@@ -121,6 +121,7 @@ class PricedRule(MemberRule):
     """
 
     sorts = True
+    prior_labels = 3.0  # its levels are probabilities, of which the first ones are too sure
 
     def __init__(
         self,

@@ -15,6 +15,18 @@ UNCERTAIN = REASONS.index(Reason.UNCERTAIN)
 SAFE_MODE = REASONS.index(Reason.SAFE_MODE)
 
 
+def fade(probability: float, n_labels: int, prior_labels: float) -> float:
+    """Return a probability whose logit is multiplied by n / (n + `prior_labels`).
+
+    A model that has learned from few labels is too sure. So its probability is drawn towards 1/2,
+    by a prior that is worth so many labels and fades as their number n grows.
+    """
+    share = n_labels / (n_labels + prior_labels)
+    success: float = probability**share
+    failure: float = (1.0 - probability) ** share
+    return success / (success + failure)
+
+
 class RadiusNeighbours(nn.Module):
     """Counts the references around one embedded trace and asks the rule.
 
@@ -29,7 +41,8 @@ class RadiusNeighbours(nn.Module):
     scored : bool, default False
         Whether the first axis of each space is a probability of success. A rule whose bound only
         sorts then takes the mean of these for both ends of the bound: it uses all labels except the
-        part's own. The counts are returned all the same.
+        part's own. For a rule with `prior_labels` the mean is drawn towards 1/2 (`fade`). The
+        counts are returned all the same.
     """
 
     def __init__(
@@ -37,6 +50,7 @@ class RadiusNeighbours(nn.Module):
     ) -> None:
         super().__init__()
         self.scored = scored
+        self.prior_labels = float(rule.prior_labels)
         self.references: RadiusIndex = references
         self.rule: DecisionRule = rule
         self.radius = float(radius)
@@ -75,6 +89,8 @@ class RadiusNeighbours(nn.Module):
         n_success, n_failure = self.references.count_near(distances, self.radius)
         if self.scored:
             score = float(z.select(1, 0).mean().item())
+            if self.prior_labels > 0.0:
+                score = fade(score, distances.size(0), self.prior_labels)
             return self.rule.action(score, score), score, score, n_success, n_failure
         action, lower, upper = self.rule(n_success, n_failure)
         return action, lower, upper, n_success, n_failure

@@ -63,6 +63,8 @@ class DecisionRule(nn.Module):
         Python and cannot be exported.
     sorts : bool
         Class attribute: whether the bound only sorts parts, so that any score could take its place.
+    prior_labels : float
+        Class attribute: labels that the prior of a predicted probability is worth; 0: it has none.
     scriptable : bool
         Whether this rule with its interval can be compiled.
     accept_threshold, reject_threshold : float
@@ -77,6 +79,7 @@ class DecisionRule(nn.Module):
 
     compiles = True
     sorts = False
+    prior_labels = 0.0
 
     def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
         super().__init__()

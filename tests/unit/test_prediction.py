@@ -13,6 +13,8 @@ from dengine import (
     DataEngine,
     Dataset,
     ModelPrediction,
+    Policy,
+    Reason,
     TraceError,
     TraceSpec,
     WilsonRadiusClassifier,
@@ -212,3 +214,24 @@ def test_what_will_answer_is_compiled_before_there_is_anything_to_learn(
             )  # in a retrain there is no time for that
         assert engine.retrain().accepted
         assert isinstance(engine.model.predictor, torch.jit.ScriptModule)
+
+
+def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_are_few(
+    make_data,
+) -> None:
+    """A prior worth three labels: the logit of the members' mean is multiplied by n / (n + 3)."""
+    data = make_data(80, samples=40)
+    policy = Policy(guarantee="cost", stops="all")
+    engine = DataEngine("rocket", policy=policy, replaying=True)
+    for x, y in zip(data.X, data.y, strict=True):
+        decision = engine.decide(x)
+        engine.report(decision.id, bool(y))
+    for n_more, x in enumerate(make_data(20, samples=40, seed=9).X):
+        decision = engine.decide(x)
+        mean = np.mean([space[0] for space in decision.embedding])
+        n = 80 + n_more
+        logit = np.log(mean / (1 - mean)) * n / (n + 3)
+        if decision.reason is not Reason.NOVEL:
+            assert decision.lower == pytest.approx(1 / (1 + np.exp(-logit)), abs=1e-5)
+        assert decision.lower <= decision.upper
+        engine.report(decision.id, True)
