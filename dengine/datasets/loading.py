@@ -98,8 +98,8 @@ def description_of(source: Any, description: Any) -> Description:
     do = "pass the one that describe(table) proposes"
     expect_data(isinstance(source, PATH), "a description of the table", None, do)
     path = Path(source)
-    wanted = f"a data set among {', '.join(BUNDLED)}, or a file or folder that exists"
-    expect_data(path.exists(), wanted, str(path))
+    wanted = f"a data set among {', '.join(BUNDLED)}, a file or a folder"
+    expect_data(path.exists(), wanted, str(path), "it does not exist")
     saved = saved_description(path)
     if not saved.is_file():
         raise DataError(missing_text(path, describe(path)))
