@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed, percent
 from ..folds import content_hash
-from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault
+from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault, expect_all
 from .description import Description
 from .table import Recording
 
@@ -32,7 +32,7 @@ Fitted = tuple[Recording, NDArray[np.float32]]
 
 def check_description(description: Description) -> None:
     """Raise DataError unless recordings can be read by a description."""
-    text, clock, rate_hz = description.text, description.time, description.time.rate_hz
+    text, clock = description.text, description.time
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
     with instead(DataError, "Expected an encoding in text.encoding", LookupError):
@@ -44,7 +44,7 @@ def check_description(description: Description) -> None:
     wanted = {
         "traces.samples, the samples of each trace": description.traces.samples > 0,
         "a rate of 1 Hz to 1 MHz in time.rate_hz": (
-            not rate_hz or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
+            not clock.rate_hz or LEAST_RATE_HZ <= clock.rate_hz <= MOST_RATE_HZ
         ),
         "time.column, since the order is time": n_clocks or description.order != "time",
         "one limit for all channels": len({c.limit for c in description.channels}) == 1,
@@ -54,9 +54,7 @@ def check_description(description: Description) -> None:
         "text.data, the line of the first samples, of 1 or more": text.data > 0,
         f"a format for each of {n_clocks} columns in [time]": (n_clocks in (0, len(clock.format))),
     }
-    for what, is_stated in wanted.items():
-        if not is_stated:
-            raise DataError(f"Expected {what}.")
+    expect_all(wanted)
 
 
 def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]]:

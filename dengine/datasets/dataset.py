@@ -3,6 +3,7 @@
 What is wrong with a recording that is left out is a `Fault`.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError, TraceError, expect
+from ..errors import DataError, TraceError, expect, listed
 from ..records import TraceSpec
 from ..representation import to_html
 from ..traces import as_traces
@@ -19,9 +20,19 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEAST_RATE_HZ, MOST_RATE_HZ = 1.0, 1e6  # of anything that a cell samples
+Texts = NDArray[np.str_]
+Names = tuple[str, ...]
+Progress = Callable[[int], None]  # called with the number of files or traces that are done
 OWN = "dengine"  # key of the metadata by which a table of ours is known
 ABOUT = ("channels", "rate_hz", "unit", "limit", "fit")  # what it says
 expect_data = partial(expect, error=DataError)
+
+
+def expect_all(wanted: Mapping[str, Any]) -> None:
+    """Raise DataError for the first of several conditions that is not met."""
+    for what, is_met in wanted.items():
+        if not is_met:
+            raise DataError(f"Expected {what}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,14 +106,14 @@ class Dataset:
     rate_hz: float | None = None
     unit: str = ""
     limit: float | None = None
-    cause: NDArray[np.str_] | None = None
-    part: NDArray[np.str_] | None = None
+    cause: Texts | None = None
+    part: Texts | None = None
     faults: tuple[Fault, ...] = ()
-    channels: tuple[str, ...] = ()
-    source: NDArray[np.str_] | None = None
+    channels: Names = ()
+    source: Texts | None = None
     fit: str = "strict"
     lengths: NDArray[np.int64] | None = None
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     unlabelled: int = 0
     ordered: bool = True
 
@@ -157,7 +168,7 @@ class Dataset:
         frame.attrs[OWN] = {name: getattr(self, name) for name in ABOUT} | {"n_channels": channels}
         return frame
 
-    def select(self, channels: tuple[str, ...]) -> "Dataset":
+    def select(self, channels: Names) -> "Dataset":
         """Return a data set of some channels, in this order; DataError for unknown names."""
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = {*channels} <= {*self.channels}
@@ -190,7 +201,7 @@ def make_dataset(
     y: ArrayLike,
     *,
     rate_hz: float | None = None,
-    channels: tuple[str, ...] = (),
+    channels: Names = (),
     part: Any = None,
     cause: Any = None,
     **about: Any,
@@ -217,23 +228,26 @@ def make_dataset(
         cube = as_traces(X)
     except TraceError as error:
         raise DataError(str(error)) from error
-    y, parts = np.asarray(y), None if part is None else np.asarray(part)
+    y = np.asarray(y)
+    parts = None if part is None else np.asarray(part)
     n, n_channels, samples = cube.shape
-    is_rate = rate_hz is None or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
-    is_part = parts is None or (parts.shape == y.shape and parts.dtype.kind in "iuUS")
-    is_cause = cause is None or np.shape(cause) == y.shape
-    checks: list[tuple[Any, str, Any]] = [
-        (y.shape == (n,), "X (n, T) or (n, C, T) with n labels", (np.shape(X), y.shape)),
-        (n, "at least one trace", n),
-        (n_channels <= samples, "X (n, channels, samples); transpose it", cube.shape),
-        (np.isin(y, (0, 1)).all(), "labels 1 (success) and 0 (failure)", sorted({*map(str, y)})),
-        (is_rate, "a rate of 1 Hz to 1 MHz", rate_hz),
-        (len(channels) in (0, n_channels), f"a name for each of {n_channels} channels", channels),
-        (is_part, f"{n} parts' numbers, texts or integers", np.shape(part)),
-        (is_cause, "a cause for each trace", np.shape(cause)),
-    ]
-    for valid, wanted, actual in checks:
-        expect_data(bool(valid), wanted, actual)
+    words = sorted({*map(str, y.ravel().tolist())})
+    expect_all(
+        {
+            f"X (n, T) or (n, C, T) with n labels, got {(np.shape(X), y.shape)}": y.shape == (n,),
+            "at least one trace": n,
+            f"X (n, channels, samples), got {cube.shape}; transpose it": n_channels <= samples,
+            f"labels 1 (success) and 0 (failure), got {listed(words)}": np.isin(y, (0, 1)).all(),
+            f"a rate of 1 Hz to 1 MHz, got {rate_hz}": (
+                rate_hz is None or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
+            ),
+            f"a name for each of {n_channels} channels": len(channels) in (0, n_channels),
+            f"{n} parts' numbers, texts or integers": (
+                parts is None or (parts.shape == y.shape and parts.dtype.kind in "iuUS")
+            ),
+            "a cause for each trace": cause is None or np.shape(cause) == y.shape,
+        }
+    )
     return Dataset(
         cube[:, 0] if n_channels == 1 else cube,
         y.astype(np.int8),

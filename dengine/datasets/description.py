@@ -10,7 +10,6 @@ made of these.
 
 import difflib
 import json
-import os
 import re
 import sys
 import tomllib
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from ..errors import DataError, instead
-from ..files import write_output
+from ..files import FilePath, write_output
 from .dataset import expect_data
 
 UNKNOWN = "?"
@@ -328,7 +327,7 @@ class Description:
         return cls.from_dict(values, where)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "Description":
+    def load(cls, path: FilePath) -> "Description":
         """Read a description from a TOML file; raise DataError if it cannot be read."""
         path = Path(path)
         with instead(DataError, f"Expected a description in {path}", OSError, UnicodeDecodeError):
@@ -336,25 +335,21 @@ class Description:
             expect_data(size <= MOST_BYTES, f"{path} of at most 1 MB", f"{size} bytes")
             return cls.from_toml(path.read_text("utf-8-sig"), str(path))
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> Path:
+    def save(self, path: FilePath, force: bool = False) -> Path:
         """Write the TOML file, over an existing one only with `force`; return its path."""
         return write_output(path, self.to_toml().encode(), force)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return nested dicts of TOML's types, without what has its default."""
-        values: dict[str, Any] = _plain(self)
-        if self.channels:
-            values["channels"] = {table.pop("column", ""): table for table in values["channels"]}
-        return values
+        """Return nested dicts of TOML's types, without what has its default; `?` for no channel."""
+        channels = {
+            channel.column: {"unit": channel.unit, **_plain(replace(channel, column=""))}
+            for channel in self.channels or [Channel(UNKNOWN)]
+        }
+        return {**_plain(self), "channels": channels}
 
     def to_toml(self) -> str:
         """Return the text of the TOML file, with `notes` as comments above their keys."""
-        values: dict[str, Any] = {"version": self.version, "channels": {UNKNOWN: {}}}
-        values |= self.to_dict()
-        values["channels"] = {
-            column: about.get("unit", "") if {*about} <= {"unit"} else about
-            for column, about in values["channels"].items()
-        }
+        values = {"version": self.version, **self.to_dict()}
         lines = self._lines("", {k: v for k, v in values.items() if k not in SECTIONS})
         for name in SECTIONS:
             if name == "check":
@@ -383,9 +378,10 @@ class Description:
 
         A word `?` of a check is none of them: it fits no recording, so others are its faults.
         """
-        values = {k: v for k, v in self.to_dict().items() if k not in ("ignored", "check")}
-        is_known = UNKNOWN not in values.get("channels", {UNKNOWN})
-        return (*_open_keys(values), *([] if is_known else ["channels"]))
+        values = self.to_dict()
+        values.pop("ignored", None)
+        open_channels = ["channels"] if UNKNOWN in values["channels"] else []
+        return (*_open_keys(values), *open_channels)
 
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which keys, like `label.column`, have other values.
@@ -526,7 +522,9 @@ def _toml_key(name: str) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """Return a value as TOML writes it, a list of one like that one."""
+    """Return a value as TOML writes it; a list of one, or a table of a unit alone, like that."""
+    if isinstance(value, Mapping) and {*value} == {"unit"}:
+        return _toml_value(value["unit"])
     if isinstance(value, Mapping):
         pairs = (f"{_toml_key(name)} = {_toml_value(item)}" for name, item in value.items())
         return f"{{ {', '.join(pairs)} }}"

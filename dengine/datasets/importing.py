@@ -10,13 +10,11 @@ other ids. `export.cell_journal` imports the journals of exported cells by `impo
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..engine.decide import as_part, verify_decision
@@ -30,6 +28,7 @@ from ..records import (
     Action,
     Decision,
     Reason,
+    TraceArray,
     TraceSpec,
     as_success,
     source_of,
@@ -39,6 +38,7 @@ from ..store.opening import LONG_WAIT, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
+from .dataset import Progress
 from .description import Description
 from .loading import description_of, own_reader
 
@@ -128,7 +128,7 @@ def import_labelled(
     dataset: Any,
     recipe: Recipe | str | None = None,
     seed: int | None = None,
-    on_traces: Callable[[int], None] | None = None,
+    on_traces: Progress | None = None,
     allow_import: bool = False,
 ) -> ImportReport:
     """Put every labelled trace of a data set into a store, in order; nothing is trained.
@@ -183,10 +183,10 @@ def import_labelled(
 
 def import_parts(
     store: "SqlStore",
-    parts: Sequence[tuple[Decision, NDArray[np.float32], bool | None]],
+    parts: Sequence[tuple[Decision, TraceArray, bool | None]],
     trace_spec: TraceSpec,
     policy: Policy,
-    on_traces: Callable[[int], None] | None = None,
+    on_traces: Progress | None = None,
 ) -> ImportReport:
     """Put parts with their decisions into a store, in chunks that are stored all or none.
 
@@ -260,7 +260,7 @@ def _count_silent(store: "SqlStore") -> int:
 
 
 def _as_stored(
-    decision: Decision, trace: NDArray[np.float32], gate: TraceGate, policy: Policy, time: float
+    decision: Decision, trace: TraceArray, gate: TraceGate, policy: Policy, time: float
 ) -> StoredDecision:
     """Return the record of a decision; a trace with a fault never trains, and is its reason."""
     fault, content = gate(torch.from_numpy(trace))
@@ -271,7 +271,7 @@ def _as_stored(
     return StoredDecision(made, trace.copy(), trace_hash(content, made.part), bool(fault), time)
 
 
-def _verifying_decisions(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:
+def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:
     """Yield for each trace, of shape (n, C, T), the decision to verify it without a model.
 
     Its id is made of the trace's content; equal traces of one data set have different ids.

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from ..files import is_database, read_archive, read_errors
+from ..files import FilePath, is_database, read_archive, read_errors
 from ..records import stored_trace_spec
-from .dataset import OWN, Dataset, expect_data, make_dataset
+from .dataset import OWN, Dataset, Progress, expect_data, make_dataset
 from .describe import describe
-from .description import FOLDER_FILE, Description
+from .description import FOLDER_FILE, Description, Stated
 from .read.files import find_files
 from .read.recordings import read_recordings
 
@@ -27,11 +27,11 @@ PATH = (str, os.PathLike)
 
 def load_dataset(
     source: Any = "insertion",
-    description: Description | Mapping[str, Any] | str | os.PathLike[str] | None = None,
+    description: Description | Stated | FilePath | None = None,
     *,
     channels: str | Sequence[str] | None = None,
     samples: int | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Dataset:
     """Read a data set: what is ours as it is, and recordings exactly by a description.
 
@@ -81,7 +81,7 @@ def load_dataset(
     return data.cut(samples) if samples else data
 
 
-def saved_description(source: str | os.PathLike[str]) -> Path:
+def saved_description(source: FilePath) -> Path:
     """Return the path at which the description of a folder or a file is saved."""
     path = Path(source)
     return path / FOLDER_FILE if path.is_dir() else path.with_name(f"{path.name}.toml")
@@ -195,7 +195,7 @@ def _read_npz(path: Path) -> Dataset:
         return _from_arrays(arrays, path.stem)
 
 
-def _from_arrays(arrays: Mapping[str, Any], name: str) -> Dataset:
+def _from_arrays(arrays: Stated, name: str) -> Dataset:
     """Return the data set of arrays with the names of a `Dataset`."""
     units, channels = (
         tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")
