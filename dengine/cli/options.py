@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from ..errors import DataError, SettingError, as_options
+from ..errors import SettingError, as_options
 from .output import Out, as_json, json_option, progress_bar
 
 if TYPE_CHECKING:
@@ -404,12 +404,11 @@ class DataChoice:
     live: Options = field(default_factory=dict)
 
     @property
-    def saved(self) -> Path | None:
-        """The file of the description; None if there is none."""
+    def path(self) -> Path:
+        """Where the description is saved."""
         from ..datasets.loading import saved_description
 
-        path = self.description or saved_description(self.data)
-        return path if self.description or path.is_file() else None
+        return self.description or saved_description(self.data)
 
     def describe(self, *, propose: bool = False) -> Description | None:
         """Return the description with the stated keys; None for a source that is ours.
@@ -419,18 +418,11 @@ class DataChoice:
         propose : bool
             Whether a description is proposed if none was saved; else that is a DataError.
         """
-        from ..datasets import Description, describe
-        from ..datasets.loading import missing_text, own_reader
+        from ..datasets.loading import description_of, own_reader
 
-        path = self.saved
-        if path is not None:
-            return Description.load(path).with_values(self.stated)
-        if not self.stated and own_reader(self.data) is not None:
+        if not self.stated and not self.description and own_reader(self.data) is not None:
             return None
-        proposal = describe(self.data, self.stated)
-        if not propose:
-            raise DataError(missing_text(Path(self.data), proposal))
-        return proposal
+        return description_of(self.data, self.description, self.stated, propose)
 
     def load(self, description: Description | None = None) -> Dataset:
         """Load the data set and return it.

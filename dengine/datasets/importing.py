@@ -161,7 +161,7 @@ def import_labelled(
     """
     description = None
     if own_reader(dataset) is None:
-        description = in_form_of(store, description_of(dataset, None))
+        description = in_form_of(store, description_of(dataset))
     data = load_dataset(dataset, description)
     with opening(store, wait=LONG_WAIT) as opened:
         agreed = agreed_trace_spec(opened, data.spec)

@@ -87,23 +87,37 @@ def saved_description(source: FilePath) -> Path:
     return path / FOLDER_FILE if path.is_dir() else path.with_name(f"{path.name}.toml")
 
 
-def description_of(source: Any, description: Any) -> Description:
-    """Return the description that is stated, or saved; raise DataError without one."""
+def description_of(
+    source: Any, description: Any = None, stated: Stated | None = None, propose: bool = False
+) -> Description:
+    """Return a description of recordings.
+
+    Parameters
+    ----------
+    source : path or DataFrame
+    description : Description, mapping or path, optional
+        None: the one that was saved.
+    stated : mapping, optional
+        Keys of a file that have other values, like `label.column`.
+    propose : bool
+        Whether one is proposed if none was saved; else that is a DataError.
+    """
     if isinstance(description, Description):
         return description
     if isinstance(description, Mapping):
         return Description.from_dict(description)
-    if description is not None:
-        return Description.load(description)
-    do = "pass the one that describe(table) proposes"
-    expect_data(isinstance(source, PATH), "a description of the table", None, do)
-    path = Path(source)
-    wanted = f"a data set among {', '.join(BUNDLED)}, a file or a folder"
-    expect_data(path.exists(), wanted, str(path), "it does not exist")
-    saved = saved_description(path)
-    if not saved.is_file():
-        raise DataError(missing_text(path, describe(path)))
-    return Description.load(saved)
+    if description is None:
+        do = "pass the one that describe(table) proposes"
+        expect_data(isinstance(source, PATH), "a description of the table", None, do)
+        wanted = f"a data set among {', '.join(BUNDLED)}, a file or a folder"
+        expect_data(Path(source).exists(), wanted, str(source), "it does not exist")
+        description = saved_description(source)
+        if not description.is_file():
+            proposal = describe(source, stated)
+            if not propose:
+                raise DataError(missing_text(Path(source), proposal))
+            return proposal
+    return Description.load(description).with_values(stated or {})
 
 
 def count_files(source: str, description: Description | None) -> int:
