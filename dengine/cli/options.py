@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -392,16 +392,13 @@ class DataChoice:
     stated : mapping
         Keys of the description that were stated, like `label.column`.
     options : mapping
-        `channel` and `samples`, if they were given.
-    live : mapping
-        Those options of live traces that were given.
+        `channel` and `samples`, and the options of live traces, those that were given.
     """
 
     data: str
     description: Path | None
     stated: Options
     options: Options
-    live: Options = field(default_factory=dict)
 
     @property
     def path(self) -> Path:
@@ -529,9 +526,7 @@ def _data_choice(
     data: str, description: Path | None, stated: tuple[str, ...], **options: Any
 ) -> DataChoice:
     """Return the choice of a data set from the values of `--data` and of its options."""
-    given = drop_none(**options)
-    chosen = {name: given.pop(name) for name in CHOICE if name in given}
-    return DataChoice(data, description, parse_stated(stated), chosen, given)
+    return DataChoice(data, description, parse_stated(stated), drop_none(**options))
 
 
 def data_options(
