@@ -65,32 +65,31 @@ def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]
     """
     hashes = content_hash(np.stack([trace for _, trace in fitted])).tolist() if fitted else []
     groups = defaultdict[int, list[Recording]](list)
+    for hash_, (recording, _) in zip(hashes, fitted, strict=True):
+        groups[hash_].append(recording)
+    kept, faults = list[Fitted](), list[Fault]()
     for hash_, (recording, trace) in zip(hashes, fitted, strict=True):
+        first = groups[hash_][0]
         samples = trace[np.isfinite(trace)]
-        if (samples != samples[:1]).any():
-            groups[hash_].append(recording)
-    messages = dict[int, str]()
-    for group in groups.values():
-        first, repeats = group[0], group[1:]
-        message = f"Expected other samples than those of {first.source}, it repeats them"
-        if len({recording.label for recording in group}) > 1:
-            repeats = group
-            sources = listed(recording.source for recording in group)
-            message = f"Expected one label for equal samples, these have two: {sources}"
-        elif len({recording.part for recording in group}) > 1:
-            message += f" under another part than {first.part}"
-        messages |= dict.fromkeys(map(id, repeats), message)
-    kept = [item for item in fitted if id(item[0]) not in messages]
-    faults = [Fault(r.source, 0, messages[id(r)]) for r, _ in fitted if id(r) in messages]
+        message = ""
+        if len({other.label for other in groups[hash_]}) > 1:
+            message = f"Expected one label for the samples of {first.source}, got two"
+        elif recording is not first:
+            part = f" of part {first.part}" if first.part != recording.part else ""
+            message = f"Expected other samples than those of {first.source}{part}, it repeats them"
+        if message and (samples != samples[:1]).any():
+            faults.append(Fault(recording.source, 0, message))
+        else:
+            kept.append((recording, trace))
     return kept, faults
 
 
 def finished_notes(traces: NDArray[np.float32], sources: Sequence[str]) -> list[str]:
     """Return a note on the traces (n, C, T) in which samples are lost, if there are any."""
-    n_lost = (~np.isfinite(traces)).sum(axis=(1, 2))
-    names = [source for source, n in zip(sources, n_lost, strict=True) if n]
-    where = f"in {len(names)} of {len(traces)} recordings: {listed(names)}"
-    return [f"{n_lost.sum()} samples are lost, {where}."] if names else []
+    n_lost = (~np.isfinite(traces)).sum(axis=(1, 2)).tolist()
+    lost = {source: n for source, n in zip(sources, n_lost, strict=True) if n}
+    where = f"in {len(lost)} of {len(traces)} recordings: {listed(lost)}"
+    return [f"{sum(n_lost)} samples are lost, {where}."] if lost else []
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:

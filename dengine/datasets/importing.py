@@ -214,9 +214,11 @@ def import_parts(
         It counts labels; `resumed` is True.
     """
     gate = TraceGate(trace_spec)
-    counts = Counter[str]()
+    counts: dict[str, Any] = dict.fromkeys(
+        ("imported", "quarantined", "repeated", "contradicted"), 0
+    )
     counts_silence = policy.stops == "some"
-    n_silent = _count_silent(store) if counts_silence else 0
+    n_silent = _count_silent(store, policy)
     for start in range(0, len(parts), CHUNK):
         chunk = parts[start : start + CHUNK]
         new: dict[str, StoredDecision] = {}
@@ -227,8 +229,9 @@ def import_parts(
                 outcome = "repeated" if label == earlier.success else "contradicted"
                 counts[outcome] += label is not None
                 continue
-            stored = earlier or _as_stored(decision, trace, gate, policy, store.clock())
-            if earlier is None:
+            stored = earlier
+            if stored is None:
+                stored = _as_stored(decision, trace, gate, policy, store.clock())
                 new[decision.id] = stored
             if counts_silence and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as silent.
@@ -239,22 +242,20 @@ def import_parts(
                 source = source_of(decision.action, decision.audit, label)
                 about = (store.clock(), stored.content_hash, stored.time)
                 labels.append(NewLabel(decision.id, label, source, 0, None, silent, *about))
-                counts["quarantined"] += stored.quarantined
+                counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels])
-        counts["imported"] += len(labels)
         if on_traces is not None:
             on_traces(len(chunk))
-    return ImportReport(
-        counts["imported"] - counts["quarantined"],
-        counts["quarantined"],
-        counts["repeated"],
-        resumed=True,
-        contradicted=counts["contradicted"],
-    )
+    return ImportReport(**counts, resumed=True)
 
 
-def _count_silent(store: "SqlStore") -> int:
-    """Return how many accepted parts there are since the last label of which nothing was heard."""
+def _count_silent(store: "SqlStore", policy: Policy) -> int:
+    """Return how many accepted parts there are since the last label of which nothing was heard.
+
+    If silence confirms a part, there is none.
+    """
+    if policy.stops != "some":
+        return 0
     since = int(store.settings().get("policy_since", 0))
     return len(store.unreported_accepts(since)) - store.silent_total(since)
 

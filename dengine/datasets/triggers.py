@@ -7,7 +7,7 @@ engine finds: nothing is filled in.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -63,7 +63,7 @@ class Trigger:
 POSITIVE = r"(?=.*[1-9])\d+(\.\d+)?"
 # Each kind of trigger: the pattern of its number in a text; what holds for a text that does not
 # state it; and whether it is on, shape (n,), by the values of its signals (k, n) and its number.
-KINDS: dict[str, tuple[str, Trigger, Callable[[Any, Any], Any]]] = {
+KINDS: dict[str, tuple[str, Trigger, Any]] = {
     "bit": (
         r"[012]?\d|3[01]",
         Trigger("bit", None, "actual_digital_output_bits", 0.0),
@@ -100,7 +100,7 @@ def as_trigger(value: Any) -> Trigger:
     if isinstance(value, Trigger):
         return value
     form = r"(\w+)(?:=([^@]*))?(?:@(.+))?"
-    match = re.fullmatch(form, value.strip()) if isinstance(value, str) else None
+    match = re.fullmatch(form, str(value).strip())
     kind, number, signal = match.groups(default="") if match else ("", "", "")
     if kind not in KINDS or not re.fullmatch(KINDS[kind][0], number):
         raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {shortened(value)}.")
