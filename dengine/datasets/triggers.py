@@ -203,7 +203,7 @@ def place(
         Samples before or behind the trace are left out; of several at one place the first stays.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
-    at = np.rint((np.asarray(times, dtype=np.float64) - start) / step).astype(np.int64)
+    at = np.rint((np.asarray(times) - start) / step).astype(np.int64)
     inside = (at >= 0) & (at < samples)
     places, first = np.unique(at[inside], return_index=True)
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds
