@@ -68,7 +68,7 @@ def data(
         seen = Seen(recordings=n_found, good=survey.good, bad=survey.bad)
         path = _save(source, replace(description, seen=seen), save, context)
         shown = description.to_toml()
-    is_new = description is not None and source.saved is None
+    is_new = description is not None and not source.path.is_file()
     do = "Look at the traces (--out FOLDER); if they are right, write the description with --save."
     last_line = f"Wrote {path}." if path else do if is_new else ""
     print_result(
@@ -132,12 +132,7 @@ def _save(
 
     It replaces another one only with `--force`.
     """
-    from ..datasets.loading import saved_description
-
-    if not save:
-        return None
-    path = source.description or saved_description(source.data)
-    return description.save(path, bool(context.params.get("force")))
+    return description.save(source.path, bool(context.params.get("force"))) if save else None
 
 
 def _trace_line(dataset: "Dataset", i: int) -> str:

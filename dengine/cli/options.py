@@ -9,7 +9,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import click
 
-from ..errors import DataError, SettingError, as_options
+from ..errors import SettingError, as_options
 from .output import Out, as_json, json_option, progress_bar
 
 if TYPE_CHECKING:
@@ -392,24 +392,20 @@ class DataChoice:
     stated : mapping
         Keys of the description that were stated, like `label.column`.
     options : mapping
-        `channel` and `samples`, if they were given.
-    live : mapping
-        Those options of live traces that were given.
+        `channel` and `samples`, and the options of live traces, those that were given.
     """
 
     data: str
     description: Path | None
     stated: Options
     options: Options
-    live: Options = field(default_factory=dict)
 
     @property
-    def saved(self) -> Path | None:
-        """The file of the description; None if there is none."""
+    def path(self) -> Path:
+        """Where the description is saved."""
         from ..datasets.loading import saved_description
 
-        path = self.description or saved_description(self.data)
-        return path if self.description or path.is_file() else None
+        return self.description or saved_description(self.data)
 
     def describe(self, *, propose: bool = False) -> Description | None:
         """Return the description with the stated keys; None for a source that is ours.
@@ -419,18 +415,11 @@ class DataChoice:
         propose : bool
             Whether a description is proposed if none was saved; else that is a DataError.
         """
-        from ..datasets import Description, describe
-        from ..datasets.loading import missing_text, own_reader
+        from ..datasets.loading import description_of, own_reader
 
-        path = self.saved
-        if path is not None:
-            return Description.load(path).with_values(self.stated)
-        if not self.stated and own_reader(self.data) is not None:
+        if not self.stated and not self.description and own_reader(self.data) is not None:
             return None
-        proposal = describe(self.data, self.stated)
-        if not propose:
-            raise DataError(missing_text(Path(self.data), proposal))
-        return proposal
+        return description_of(self.data, self.description, self.stated, propose)
 
     def load(self, description: Description | None = None) -> Dataset:
         """Load the data set and return it.
@@ -537,9 +526,7 @@ def _data_choice(
     data: str, description: Path | None, stated: tuple[str, ...], **options: Any
 ) -> DataChoice:
     """Return the choice of a data set from the values of `--data` and of its options."""
-    given = drop_none(**options)
-    chosen = {name: given.pop(name) for name in CHOICE if name in given}
-    return DataChoice(data, description, parse_stated(stated), chosen, given)
+    return DataChoice(data, description, parse_stated(stated), drop_none(**options))
 
 
 def data_options(

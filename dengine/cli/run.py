@@ -236,7 +236,7 @@ def _simulated_cell(
         cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=parameters)
         return cell, f"simulated cell, {scenario}"
 
-    stated = options.trace_spec_from({**source.options, **source.live})
+    stated = options.trace_spec_from(source.options)
     spec = SimulatedCell.spec if stated is None else stated.completed(SimulatedCell.spec)
     return CellToDrive(spec, make)
 
@@ -292,9 +292,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
         raise SettingError(
             "Expected the robot's address for --cell ur, as in --host 192.168.1.10, got none."
         )
-    stated = {**source.options, **source.live}
-    settings, spec = options.recorder_settings(stated)
-    settings |= options.drop_none(trigger=stated.get("trigger"))
+    settings, spec = options.recorder_settings(source.options)
+    settings |= options.drop_none(trigger=source.options.get("trigger"))
     name, port = host_and_port(host)
     return CellToDrive(
         spec, lambda engine: (UrCell(name, port=port, **settings), f"robot at {host}")

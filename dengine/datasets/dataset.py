@@ -3,6 +3,7 @@
 What is wrong with a recording that is left out is a `Fault`.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError, TraceError, expect
+from ..errors import DataError, TraceError, expect, listed
 from ..records import TraceSpec
 from ..representation import to_html
 from ..traces import as_traces
@@ -19,8 +20,19 @@ if TYPE_CHECKING:
     import pandas as pd
 
 LEAST_RATE_HZ, MOST_RATE_HZ = 1.0, 1e6  # of anything that a cell samples
+Texts = NDArray[np.str_]
+Names = tuple[str, ...]
+Progress = Callable[[int], None]  # called with the number of files or traces that are done
 OWN = "dengine"  # key of the metadata by which a table of ours is known
+ABOUT = ("channels", "rate_hz", "unit", "limit", "fit")  # what it says
 expect_data = partial(expect, error=DataError)
+
+
+def expect_all(wanted: Mapping[str, Any]) -> None:
+    """Raise DataError for the first of several conditions that is not met."""
+    for what, is_met in wanted.items():
+        if not is_met:
+            raise DataError(f"Expected {what}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +106,14 @@ class Dataset:
     rate_hz: float | None = None
     unit: str = ""
     limit: float | None = None
-    cause: NDArray[np.str_] | None = None
-    part: NDArray[np.str_] | None = None
+    cause: Texts | None = None
+    part: Texts | None = None
     faults: tuple[Fault, ...] = ()
-    channels: tuple[str, ...] = ()
-    source: NDArray[np.str_] | None = None
+    channels: Names = ()
+    source: Texts | None = None
     fit: str = "strict"
     lengths: NDArray[np.int64] | None = None
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
     unlabelled: int = 0
     ordered: bool = True
 
@@ -110,12 +122,14 @@ class Dataset:
 
     def __repr__(self) -> str:
         good = int(self.y.sum())
+        shape = " x ".join(map(str, self.X.shape[1:]))
         names = f" of {', '.join(self.channels)}" if self.channels else ""
-        rate = "an unknown rate" if self.rate_hz is None else f"{self.rate_hz:g} Hz"
-        form = f"{' x '.join(map(str, self.X.shape[1:]))} samples{names} at {rate}"
-        labels = f"{good} good, {len(self) - good} bad, {self.unlabelled} unlabelled"
-        counts = f"{labels}, {len(self.faults)} left out"
-        return f"<Dataset {self.name}: {len(self)} traces, {form}, {counts}>"
+        rate = f"{self.rate_hz:g} Hz" if self.rate_hz else "an unknown rate"
+        return (
+            f"<Dataset {self.name}: {len(self)} traces, {shape} samples{names} at {rate}, {good} "
+            f"good, {len(self) - good} bad, {self.unlabelled} unlabelled, {len(self.faults)} left "
+            f"out>"
+        )
 
     _repr_html_ = to_html
 
@@ -130,15 +144,9 @@ class Dataset:
 
         A rate or a unit that is unknown is None.
         """
-        return TraceSpec(
-            self.X.shape[-1],
-            self.rate_hz,
-            channels=1 if self.X.ndim == 2 else self.X.shape[1],
-            unit=self.unit,
-            limit=self.limit,
-            fit=self.fit,
-            columns=self.channels,
-        )
+        _, channels, samples = self.cube.shape
+        about = (self.rate_hz, channels, self.unit, self.limit, self.fit, self.channels)
+        return TraceSpec(samples, *about)
 
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each trace.
@@ -150,27 +158,29 @@ class Dataset:
         """
         import pandas as pd
 
-        X = self.cube
-        default = ["x"] if X.shape[1] == 1 else [f"x{c}" for c in range(X.shape[1])]
-        names = [f"{name}_{i}" for name in self.channels or default for i in range(X.shape[2])]
-        columns = {"label": self.y, "part": self.part, "cause": self.cause}
-        columns = {name: values for name, values in columns.items() if values is not None}
-        samples = pd.DataFrame(X.reshape(len(X), -1), columns=names)
-        frame = pd.concat([pd.DataFrame(columns), samples], axis=1)
-        about = {"rate_hz": self.rate_hz, "unit": self.unit, "fit": self.fit, "limit": self.limit}
-        frame.attrs[OWN] = {"channels": list(self.channels), "n_channels": X.shape[1], **about}
+        _, channels, samples = self.cube.shape
+        stems = self.channels or (["x"] if channels == 1 else [f"x{c}" for c in range(channels)])
+        names = [f"{stem}_{i}" for stem in stems for i in range(samples)]
+        frame = pd.DataFrame(self.X.reshape(len(self), -1), columns=names)
+        for name, values in (("cause", self.cause), ("part", self.part), ("label", self.y)):
+            if values is not None:
+                frame.insert(0, name, values)
+        frame.attrs[OWN] = {name: getattr(self, name) for name in ABOUT} | {"n_channels": channels}
         return frame
 
-    def select(self, channels: tuple[str, ...]) -> "Dataset":
+    def select(self, channels: Names) -> "Dataset":
         """Return a data set of some channels, in this order; DataError for unknown names."""
         names = ", ".join(self.channels) or "none, its channels have no names"
-        wanted = f"channels of {self.name}, {names}"
-        expect_data({*channels} <= {*self.channels}, wanted, [*channels])
+        is_known = {*channels} <= {*self.channels}
+        expect_data(is_known, f"channels of {self.name}, {names}", [*channels])
         places = [self.channels.index(name) for name in channels]
-        units = self.unit.split(", ") if ", " in self.unit else [self.unit] * len(self.channels)
         X = np.ascontiguousarray(self.cube[:, places])
-        unit = ", ".join(units[place] for place in places)
-        return replace(self, X=X if len(places) > 1 else X[:, 0], channels=channels, unit=unit)
+        return replace(
+            self,
+            X=X if len(places) > 1 else X[:, 0],
+            channels=channels,
+            unit=", ".join(self.spec.units[place] for place in places),
+        )
 
     def cut(self, samples: int) -> "Dataset":
         """Return a data set of the first `samples` samples of every trace, to decide earlier.
@@ -178,11 +188,11 @@ class Dataset:
         Raises DataError if the traces are shorter, or were resampled, so that their first samples
         are not the first of the recordings.
         """
-        have = self.X.shape[-1]
-        expect_data(1 <= samples <= have, f"1 to {have} samples of {self.name}", samples)
-        can_cut = samples == have or self.fit != "resample"
-        expect_data(can_cut, f"{have} samples of {self.name}, which was resampled", samples)
-        fit = "cut" if samples < have and self.fit == "pad" else self.fit
+        most = self.X.shape[-1]
+        least = most if self.fit == "resample" else 1
+        wanted = f"{least} to {most} samples of {self.name}"
+        expect_data(least <= samples <= most, wanted, samples, "resampled traces stay whole")
+        fit = "cut" if samples < most and self.fit == "pad" else self.fit
         return replace(self, X=np.ascontiguousarray(self.X[..., :samples]), fit=fit)
 
 
@@ -191,7 +201,7 @@ def make_dataset(
     y: ArrayLike,
     *,
     rate_hz: float | None = None,
-    channels: tuple[str, ...] = (),
+    channels: Names = (),
     part: Any = None,
     cause: Any = None,
     **about: Any,
@@ -215,47 +225,35 @@ def make_dataset(
         channels than samples.
     """
     try:
-        X = as_traces(X)[:, 0] if np.ndim(X) == 2 else as_traces(X)
+        cube = as_traces(X)
     except TraceError as error:
         raise DataError(str(error)) from error
     y = np.asarray(y)
-    n_channels = 1 if X.ndim == 2 else X.shape[1]
-    part = None if part is None else np.asarray(part)
-    is_word = part is None or (part.shape == y.shape and part.dtype.kind in "iuUS")
-    shapes, transpose = (X.shape, y.shape), "it looks transposed; pass X.transpose(0, 2, 1)"
-    is_rate = rate_hz is None or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
-    for valid, wanted, actual, do in (
-        (y.shape == X.shape[:1], "X (n, T) or (n, C, T) with n labels", shapes, ""),
-        (len(y) > 0, "at least one trace", 0, ""),
-        (n_channels <= X.shape[-1], "X (n, channels, samples)", X.shape, transpose),
-        (
-            np.isin(y, (0, 1)).all(),
-            "labels 1 (success) and 0 (failure)",
-            sorted({*map(str, y)}),
-            "",
-        ),
-        (is_rate, "a rate of 1 Hz to 1 MHz", rate_hz, ""),
-        (
-            len(channels) in (0, n_channels),
-            f"a name for each of {n_channels} channels",
-            channels,
-            "",
-        ),
-        (is_word, f"{len(y)} parts' numbers, texts or integers", np.shape(part), ""),
-        (
-            cause is None or np.shape(cause) == y.shape,
-            "a cause for each trace",
-            np.shape(cause),
-            "",
-        ),
-    ):
-        expect_data(bool(valid), wanted, actual, do)
+    parts = None if part is None else np.asarray(part)
+    n, n_channels, samples = cube.shape
+    words = sorted({*map(str, y.ravel().tolist())})
+    expect_all(
+        {
+            f"X (n, T) or (n, C, T) with n labels, got {(np.shape(X), y.shape)}": y.shape == (n,),
+            "at least one trace": n,
+            f"X (n, channels, samples), got {cube.shape}; transpose it": n_channels <= samples,
+            f"labels 1 (success) and 0 (failure), got {listed(words)}": np.isin(y, (0, 1)).all(),
+            f"a rate of 1 Hz to 1 MHz, got {rate_hz}": (
+                rate_hz is None or LEAST_RATE_HZ <= rate_hz <= MOST_RATE_HZ
+            ),
+            f"a name for each of {n_channels} channels": len(channels) in (0, n_channels),
+            f"{n} parts' numbers, texts or integers": (
+                parts is None or (parts.shape == y.shape and parts.dtype.kind in "iuUS")
+            ),
+            "a cause for each trace": cause is None or np.shape(cause) == y.shape,
+        }
+    )
     return Dataset(
-        X,
+        cube[:, 0] if n_channels == 1 else cube,
         y.astype(np.int8),
         rate_hz=rate_hz,
         channels=channels,
-        part=None if part is None else part.astype(np.str_),
+        part=None if parts is None else parts.astype(np.str_),
         cause=cause,
         **about,
     )

@@ -4,185 +4,256 @@
     description.save("cell_3/recordings.toml")
     data = load_dataset("cell_3/")           # reads by that file, and infers nothing
 
-Each key is a field of a dataclass below, with one sentence on it in its metadata: the reference
-page is made of these.
+Each key is a field of a dataclass below, with its sentence in the docstring: the reference page is
+made of these.
 """
 
 import difflib
 import json
-import math
-import os
+import re
+import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin
 
-from ..errors import DataError, expect, instead, listed
-from ..files import write_output
+from ..errors import DataError, instead
+from ..files import FilePath, write_output
+from .dataset import expect_data
 
 UNKNOWN = "?"
 ANY = "*"  # in place of a word, any that is not named; in a column, any text
 VERSION = 1
 FOLDER_FILE = "recordings.toml"  # in a folder; beside a single file it is FILE.toml
 MOST_BYTES = 1_000_000
-MOST_LINE = 100  # characters of a line of the file with its comment
-FORMATS = ("text", "json", "jsonl", "parquet", "npz", "ts", "mcap", "frame")
-LAYOUTS = ("files", "long", "wide", "columns", "npz", "mcap")
-LENGTHS = ("strict", "cut", "pad", "pad-all", "resample")
-PLACES = ("same", "first", "last")  # of a label in a recording's rows
 Words = tuple[str, ...]
-TYPES: dict[type, tuple[Any, str]] = {
-    float: (int | float, "a number"),
-    int: (int, "a whole number"),
-    bool: (bool, "true or false"),
-    str: (str, "a text"),
-}
 Stated = Mapping[str, Any]
 
 
-def setting(default: Any, doc: str, *choices: str, may_be_text: bool = False) -> Any:
-    """Return a dataclass field for one key, with its sentence and what it may be."""
-    about = {"doc": doc, "choices": choices, "may_be_text": may_be_text}
-    return field(default=default, metadata=about)
+def choice(*choices: str) -> Any:
+    """Return a dataclass field for a key that is one of some texts, the first by default."""
+    return field(default=choices[0], metadata={"choices": choices})
 
 
 @dataclass(frozen=True, slots=True)
 class TextForm:
-    """How text files are written: `[text]`."""
+    """How text files are written: `[text]`.
 
-    encoding: str = setting("utf-8", "Encoding of the files, by a name that Python knows.")
-    delimiter: str = setting(",", "Character between cells; a blank stands for any run of blanks.")
-    decimal: str = setting(".", "Decimal mark of numbers.")
-    thousands: str = setting("", "Mark between groups of three digits; empty: there is none.")
-    header: Any = setting(
-        1,
-        "Line of the columns' names, 0 if there is none; or a text that this line begins with, if "
-        "it stands at another line in each file.",
-        may_be_text=True,
-    )
-    units: int = setting(0, "Line of the columns' units, 0 if there is none; counted like `data`.")
-    data: int = setting(2, "Line of the first samples; counted from the header if that is a text.")
-    names: Words = setting(
-        (), "Names of the columns, in place of a header; a last `x*` names all that remain."
-    )
-    missing: Words = setting(
-        (), "Words that stand for a lost sample, which is read as NaN; other words are faults."
-    )
-    drop: Words = setting((), "Beginnings of the lines below the header that are left out.")
+    encoding
+        Encoding of the files, by a name that Python knows.
+    delimiter
+        Character between cells; a blank stands for any run of blanks.
+    decimal
+        Decimal mark of numbers.
+    thousands
+        Mark between groups of three digits; empty: there is none.
+    header
+        Line of the columns' names, 0 if there is none; or a text that this line begins with, if it
+        stands at another line in each file.
+    units
+        Line of the columns' units, 0 if there is none; counted like `data`.
+    data
+        Line of the first samples; counted from the header if that is a text.
+    names
+        Names of the columns, in place of a header; a last `x*` names all that remain.
+    missing
+        Words that stand for a lost sample, which is read as NaN; other words are faults.
+    drop
+        Beginnings of the lines below the header that are left out.
+    """
+
+    encoding: str = "utf-8"
+    delimiter: str = ","
+    decimal: str = "."
+    thousands: str = ""
+    header: int | str = 1
+    units: int = 0
+    data: int = 2
+    names: Words = ()
+    missing: Words = ()
+    drop: Words = ()
 
 
 @dataclass(frozen=True, slots=True)
 class RowWords:
-    """What the words of one column mean for their rows: `[rows.COLUMN]`. Other words are faults."""
+    """What the words of one column mean for their rows: `[rows]`. Other words are faults.
 
-    keep: Words = setting((), "Words of rows that are samples; `*` is any other word.")
-    drop: Words = setting((), "Words of rows that are left out; `*` is any other word.")
-    invalid: Words = setting((), "Words of rows whose samples are lost, and read as NaN.")
+    keep
+        Words of rows that are samples; `*` is any other word.
+    drop
+        Words of rows that are left out; `*` is any other word.
+    invalid
+        Words of rows whose samples are lost, and read as NaN.
+    """
+
+    keep: Words = ()
+    drop: Words = ()
+    invalid: Words = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """When the samples were taken: `[time]`."""
+    """When the samples were taken: `[time]`.
 
-    column: Words = setting(
-        (),
-        "Column of times, or several whose times are added: a date, a time of day, milliseconds.",
-    )
-    format: Words = setting(
-        ("s",),
-        "Unit of each column (`s ms us ns min h d`, or `0.001 ms`), `iso`, or a form with percent "
-        "signs like those of Python's strptime.",
-    )
-    zone: str = setting("", "Time zone of dates that state none, like `Europe/Berlin`; empty: UTC.")
-    rate_hz: float = setting(
-        0.0, "Sampling rate in hertz, which the times must agree with; 0: unknown."
-    )
-    wrap: float = setting(
-        0.0, "Value at which a counter of times begins again at 0; 0: it never does."
-    )
-    gap: float = setting(1.5, "Longest step from one sample to the next, in usual steps; 0: any.")
-    sort: bool = setting(
-        False, "Whether the samples of a part are put in the order of their times."
-    )
+    column
+        Column of times, or several whose times are added: a date, a time of day, milliseconds.
+    format
+        Unit of each column (`s ms us ns min h d`, or `0.001 ms`), `iso`, or a form with percent
+        signs like those of Python's strptime.
+    zone
+        Time zone of dates that state none, like `Europe/Berlin`; empty: UTC.
+    rate_hz
+        Sampling rate in hertz, which the times must agree with; 0: unknown.
+    wrap
+        Value at which a counter of times begins again at 0; 0: it never does.
+    gap
+        Longest step from one sample to the next, in usual steps; 0: any.
+    sort
+        Whether the samples of a part are put in the order of their times.
+    """
+
+    column: Words = ()
+    format: Words = ("s",)
+    zone: str = ""
+    rate_hz: float = 0.0
+    wrap: float = 0.0
+    gap: float = 1.5
+    sort: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One channel of the traces: `COLUMN = "UNIT"` in `[channels]`, or a table of these keys."""
+    """One channel of the traces: `COLUMN = "UNIT"` in `[channels]`, or a table of these keys.
 
-    column: str = setting("", "Column, or a pattern of columns with `*`.")
-    unit: str = setting(
-        "", "Unit of the traces; samples whose own unit is stated are converted to it."
-    )
-    factor: float = setting(1.0, "Number by which the samples are multiplied.")
-    limit: float = setting(0.0, "Range of the sensor, in the unit of the traces; 0: not known.")
+    column
+        Column, or a pattern of columns with `*`.
+    unit
+        Unit of the traces; samples whose own unit is stated are converted to it.
+    factor
+        Number by which the samples are multiplied.
+    limit
+        Range of the sensor, in the unit of the traces; 0: not known.
+    """
+
+    column: str = ""
+    unit: str = ""
+    factor: float = 1.0
+    limit: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class PartSource:
-    """Where the number of a part stands: `[part]`. Without it each recording is of another part."""
+    """Where the number of a part stands: `[part]`. Without it each recording is of another part.
 
-    column: Words = setting((), "Column, or columns that tell the part together.")
-    path: str = setting(
-        "", "Regular expression, whose one group is found in the path without suffix."
-    )
-    line: str = setting("", "Beginning of a line above the header, in front of the part's number.")
+    column
+        Column, or columns that tell the part together.
+    path
+        Regular expression, whose one group is found in the path without suffix.
+    line
+        Beginning of a line above the header, in front of the part's number.
+    """
+
+    column: Words = ()
+    path: str = ""
+    line: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class LabelSource:
-    """Where the label of a part stands, and its words: `[label]`. Other words are faults."""
+    """Where the label of a part stands, and its words: `[label]`. Other words are faults.
 
-    column: str = setting("", "Column, or array, with the label.")
-    path: str = setting(
-        "", "Regular expression, whose one group is found in the path without suffix."
-    )
-    line: str = setting("", "Beginning of a line above the header, in front of the label.")
-    topic: str = setting("", "Topic of a bag whose next message is the label.")
-    listing: str = setting("", "File beside the recordings that lists the labels, in its `column`.")
-    key: str = setting("", "Column of the listing with the part's number or the recording's file.")
-    at: str = setting("same", "Which row has the label, if it changes within a recording.", *PLACES)
-    good: Words = setting((), "Words for a good part.")
-    bad: Words = setting((), "Words for a bad part.")
-    unchecked: Words = setting((), "Words for a part that was not checked: it is left out.")
+    column
+        Column, or array, with the label.
+    path
+        Regular expression, whose one group is found in the path without suffix.
+    line
+        Beginning of a line above the header, in front of the label.
+    topic
+        Topic of a bag whose next message is the label.
+    listing
+        File beside the recordings that lists the labels, in its `column`.
+    key
+        Column of the listing with the part's number or the recording's file.
+    at
+        Which row has the label, if it changes within a recording: `same`, `first` or `last`.
+    good
+        Words for a good part.
+    bad
+        Words for a bad part.
+    unchecked
+        Words for a part that was not checked: it is left out.
+    """
+
+    column: str = ""
+    path: str = ""
+    line: str = ""
+    topic: str = ""
+    listing: str = ""
+    key: str = ""
+    at: str = choice("same", "first", "last")
+    good: Words = ()
+    bad: Words = ()
+    unchecked: Words = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Windows:
-    """How one long recording is cut into parts: `[windows]`."""
+    """How one long recording is cut into parts: `[windows]`.
 
-    trigger: str = setting(
-        "", "Condition that begins a part, like `register=1@/phase` or `contact=5`."
-    )
-    listing: str = setting("", "File beside the recordings with a row for each part.")
-    key: str = setting("", "Column of the listing with the part's number.")
-    start: str = setting("", "Column of the listing with the time at which the part began.")
-    end: str = setting("", "Column of the listing with the time at which the part ended.")
-    format: str = setting("s", "Unit or form of these times, like that of `[time]`.")
+    trigger
+        Condition that begins a part, like `register=1@/phase` or `contact=5`.
+    listing
+        File beside the recordings with a row for each part.
+    key
+        Column of the listing with the part's number.
+    start
+        Column of the listing with the time at which the part began.
+    end
+        Column of the listing with the time at which the part ended.
+    format
+        Unit or form of these times, like that of `[time]`.
+    """
+
+    trigger: str = ""
+    listing: str = ""
+    key: str = ""
+    start: str = ""
+    end: str = ""
+    format: str = "s"
 
 
 @dataclass(frozen=True, slots=True)
 class TraceForm:
-    """The traces that come out: `[traces]`."""
+    """The traces that come out: `[traces]`.
 
-    samples: int = setting(0, "Samples of each trace.")
-    lengths: str = setting(
-        "strict",
-        "What happens to a recording of another length. `strict`: it is a fault. `cut`: it loses "
-        "its end. `pad`: like `cut`, or its last sample is repeated, up to twice its length. "
-        "`pad-all`: like `pad`, at any length. `resample`: it is interpolated.",
-        *LENGTHS,
-    )
+    samples
+        Samples of each trace.
+    lengths
+        What happens to a recording of another length. `strict`: it is a fault. `cut`: it loses its
+        end. `pad`: like `cut`, or its last sample is repeated, up to twice its length. `pad-all`:
+        like `pad`, at any length. `resample`: it is interpolated.
+    """
+
+    samples: int = 0
+    lengths: str = choice("strict", "cut", "pad", "pad-all", "resample")
 
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the author of the description saw: `[seen]`. Fewer recordings are noted later."""
+    """What the author of the description saw: `[seen]`. Fewer recordings are noted later.
 
-    recordings: int = setting(0, "Recordings that were read.")
-    good: int = setting(0, "Good parts among them.")
-    bad: int = setting(0, "Bad parts among them.")
+    recordings
+        Recordings that were read.
+    good
+        Good parts among them.
+    bad
+        Bad parts among them.
+    """
+
+    recordings: int = 0
+    good: int = 0
+    bad: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,34 +262,41 @@ class Description:
 
     `?` stands for a value that is not known; it must be replaced before anything is read. The
     fields are the keys and sections of the TOML file, `notes` the comments in it, by key.
+
+    version
+        Version of this form of description.
+    files
+        Patterns of the files, like `*.csv` or `**/*.csv`.
+    exclude
+        Patterns of files that are no recordings.
+    format
+        What kind of files they are: `text`, `json`, `jsonl`, `parquet`, `npz`, `ts`, `mcap` or
+        `frame`.
+    layout
+        `files`: a file for each part. `long`: a row for each sample. `wide`: a row for each part.
+        `columns`: a column for each part. `npz`: arrays with all parts. `mcap`: bags.
+    order
+        The order in which the parts were made: `name`, by file name, with numbers by their size;
+        `time`, by the first time of each; or the name of a column.
     """
 
-    version: int = setting(VERSION, "Version of this form of description.")
-    files: Words = setting((), "Patterns of the files, like `*.csv` or `**/*.csv`.")
-    exclude: Words = setting((), "Patterns of files that are no recordings.")
-    format: str = setting("text", "What kind of files they are.", *FORMATS)
-    layout: str = setting(
-        "files",
-        "`files`: a file for each part. `long`: a row for each sample. `wide`: a row for each "
-        "part. `columns`: a column for each part. `npz`: arrays with all parts. `mcap`: bags.",
-        *LAYOUTS,
-    )
-    order: str = setting(
-        "name",
-        "The order in which the parts were made: `name`, by file name, with numbers by their size; "
-        "`time`, by the first time of each; or the name of a column.",
-    )
-    text: TextForm = field(default_factory=TextForm)
+    version: int = VERSION
+    files: Words = ()
+    exclude: Words = ()
+    format: str = choice("text", "json", "jsonl", "parquet", "npz", "ts", "mcap", "frame")
+    layout: str = choice("files", "long", "wide", "columns", "npz", "mcap")
+    order: str = "name"
+    text: TextForm = TextForm()
     rows: Mapping[str, RowWords] = field(default_factory=dict)
-    time: Clock = field(default_factory=Clock)
+    time: Clock = Clock()
     channels: tuple[Channel, ...] = ()
     ignored: Mapping[str, str] = field(default_factory=dict)  # column: unit
-    part: PartSource = field(default_factory=PartSource)
-    label: LabelSource = field(default_factory=LabelSource)
+    part: PartSource = PartSource()
+    label: LabelSource = LabelSource()
     check: tuple[LabelSource, ...] = ()
-    windows: Windows = field(default_factory=Windows)
-    traces: TraceForm = field(default_factory=TraceForm)
-    seen: Seen = field(default_factory=Seen)
+    windows: Windows = Windows()
+    traces: TraceForm = TraceForm()
+    seen: Seen = Seen()
     notes: Mapping[str, str] = field(default_factory=dict, compare=False)
 
     @classmethod
@@ -231,8 +309,15 @@ class Description:
         version = values.get("version", VERSION)
         is_older = isinstance(version, int) and version <= VERSION
         do = "install a newer dengine"
-        expect(is_older, f"version {VERSION} of {where}", version, do, DataError)
-        return _made(cls, values, where)  # type: ignore[no-any-return]
+        expect_data(is_older, f"version {VERSION} of {where}", version, do)
+        channels = values.get("channels", {})
+        if isinstance(channels, Mapping):
+            channels = [
+                {"column": column, **(about if isinstance(about, Mapping) else {"unit": about})}
+                for column, about in channels.items()
+                if column != UNKNOWN
+            ]
+        return _made(cls, {**values, "channels": channels}, where)  # type: ignore[no-any-return]
 
     @classmethod
     def from_toml(cls, text: str, where: str = FOLDER_FILE) -> "Description":
@@ -242,64 +327,50 @@ class Description:
         return cls.from_dict(values, where)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> "Description":
+    def load(cls, path: FilePath) -> "Description":
         """Read a description from a TOML file; raise DataError if it cannot be read."""
         path = Path(path)
         with instead(DataError, f"Expected a description in {path}", OSError, UnicodeDecodeError):
             size = path.stat().st_size
-            expect(size <= MOST_BYTES, f"{path} of at most 1 MB", f"{size} bytes", "", DataError)
+            expect_data(size <= MOST_BYTES, f"{path} of at most 1 MB", f"{size} bytes")
             return cls.from_toml(path.read_text("utf-8-sig"), str(path))
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> Path:
+    def save(self, path: FilePath, force: bool = False) -> Path:
         """Write the TOML file, over an existing one only with `force`; return its path."""
         return write_output(path, self.to_toml().encode(), force)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return nested dicts of TOML's types, without what has its default."""
-        values: dict[str, Any] = _plain(self)
-        if self.channels:
-            values["channels"] = {table.pop("column", ""): table for table in values["channels"]}
-        return values
+        """Return nested dicts of TOML's types, without what has its default; `?` for no channel."""
+        channels = {
+            channel.column: {"unit": channel.unit, **_plain(replace(channel, column=""))}
+            for channel in self.channels or [Channel(UNKNOWN)]
+        }
+        return {**_plain(self), "channels": channels}
 
     def to_toml(self) -> str:
-        """Return the text of the TOML file, with `notes` as comments."""
-        values: dict[str, Any] = {"version": self.version, "channels": {UNKNOWN: {}}}
-        values |= self.to_dict()
-        only_unit = {"unit"}
-        values["channels"] = {
-            column: table.get("unit", "") if {*table} <= only_unit else table
-            for column, table in values["channels"].items()
-        }
-        lines = self._lines("", values, KEYS[""])
+        """Return the text of the TOML file, with `notes` as comments above their keys."""
+        values = {"version": self.version, **self.to_dict()}
+        lines = self._lines("", {k: v for k, v in values.items() if k not in SECTIONS})
         for name in SECTIONS:
-            table = values.get(name, {})
-            if name == "rows":
-                for column, words in table.items():
-                    lines += ["", f"[rows.{_toml_key(column)}]"]
-                    lines += self._lines(f"rows.{column}.", words, KEYS["rows"])
-            elif name == "check":
-                for i, source in enumerate(table):
-                    lines += ["", "[[check]]", *self._lines(f"check.{i}.", source, KEYS["check"])]
-            else:
-                names = table if name in NAMED else KEYS[name]
-                body = self._lines(f"{name}.", table, names)
-                lines += ["", f"[{name}]", *body] if body else []
+            if name == "check":
+                for source in values.get(name, ()):
+                    lines += ["", "[[check]]", *self._lines("check.", source)]
+            elif body := self._lines(f"{name}.", values.get(name, {})):
+                lines += ["", f"[{name}]", *body]
         return "\n".join(lines) + "\n"
 
-    def _lines(self, prefix: str, table: Stated, names: Iterable[str]) -> list[str]:
-        """Return a line for each key that is stated or has a note, with the note as a comment."""
-        result = []
-        for name in names:
-            note = self.notes.get(prefix + name, "")
-            note = "".join(c if c.isprintable() else " " for c in note)
-            line = f"{_toml_key(name)} = {_toml_value(table[name])}" if name in table else ""
-            if not line:
-                result += [f"# {name}: {note}"] if note else []
-            elif note and len(line) + len(note) + 4 <= MOST_LINE:
-                result.append(f"{line}  # {note}")
-            else:
-                result += [f"# {note}", line] if note else [line]
-        return result
+    def _lines(self, prefix: str, table: Stated) -> list[str]:
+        """Return the notes on keys that are not stated, and each that is below its note."""
+        notes = {
+            key.removeprefix(prefix): "".join(c if c.isprintable() else " " for c in note)
+            for key, note in self.notes.items()
+            if note and key.startswith(prefix) and (prefix or key.partition(".")[0] not in SECTIONS)
+        }
+        lines = [f"# {name}: {note}" for name, note in notes.items() if name not in table]
+        for name, value in table.items():
+            lines += [f"# {notes[name]}"] if name in notes else []
+            lines.append(f"{_toml_key(name)} = {_toml_value(value)}")
+        return lines
 
     @property
     def open_keys(self) -> Words:
@@ -307,10 +378,10 @@ class Description:
 
         A word `?` of a check is none of them: it fits no recording, so others are its faults.
         """
-        values = {k: v for k, v in self.to_dict().items() if k not in ("ignored", "check")}
-        found = tuple(name for name, value in _leaves(values) if value == UNKNOWN)
-        columns = [channel.column for channel in self.channels]
-        return found if columns and UNKNOWN not in columns else (*found, "channels")
+        values = self.to_dict()
+        values.pop("ignored", None)
+        open_channels = ["channels"] if UNKNOWN in values["channels"] else []
+        return (*_open_keys(values), *open_channels)
 
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which keys, like `label.column`, have other values.
@@ -319,18 +390,19 @@ class Description:
         channel that is stated replaces `?`. Raises DataError like `from_dict`.
         """
         values = self.to_dict()
+        for section, sources in SOURCES.items():
+            if any(f"{section}.{source}" in stated for source in sources):
+                for source in sources:
+                    values.get(section, {}).pop(source, None)
         for name, value in stated.items():
-            section, *path = split_key(name)
-            if path and path[0] in SOURCES.get(section, ()):
-                for other in SOURCES[section]:
-                    if f"{section}.{other}" not in stated:
-                        values.get(section, {}).pop(other, None)
+            of_column = OF_COLUMN.fullmatch(name)
+            *steps, last = of_column.groups() if of_column else name.split(".", 1)
             table = values
-            for step in [section, *path][:-1]:
+            for step in steps:
                 table = table.setdefault(step, {})
                 wanted = f"a section before the dot in {name}"
-                expect(isinstance(table, dict), wanted, step, "", DataError)
-            table[[section, *path][-1]] = value
+                expect_data(isinstance(table, dict), wanted, step)
+            table[last] = value
         return replace(Description.from_dict(values), notes=self.notes)
 
     def with_channels(self, columns: Sequence[str]) -> "Description":
@@ -341,8 +413,7 @@ class Description:
         known = {column: Channel(column, unit) for column, unit in self.ignored.items()}
         known |= {channel.column: channel for channel in self.channels}
         for column in columns:
-            wanted = f"one of the columns {listed(known)} as a channel"
-            expect(column in known, wanted, column, "see [channels] and [ignored]", DataError)
+            _expect_one_of(known, column, "[channels] and [ignored]")
         return replace(self, channels=tuple(known[column] for column in columns))
 
 
@@ -360,139 +431,104 @@ SECTIONS: dict[str, Any] = {
     "traces": TraceForm,
     "seen": Seen,
 }
-KEYS = {name: tuple(f.name for f in fields(s)) for name, s in SECTIONS.items() if s is not None}
-KEYS[""] = tuple(f.name for f in fields(Description) if f.name not in ("notes", *SECTIONS))
 # Keys of which one states where something stands, and the others are cleared.
 SOURCES = {
     "label": ("column", "path", "line", "topic", "listing"),
     "part": ("column", "path", "line"),
 }
+# Keys of one column, whose name may have dots in it: `rows.Status of A.1.keep`.
+OF_COLUMN = re.compile(r"(rows|channels)\.(.+)\.(keep|drop|invalid|unit|factor|limit)", re.DOTALL)
+KINDS: dict[Any, str] = {
+    str: "a text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+    int | str: "a whole number or a text",
+}
 
 
-# Sections of any columns, each with its unit or its table.
-NAMED = ("channels", "ignored")
+def _made(kind: Any, value: Any, where: str, choices: Words = ()) -> Any:
+    """Return what TOML states as a section, or in the type of its key; raise DataError if it is
+    none.
 
-
-def _made(cls: Any, values: Any, where: str) -> Any:
-    """Return a dataclass of nested dicts; raise DataError for an unknown key or a wrong type."""
-    known = {about.name: about for about in fields(cls) if about.compare}
-    for name in _table(values, where):
-        if name not in known:
-            raise DataError(f"Expected {_one_of(known, name)} in {where}, got {name!r}.")
-    return cls(**{name: _value(known[name], v, f"{where}, {name}") for name, v in values.items()})
-
-
-def _table(values: Any, where: str) -> Stated:
-    """Return a table; raise DataError for something else."""
-    expect(isinstance(values, Mapping), f"{where} to be a table", values, "", DataError)
-    return values  # type: ignore[no-any-return]
-
-
-def _value(about: Any, value: Any, where: str) -> Any:
-    """Return the value of a field in its type; raise DataError for another one."""
-    name, section = about.name, SECTIONS.get(about.name)
-    if name not in SECTIONS:
-        return _as_type(about, value, where)
-    if name == "check":
-        expect(isinstance(value, list), f"tables in {where}", value, "", DataError)
-        return tuple(_made(section, table, where) for table in value)
-    items = _table(value, where).items()
-    if name == "rows":
-        return {key: _made(section, table, f"{where}.{key}") for key, table in items}
-    if name not in NAMED:
-        return _made(section, value, where)
-    tables = {key: item if isinstance(item, Mapping) else {"unit": item} for key, item in items}
-    channels = [
-        _made(Channel, {"column": key, **table}, f"{where}.{key}")
-        for key, table in tables.items()
-        if (name, key) != ("channels", UNKNOWN)
-    ]
-    is_ignored = name == "ignored"
-    return {c.column: c.unit for c in channels} if is_ignored else tuple(channels)
-
-
-def _as_type(about: Any, value: Any, where: str) -> Any:
-    """Return a value in the type of the key's default; a lone text for several is one of them.
-
-    `?` passes for every key.
+    A lone value of several is one of them.
     """
-    default, choices = about.default, about.metadata["choices"]
-    items = value if isinstance(value, list | tuple) else [value]
-    if isinstance(default, tuple):
-        valid = all(isinstance(item, str | int | float) for item in items)
-        expect(valid, f"texts in {where}", value, "", DataError)
-        return tuple(map(str, items))
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is tuple:
+        items = value if isinstance(value, list | tuple) else [value]
+        return tuple(_made(args[0], item, where) for item in items)
+    if origin is not Mapping and not is_dataclass(kind):
+        return _as_kind(kind, value, where, choices)
+    expect_data(isinstance(value, Mapping), f"{where} to be a table", value)
+    if origin is Mapping:
+        return {name: _made(args[1], item, f"{where}.{name}") for name, item in value.items()}
+    known = {about.name: about for about in fields(kind) if about.compare}
+    made = {}
+    for name, item in value.items():
+        _expect_one_of(known, name, where)
+        about = known[name]
+        choices = about.metadata.get("choices", ())
+        made[name] = _made(about.type, item, f"{where}, {name}", choices)
+    return kind(**made)
+
+
+def _as_kind(kind: Any, value: Any, where: str, choices: Words) -> Any:
+    """Return a value in the type of its key; `?` passes for every key, a number for a text."""
     if value == UNKNOWN:
         return value
-    kind, wanted = TYPES[type(default)]
-    kind = int | str if about.metadata["may_be_text"] else kind
-    valid = isinstance(value, kind) and isinstance(value, bool) == isinstance(default, bool)
-    valid = valid and (not isinstance(value, float) or math.isfinite(value))
-    expect(valid, f"{wanted} in {where}", value, "", DataError)
-    if choices and value not in choices:
-        raise DataError(f"Expected {_one_of(choices, value)} in {where}, got {value!r}.")
-    return float(value) if isinstance(default, float) else value
+    if kind is str and isinstance(value, int | float):
+        return str(value)
+    is_kind = isinstance(value, int | float if kind is float else kind)
+    is_kind = is_kind and isinstance(value, bool) == (kind is bool)
+    is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
+    expect_data(is_kind and is_finite, f"{KINDS[kind]} in {where}", value)
+    if choices:
+        _expect_one_of(choices, value, where)
+    return float(value) if kind is float else value
 
 
-def _one_of(known: Iterable[str], name: str) -> str:
-    """Return the known name that is nearest, or all of them."""
-    nearest = difflib.get_close_matches(name, [*known], 1)
-    return f"{nearest[0]!r}" if nearest else f"one of {', '.join(known)}"
+def _expect_one_of(known: Iterable[str], name: str, where: str) -> None:
+    """Raise DataError for a name that is not known, with the nearest that is, or all of them."""
+    nearest = difflib.get_close_matches(name, known, 1)
+    wanted = repr(nearest[0]) if nearest else f"one of {', '.join(known)}"
+    expect_data(name in known, f"{wanted} in {where}", name)
 
 
 def _plain(value: Any) -> Any:
     """Return dataclasses, and what they hold, in TOML's types, without fields of their defaults."""
+    if isinstance(value, str | int | float):
+        return value
+    if isinstance(value, tuple):
+        return [*map(_plain, value)]
     if isinstance(value, Mapping):
         return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, tuple):
-        items = [*map(_plain, value)]
-        return items[0] if len(items) == 1 and isinstance(items[0], str) else items
-    if not is_dataclass(value) or isinstance(value, type):
-        return value
+    values = {about.name: getattr(value, about.name) for about in fields(value) if about.compare}
     default = type(value)()
-    names = [about.name for about in fields(value) if about.compare]
-    values = {name: getattr(value, name) for name in names}
     return {k: _plain(v) for k, v in values.items() if v != getattr(default, k)}
 
 
-def _leaves(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each key of nested dicts, like `label.column`, with its values."""
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _leaves(item, f"{name}.{key}" if name else key)
-    elif isinstance(value, list):
-        for item in value:
-            yield from _leaves(item, name)
-    else:
-        yield name, value
-
-
-def split_key(name: str) -> list[str]:
-    """Return the parts of a key: `rows.Status of A.1.keep` -> rows, Status of A.1, keep.
-
-    The column of a channel, or of rows, may have dots in its name.
-    """
-    section, _, rest = name.partition(".")
-    column, _, last = rest.rpartition(".")
-    if section in ("rows", "channels") and column and last in KEYS[section]:
-        return [section, column, last]
-    return [section, rest] if rest else [section]
+def _open_keys(values: Stated, prefix: str = "") -> Iterator[str]:
+    """Yield each key of nested dicts, like `label.column`, that is `?` or has it in its list."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _open_keys(value, f"{prefix}{name}.")
+        elif value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
+            yield prefix + name
 
 
 def _toml_key(name: str) -> str:
     """Return a key as TOML writes it, in quotes if it needs them."""
-    plain = name.isascii() and name.replace("_", "").replace("-", "").isalnum()
-    return name if plain else _toml_value(name)
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml_value(name)
 
 
 def _toml_value(value: Any) -> str:
-    """Return a value as TOML writes it."""
+    """Return a value as TOML writes it; a list of one, or a table of a unit alone, like that."""
+    if isinstance(value, Mapping) and {*value} == {"unit"}:
+        return _toml_value(value["unit"])
     if isinstance(value, Mapping):
         pairs = (f"{_toml_key(name)} = {_toml_value(item)}" for name, item in value.items())
         return f"{{ {', '.join(pairs)} }}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_toml_value, value))}]"
-    if isinstance(value, float):
-        return repr(value)
-    # JSON's texts and booleans are TOML's, but for DEL, which TOML wants escaped.
+    if isinstance(value, list) and len(value) == 1:
+        return _toml_value(value[0])
+    # JSON's texts, lists and booleans are TOML's, but for DEL, which TOML wants escaped.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -10,19 +10,17 @@ other ids. `export.cell_journal` imports the journals of exported cells by `impo
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..engine.decide import as_part, verify_decision
 from ..engine.engine import DataEngine
 from ..engine.settings import agreed_trace_spec
-from ..errors import StoreError, TraceError
+from ..errors import StoreError, TraceError, expect
 from ..folds import content_hash, trace_hash
 from ..recipe import Recipe
 from ..records import (
@@ -30,6 +28,7 @@ from ..records import (
     Action,
     Decision,
     Reason,
+    TraceArray,
     TraceSpec,
     as_success,
     source_of,
@@ -39,6 +38,7 @@ from ..store.opening import LONG_WAIT, opening
 from ..store.records import NewLabel, StoredDecision
 from ..traces import TraceGate, as_traces
 from . import Dataset, load_dataset
+from .dataset import Progress
 from .description import Description
 from .loading import description_of, own_reader
 
@@ -58,19 +58,15 @@ def in_form_of(store: "StoreLike", description: Description) -> Description:
     """
     try:
         with opening(store, must_exist=True) as opened:
-            trace_spec = stored_trace_spec(opened.settings())
-            if opened is not store:
-                opened.close()
+            spec = stored_trace_spec(opened.settings())
     except StoreError:
-        return (
-            description  # a new store; any other error comes again when it is opened to be written
-        )
-    if trace_spec is None:
+        return description  # a new store; another error comes again when it is opened to be written
+    if opened is not store:
+        opened.close()
+    if spec is None:
         return description
-    stated: dict[str, Any] = {"traces.samples": trace_spec.samples}
-    if trace_spec.fit != "strict":
-        stated["traces.lengths"] = trace_spec.fit
-    return description.with_values(stated)
+    lengths = {} if spec.fit == "strict" else {"traces.lengths": spec.fit}
+    return description.with_values({"traces.samples": spec.samples, **lengths})
 
 
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
@@ -80,20 +76,20 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     are known. Recordings that were brought to one length must have the store's length, and be
     resampled if and only if the store's traces are.
     """
-    data_spec = data.spec
-    is_other_fit = data_spec.fit != trace_spec.fit and "resample" in (data_spec.fit, trace_spec.fit)
-    if data.lengths is not None and (is_other_fit or data_spec.samples != trace_spec.samples):
-        wanted = f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}"
-        actual = f"{data.name} was to {data_spec.samples} by {data_spec.fit}"
-        do = f"load it with samples={trace_spec.samples}, fit={trace_spec.fit!r}"
-        raise TraceError(f"Expected {wanted}, {actual}; {do}, or what is known would count again.")
-    rate = trace_spec.rate_hz or data.rate_hz
-    if rate and data.rate_hz and not math.isclose(rate, data.rate_hz, rel_tol=RATE_TOLERANCE):
-        actual = f"{data.name} has {data.rate_hz:g} Hz"
-        raise TraceError(f"Expected traces at {rate:g} Hz, {actual}; resample it.")
-    if data.channels and trace_spec.columns and data.channels != trace_spec.columns:
-        wanted = ", ".join(trace_spec.columns)
-        raise TraceError(f"Expected the channels {wanted}, got {', '.join(data.channels)}.")
+    spec = data.spec
+    fits = {spec.fit, trace_spec.fit}
+    is_same_fit = len(fits) == 1 or "resample" not in fits
+    is_fitted = is_same_fit and spec.samples == trace_spec.samples
+    wanted = f"recordings brought to {trace_spec.samples} samples by {trace_spec.fit}"
+    do = "state these in [traces], or what is known would count again"
+    is_fitted = is_fitted or data.lengths is None
+    expect(is_fitted, wanted, (spec.samples, spec.fit), do, TraceError)
+    rates = (trace_spec.rate_hz, spec.rate_hz)
+    is_rate = None in rates or math.isclose(*rates, rel_tol=RATE_TOLERANCE)  # type: ignore[arg-type]
+    expect(is_rate, f"traces at {rates[0]} Hz", rates[1], "resample them", TraceError)
+    names = trace_spec.columns
+    is_same = spec.columns == names or not (spec.columns and names)
+    expect(is_same, f"the channels {', '.join(names)}", spec.columns, "", TraceError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +128,7 @@ def import_labelled(
     dataset: Any,
     recipe: Recipe | str | None = None,
     seed: int | None = None,
-    on_traces: Callable[[int], None] | None = None,
+    on_traces: Progress | None = None,
     allow_import: bool = False,
 ) -> ImportReport:
     """Put every labelled trace of a data set into a store, in order; nothing is trained.
@@ -165,7 +161,7 @@ def import_labelled(
     """
     description = None
     if own_reader(dataset) is None:
-        description = in_form_of(store, description_of(dataset, None))
+        description = in_form_of(store, description_of(dataset))
     data = load_dataset(dataset, description)
     with opening(store, wait=LONG_WAIT) as opened:
         agreed = agreed_trace_spec(opened, data.spec)
@@ -187,10 +183,10 @@ def import_labelled(
 
 def import_parts(
     store: "SqlStore",
-    parts: Sequence[tuple[Decision, NDArray[np.float32], bool | None]],
+    parts: Sequence[tuple[Decision, TraceArray, bool | None]],
     trace_spec: TraceSpec,
     policy: Policy,
-    on_traces: Callable[[int], None] | None = None,
+    on_traces: Progress | None = None,
 ) -> ImportReport:
     """Put parts with their decisions into a store, in chunks that are stored all or none.
 
@@ -218,55 +214,39 @@ def import_parts(
         It counts labels; `resumed` is True.
     """
     gate = TraceGate(trace_spec)
-    counts = Counter[str]()
+    counts: dict[str, Any] = dict.fromkeys(
+        ("imported", "quarantined", "repeated", "contradicted"), 0
+    )
     counts_silence = policy.stops == "some"
     n_silent = _count_silent(store, policy)
     for start in range(0, len(parts), CHUNK):
+        chunk = parts[start : start + CHUNK]
         new: dict[str, StoredDecision] = {}
         labels: list[NewLabel] = []
-        for decision, trace, label in parts[start : start + CHUNK]:
-            fault, hash_of_content = gate(torch.from_numpy(trace))
+        for decision, trace, label in chunk:
             earlier = new.get(decision.id) or store.get_decision(decision.id)
             if earlier is not None and earlier.source is not None:  # a forgotten one has a label
-                counts[_repeat_of(label, earlier)] += 1
+                outcome = "repeated" if label == earlier.success else "contradicted"
+                counts[outcome] += label is not None
                 continue
             stored = earlier
             if stored is None:
-                stored = _as_stored(decision, trace, fault, hash_of_content, policy, store.clock())
+                stored = _as_stored(decision, trace, gate, policy, store.clock())
                 new[decision.id] = stored
             if counts_silence and decision.action is Action.ACCEPT:
                 # A decision that was stored without a label was counted as silent.
                 n_silent += (label is None) - (earlier is not None)
-            if label is None:
-                continue
-            silent = 0
-            if not fault:
-                silent = n_silent
-                n_silent = 0
-            labels.append(
-                NewLabel(
-                    decision.id,
-                    label,
-                    source_of(decision.action, decision.audit, label),
-                    model_version=0,
-                    point=None,
-                    silent=silent,
-                    time=store.clock(),
-                    content_hash=stored.content_hash,
-                    decided=stored.time,
-                )
-            )
-            counts["quarantined" if fault else "imported"] += 1
+            if label is not None:
+                silent = n_silent * (not stored.quarantined)
+                n_silent -= silent
+                source = source_of(decision.action, decision.audit, label)
+                about = (store.clock(), stored.content_hash, stored.time)
+                labels.append(NewLabel(decision.id, label, source, 0, None, silent, *about))
+                counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels])
         if on_traces is not None:
-            on_traces(min(CHUNK, len(parts) - start))
-    return ImportReport(
-        counts["imported"],
-        counts["quarantined"],
-        counts["repeated"],
-        resumed=True,
-        contradicted=counts["contradicted"],
-    )
+            on_traces(len(chunk))
+    return ImportReport(**counts, resumed=True)
 
 
 def _count_silent(store: "SqlStore", policy: Policy) -> int:
@@ -280,43 +260,26 @@ def _count_silent(store: "SqlStore", policy: Policy) -> int:
     return len(store.unreported_accepts(since)) - store.silent_total(since)
 
 
-def _repeat_of(label: bool | None, earlier: StoredDecision) -> str:
-    """Return what the label of a part that has one in the store counts as; "" without a label."""
-    if label is None:
-        return ""
-    return "repeated" if label == earlier.success else "contradicted"
-
-
 def _as_stored(
-    decision: Decision,
-    trace: NDArray[np.float32],
-    fault: int,
-    hash_of_content: int,
-    policy: Policy,
-    time: float,
+    decision: Decision, trace: TraceArray, gate: TraceGate, policy: Policy, time: float
 ) -> StoredDecision:
-    """Return the record of a decision; a trace with a fault never trains, and is its reason.
-
-    fault : position in `REASONS`, 0 for none.
-    """
+    """Return the record of a decision; a trace with a fault never trains, and is its reason."""
+    fault, content = gate(torch.from_numpy(trace))
     is_certain = decision.predicted is not Action.VERIFY
     propensity = policy.audited_share if is_certain else 1.0
     reason = REASONS[fault] if fault else decision.reason
     made = replace(decision, reason=reason, propensity=propensity)
-    part_hash = trace_hash(hash_of_content, decision.part)
-    return StoredDecision(made, trace.copy(), part_hash, bool(fault), time)
+    return StoredDecision(made, trace.copy(), trace_hash(content, made.part), bool(fault), time)
 
 
-def _verifying_decisions(traces: NDArray[np.float32], data: Dataset) -> Iterator[Decision]:
+def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:
     """Yield for each trace, of shape (n, C, T), the decision to verify it without a model.
 
     Its id is made of the trace's content; equal traces of one data set have different ids.
     """
     n_equal = Counter[int]()
-    parts: list[str | None] = [None] * len(data)
-    if data.part is not None:
-        parts = [as_part(part) for part in data.part.tolist()]
+    parts = [None] * len(data) if data.part is None else data.part.tolist()
     for hash_, part in zip(content_hash(traces).tolist(), parts, strict=True):
         decision_id = f"import-{hash_ & (2**64 - 1):016x}-{n_equal[hash_]}"
-        yield verify_decision(decision_id, part, 0, Reason.NO_MODEL)
+        yield verify_decision(decision_id, as_part(part), 0, Reason.NO_MODEL)
         n_equal[hash_] += 1

@@ -12,26 +12,26 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from ..files import is_database, read_archive, read_errors
+from ..files import FilePath, is_database, read_archive, read_errors
 from ..records import stored_trace_spec
-from .dataset import OWN, Dataset, expect_data, make_dataset
+from .dataset import OWN, Dataset, Progress, expect_data, make_dataset
 from .describe import describe
-from .description import FOLDER_FILE, Description
+from .description import FOLDER_FILE, Description, Stated
 from .read.files import find_files
 from .read.recordings import read_recordings
 
 BUNDLED = {"insertion": "insertion.npz"}
-# Arrays of an archive of ours, beside X and y.
-ABOUT = ("scale", "rate_hz", "unit", "cause", "channels", "part")
+OWN_ARRAYS = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels", "part")
+PATH = (str, os.PathLike)
 
 
 def load_dataset(
     source: Any = "insertion",
-    description: Description | Mapping[str, Any] | str | os.PathLike[str] | None = None,
+    description: Description | Stated | FilePath | None = None,
     *,
     channels: str | Sequence[str] | None = None,
     samples: int | None = None,
-    progress: Callable[[int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Dataset:
     """Read a data set: what is ours as it is, and recordings exactly by a description.
 
@@ -76,36 +76,48 @@ def load_dataset(
         traces = about.traces
         if samples and (samples > traces.samples or traces.lengths == "resample"):
             about = replace(about, traces=replace(traces, samples=samples))
-        place = Path(source) if isinstance(source, str | os.PathLike) else source
+        place = Path(source) if isinstance(source, PATH) else source
         data = read_recordings(place, about, progress)
     return data.cut(samples) if samples else data
 
 
-def saved_description(source: str | os.PathLike[str]) -> Path:
+def saved_description(source: FilePath) -> Path:
     """Return the path at which the description of a folder or a file is saved."""
     path = Path(source)
     return path / FOLDER_FILE if path.is_dir() else path.with_name(f"{path.name}.toml")
 
 
-def description_of(source: Any, description: Any) -> Description:
-    """Return the description that is stated, or saved; raise DataError without one."""
+def description_of(
+    source: Any, description: Any = None, stated: Stated | None = None, propose: bool = False
+) -> Description:
+    """Return a description of recordings.
+
+    Parameters
+    ----------
+    source : path or DataFrame
+    description : Description, mapping or path, optional
+        None: the one that was saved.
+    stated : mapping, optional
+        Keys of a file that have other values, like `label.column`.
+    propose : bool
+        Whether one is proposed if none was saved; else that is a DataError.
+    """
     if isinstance(description, Description):
         return description
     if isinstance(description, Mapping):
         return Description.from_dict(description)
-    if description is not None:
-        return Description.load(description)
-    if not isinstance(source, str | os.PathLike):
+    if description is None:
         do = "pass the one that describe(table) proposes"
-        raise DataError(f"Expected a description of the {type(source).__name__}; {do}.")
-    path = Path(source)
-    if not path.exists():
+        expect_data(isinstance(source, PATH), "a description of the table", None, do)
         wanted = f"a data set among {', '.join(BUNDLED)}, a file or a folder"
-        raise DataError(f"Expected {wanted}, got {source}, which does not exist.")
-    saved = saved_description(path)
-    if saved.is_file():
-        return Description.load(saved)
-    raise DataError(missing_text(path, describe(path)))
+        expect_data(Path(source).exists(), wanted, str(source), "it does not exist")
+        description = saved_description(source)
+        if not description.is_file():
+            proposal = describe(source, stated)
+            if not propose:
+                raise DataError(missing_text(Path(source), proposal))
+            return proposal
+    return Description.load(description).with_values(stated or {})
 
 
 def count_files(source: str, description: Description | None) -> int:
@@ -116,9 +128,9 @@ def count_files(source: str, description: Description | None) -> int:
 
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the message for recordings without a description: what is open, and what to type."""
-    open_keys = proposal.open_keys
-    questions = "".join(f"\n  {key}: {proposal.notes.get(key, '')}" for key in open_keys)
-    state = "".join(f" --set {key}=..." for key in open_keys)
+    notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
+    questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())
+    state = "".join(f" --set {key}=..." for key in notes)
     return (
         f"Expected the description {saved_description(path)}, found none. Look at the proposal "
         f"with `dengine data {path}`, and write it with `dengine data {path} --save{state}`."
@@ -136,18 +148,16 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
     if isinstance(source, tuple) and len(source) == 2:
         return lambda: make_dataset(*source)
     if hasattr(source, "columns"):
-        return partial(_from_own_frame, source, "table") if OWN in source.attrs else None
-    if not isinstance(source, str | os.PathLike):
-        wanted = "a name, a path, a Dataset, a DataFrame or a pair (X, y)"
-        raise DataError(f"Expected {wanted}, got {type(source).__name__}.")
-    if str(source) in BUNDLED:
-        bundled = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
-        return partial(_read_npz, bundled, str(source))
+        return partial(_from_own_frame, source) if OWN in source.attrs else None
+    wanted = "a name, a path, a Dataset, a DataFrame or a pair (X, y)"
+    expect_data(isinstance(source, PATH), wanted, source)
     path = Path(source)
+    if str(source) in BUNDLED:
+        path = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
     if path.is_file() and not saved_description(path).is_file():
         for is_own, read in OWN_FILES:
             if is_own(path):
-                return partial(read, path, path.stem)
+                return partial(read, path)
     return None
 
 
@@ -156,7 +166,7 @@ def _is_own_archive(path: Path) -> bool:
     if path.suffix.lower() != ".npz":
         return False
     arrays, names = read_archive(path, ("y",))
-    labels = arrays.get("y", np.array(["none"]))
+    labels = arrays.get("y", np.array("none"))
     return "X" in names and labels.dtype.kind in "iufb" and bool(np.isin(labels, (0, 1)).all())
 
 
@@ -171,43 +181,55 @@ def _is_own_table(path: Path) -> bool:
         return OWN in json.loads(metadata.get(b"PANDAS_ATTRS", b"{}"))
 
 
-def _read_own_table(path: Path, name: str) -> Dataset:
+def _read_own_table(path: Path) -> Dataset:
     """Return the data set of a Parquet file of ours."""
     import pandas as pd
 
-    return _from_own_frame(pd.read_parquet(path), name)
+    return _from_own_frame(pd.read_parquet(path), path.stem)
 
 
-def _from_own_frame(frame: Any, name: str) -> Dataset:
+def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     """Return the data set of a table that `Dataset.to_frame` made."""
-    about = dict(frame.attrs[OWN])
-    columns = [column for column in frame.columns if column not in ("label", "part", "cause")]
-    n_channels = about.pop("n_channels")
-    X = frame[columns].to_numpy(np.float32)
-    X = X.reshape(len(X), n_channels, -1) if n_channels > 1 else X
-    about |= {key: frame[key].to_numpy(str) for key in ("part", "cause") if key in frame}
-    about["channels"] = tuple(about["channels"])
-    return make_dataset(X, frame["label"].to_numpy(), name=name, **about)
+    about = frame.attrs[OWN]
+    words = frame[frame.columns.intersection(["part", "cause"])].astype(str)
+    X = frame.drop(columns=["label", *words]).to_numpy(np.float32)
+    arrays = {**about, "X": X.reshape(len(X), about["n_channels"], -1), "y": frame["label"]}
+    return _from_arrays(arrays | {key: words[key].to_numpy(np.str_) for key in words}, name)
 
 
-def _read_npz(path: Path, name: str) -> Dataset:
+def _read_npz(path: Path) -> Dataset:
     """Return the data set of an archive with X and labels y of 1 and 0.
 
     X is multiplied by the number `scale` if there is one.
     """
-    arrays, _ = read_archive(path, ("X", "y", *ABOUT))
-    X = arrays["X"]
+    arrays, _ = read_archive(path, OWN_ARRAYS)
     with read_errors(path, "an .npz file of plain arrays"):
         if "scale" in arrays:
-            X = X.astype(np.float32) * arrays["scale"].astype(np.float32)
-        about: dict[str, Any] = {key: arrays.get(key) for key in ("cause", "part")}
-        about["rate_hz"] = float(arrays["rate_hz"]) if "rate_hz" in arrays else None
-        about["unit"] = ", ".join(map(str, np.atleast_1d(arrays.get("unit", "")).tolist()))
-        about["channels"] = tuple(map(str, arrays.get("channels", ())))
-        return make_dataset(X, arrays["y"], name=name, **about)
+            arrays["X"] = arrays["X"].astype(np.float32) * arrays["scale"].astype(np.float32)
+        return _from_arrays(arrays, path.stem)
 
 
-def _read_store(path: Path, name: str) -> Dataset:
+def _from_arrays(arrays: Stated, name: str) -> Dataset:
+    """Return the data set of arrays with the names of a `Dataset`."""
+    units, channels = (
+        tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")
+    )
+    rate_hz = arrays.get("rate_hz")
+    return make_dataset(
+        arrays["X"],
+        arrays["y"],
+        name=name,
+        rate_hz=rate_hz and float(rate_hz),
+        unit=", ".join(units),
+        channels=channels,
+        limit=arrays.get("limit"),
+        fit=arrays.get("fit", "strict"),
+        cause=arrays.get("cause"),
+        part=arrays.get("part"),
+    )
+
+
+def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
     Quarantined and forgotten ones are left out. Raises DataError if the store contradicts its
@@ -216,32 +238,31 @@ def _read_store(path: Path, name: str) -> Dataset:
     from ..store.opening import opening
 
     with opening(path, must_exist=True) as store:
-        if integrity_error := store.database.check_integrity(0, since=0):
-            wanted = f"{path} as its ledger has it"
-            do = "see `dengine verify`, and restore a copy"
-            raise DataError(f"Expected {wanted}, {integrity_error}; {do}.")
+        difference = store.database.check_integrity(0, since=0)
+        do = "see `dengine verify`, and restore a copy"
+        expect_data(not difference, f"{path} as its ledger has it", difference, do)
         labelled = store.labelled()
         spec = stored_trace_spec(store.settings())
     store.close()
     if spec is None or not len(labelled.labels):
         do = "record some first, as in shadow mode"
         raise DataError(f"Expected a store with labelled traces, {path} has none; {do}.")
-    has_repeats = len(np.unique(labelled.hashes)) < len(labelled.hashes)
+    hashes = labelled.hashes
     return make_dataset(
-        labelled.traces[:, 0] if spec.channels == 1 else labelled.traces,
+        labelled.traces,
         labelled.labels,
         # As the store counts: a part that came again has one vote.
-        part=labelled.hashes.astype(np.str_) if has_repeats else None,
-        name=name,
+        part=hashes if len({*hashes.tolist()}) < len(hashes) else None,
+        name=path.stem,
         rate_hz=spec.rate_hz,
         unit=spec.unit if isinstance(spec.unit, str) else ", ".join(spec.unit or ()),
-        channels=tuple(spec.columns),
+        channels=spec.columns,
         limit=spec.limit,
         fit=spec.fit,
     )
 
 
-OWN_FILES: tuple[tuple[Callable[[Path], bool], Callable[[Path, str], Dataset]], ...] = (
+OWN_FILES = (
     (is_database, _read_store),
     (_is_own_archive, _read_npz),
     (_is_own_table, _read_own_table),

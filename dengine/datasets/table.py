@@ -20,7 +20,7 @@ Cells = NDArray[Any]
 Floats = NDArray[np.float64]
 LARGEST = 3.4028235e38  # of a sample, which is a float32
 # A minus sign that typographers use, which Excel writes in some languages.
-MINUS = str.maketrans({"−": "-"})
+MINUS = "−"
 
 
 class UnreadableError(DataError):
@@ -103,12 +103,10 @@ class Table:
         missing one.
         """
         cells = self.column(name)
-        if cells.dtype.kind in "iuf":
-            values = cells.astype(np.float64)
-        elif (plain := _plain_numbers(cells.tolist(), form)) is not None:
-            return plain
-        else:
-            values = np.array([_number(cell, form) for cell in cells.tolist()], dtype=np.float64)
+        if cells.dtype.kind not in "iuf":
+            pattern = _pattern(form)
+            cells = np.array([_number(cell, form, pattern) for cell in cells.tolist()])
+        values = cells.astype(np.float64)
         groups = f" and groups by {form.thousands!r}" if form.thousands else ""
         wanted = f"a number with the decimal mark {form.decimal}{groups}"
         self.refuse(np.abs(values) > LARGEST, wanted, name)
@@ -132,13 +130,12 @@ class Table:
 
         Raises UnreadableError if it changes although it must be the same.
         """
-        cells = self.column(name)
-        if not len(cells):
+        words = self.words(name)
+        if not len(words):
             raise UnreadableError(f"Expected a word in column {name}, got no rows", column=name)
-        if at == "same" and (cells != cells[0]).any():
-            words = self.words(name)
+        if at == "same":
             self.refuse(words != words[0], f"one word in all rows, {words[0]!r}", name)
-        return as_word(cells[-1 if at == "last" else 0])
+        return str(words[-1 if at == "last" else 0])
 
 
 @dataclass(slots=True)
@@ -186,32 +183,16 @@ def as_word(cell: Any) -> str:
 def _pattern(form: TextForm) -> re.Pattern[str]:
     """Return the pattern of a number with the marks of a form."""
     mark, decimal = re.escape(form.thousands), re.escape(form.decimal)
-    groups = rf"|\d{{1,3}}(?:{mark}\d{{3}})+" if mark else ""
-    digits = rf"(?:(?:\d+{groups})(?:{decimal}\d*)?|{decimal}\d+)"
-    return re.compile(rf"[-+−]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)
+    groups = rf"\d{{1,3}}(?:{mark}\d{{3}})+|" if mark else ""
+    digits = rf"(?:(?:{groups}\d+)(?:{decimal}\d*)?|{decimal}\d+)"
+    return re.compile(rf"[-+{MINUS}]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)
 
 
-def _plain_numbers(cells: list[Any], form: TextForm) -> Floats | None:
-    """Return cells as numbers if all are plain texts, without groups; None if one may not be."""
-    if form.thousands or not all(isinstance(cell, str) for cell in cells):
-        return None
-    text = "\n".join(cells)
-    if not text.isascii() or "_" in text or (form.decimal != "." and "." in text):
-        return None
-    try:
-        values = np.array(text.replace(form.decimal, ".").split("\n"), dtype=np.float64)
-    except ValueError:
-        return None
-    return values if len(values) == len(cells) and np.isfinite(values).all() else None
-
-
-def _number(cell: Any, form: TextForm) -> float:
+def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
     """Return the number in a cell, NaN for a word that stands for a lost one, inf for others."""
-    if isinstance(cell, int | float) and not isinstance(cell, bool):
-        return np.inf if abs(cell) > LARGEST else float(cell)
+    if isinstance(cell, float):
+        return cell
     text = "null" if cell is None else str(cell).strip()
-    if not _pattern(form).fullmatch(text):
+    if not pattern.fullmatch(text):
         return np.nan if text in form.missing else np.inf
-    if form.thousands:
-        text = text.replace(form.thousands, "")
-    return float(text.replace(form.decimal, ".").translate(MINUS))
+    return float(text.replace(form.thousands, "").replace(form.decimal, ".").replace(MINUS, "-"))

@@ -7,8 +7,8 @@ engine finds: nothing is filled in.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,61 +17,7 @@ from numpy.typing import NDArray
 from ..errors import SettingError, shortened
 
 Signals = Mapping[str, NDArray[np.float64]]  # (n,) each
-Active = NDArray[np.bool_]
 MAX_STEP = 1.5  # steps from one sample to the next if none is missing
-POSITIVE = r"(?=.*[1-9])\d+(\.\d+)?"
-BITS = "actual_digital_output_bits"
-REGISTER = "output_int_register_25"
-
-
-class TriggerKind(NamedTuple):
-    """A kind of trigger.
-
-    pattern : str
-        Regular expression of its number in a text.
-    number, signal, quiet_s
-        Those of a trigger whose text does not state them; see `Trigger`.
-    is_active : callable
-        Returns whether it is on, shape (n,), of the values of its signals (k, n), and its number.
-    """
-
-    pattern: str
-    number: float | None
-    signal: str
-    quiet_s: float
-    is_active: Callable[[Any, Any], Any]
-
-
-def _is_bit_set(values: Any, bit: float) -> Any:
-    """Return whether a bit of the first signal is set."""
-    return values[0].astype(np.int64) >> int(bit) & 1 != 0
-
-
-def _has_value(values: Any, number: float | None) -> Any:
-    """Return whether the first signal has a value, or any but zero for None."""
-    return values[0] != 0 if number is None else values[0] == number
-
-
-def _has_contact(values: Any, newtons: float) -> Any:
-    """Return whether the force of the first signal is large enough, in either direction."""
-    return np.abs(values[0]) >= newtons
-
-
-def _is_moving(values: Any, speed: float) -> Any:
-    """Return whether the vector of all signals is longer than a speed."""
-    return np.linalg.norm(values, axis=0) > speed
-
-
-KINDS = {
-    "bit": TriggerKind(r"[012]?\d|3[01]", None, BITS, 0.0, _is_bit_set),
-    "register": TriggerKind(r"(-?\d+)?", None, REGISTER, 0.0, _has_value),
-    "contact": TriggerKind(POSITIVE, None, "FZ_Base", 0.2, _has_contact),
-    "motion": TriggerKind(f"({POSITIVE})?", 0.002, "actual_TCP_speed", 0.1, _is_moving),
-}
-EXAMPLES = (
-    "bit=0, register@output_int_register_25, register=1@/phase, contact=5, contact=5@FZ_Base,"
-    " motion=0.002"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,18 +47,48 @@ class Trigger:
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of the signals that are read: three for a vector, else one."""
-        if self.kind == "motion":
-            return tuple(f"{self.signal}[{i}]" for i in range(3))
-        return (self.signal,)
+        vector = (f"{self.signal}[0]", f"{self.signal}[1]", f"{self.signal}[2]")
+        return vector if self.kind == "motion" else (self.signal,)
 
-    def active(self, signals: Signals) -> Active:
+    def active(self, signals: Signals) -> NDArray[np.bool_]:
         """Return whether the condition is met at each of n samples; not where a signal is NaN.
 
         signals : arrays of shape (n,) by the names of the signals.
         """
         values = np.stack([signals[name] for name in self.signals])
-        active = KINDS[self.kind].is_active(np.nan_to_num(values), self.number)
+        active = KINDS[self.kind][2](np.nan_to_num(values), self.number)
         return np.asarray(active & ~np.isnan(values).any(axis=0))
+
+
+POSITIVE = r"(?=.*[1-9])\d+(\.\d+)?"
+# Each kind of trigger: the pattern of its number in a text; what holds for a text that does not
+# state it; and whether it is on, shape (n,), by the values of its signals (k, n) and its number.
+KINDS: dict[str, tuple[str, Trigger, Any]] = {
+    "bit": (
+        r"[012]?\d|3[01]",
+        Trigger("bit", None, "actual_digital_output_bits", 0.0),
+        lambda values, bit: values[0].astype(np.int64) >> int(bit) & 1 != 0,
+    ),
+    "register": (
+        r"(-?\d+)?",
+        Trigger("register", None, "output_int_register_25", 0.0),
+        lambda values, number: values[0] != 0 if number is None else values[0] == number,
+    ),
+    "contact": (
+        POSITIVE,
+        Trigger("contact", None, "FZ_Base", 0.2),
+        lambda values, newtons: np.abs(values[0]) >= newtons,
+    ),
+    "motion": (
+        f"({POSITIVE})?",
+        Trigger("motion", 0.002, "actual_TCP_speed", 0.1),
+        lambda values, speed: np.linalg.norm(values, axis=0) > speed,
+    ),
+}
+EXAMPLES = (
+    "bit=0, register@output_int_register_25, register=1@/phase, contact=5, contact=5@FZ_Base,"
+    " motion=0.002"
+)
 
 
 def as_trigger(value: Any) -> Trigger:
@@ -124,13 +100,13 @@ def as_trigger(value: Any) -> Trigger:
     if isinstance(value, Trigger):
         return value
     form = r"(\w+)(?:=([^@]*))?(?:@(.+))?"
-    match = re.fullmatch(form, value.strip()) if isinstance(value, str) else None
+    match = re.fullmatch(form, str(value).strip())
     kind, number, signal = match.groups(default="") if match else ("", "", "")
-    if kind not in KINDS or not re.fullmatch(KINDS[kind].pattern, number):
+    if kind not in KINDS or not re.fullmatch(KINDS[kind][0], number):
         raise SettingError(f"Expected a trigger, as {EXAMPLES}; got {shortened(value)}.")
-    default = KINDS[kind]
+    default = KINDS[kind][1]
     stated = float(number) if number else default.number
-    return Trigger(kind, stated, signal or default.signal, default.quiet_s)
+    return replace(default, number=stated, signal=signal or default.signal)
 
 
 class Placed(NamedTuple):
@@ -227,7 +203,7 @@ def place(
         Samples before or behind the trace are left out; of several at one place the first stays.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
-    at = np.rint((np.asarray(times, dtype=np.float64) - start) / step).astype(np.int64)
+    at = np.rint((np.asarray(times) - start) / step).astype(np.int64)
     inside = (at >= 0) & (at < samples)
     places, first = np.unique(at[inside], return_index=True)
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which the engine finds

@@ -10,7 +10,7 @@ from importlib.resources import files
 from ..errors import DataError
 
 TABLE = tomllib.loads((files("dengine") / "data" / "units.toml").read_text("utf-8"))
-PREFIXES: dict[str, float] = TABLE.pop("prefixes")
+PREFIXES = TABLE.pop("prefixes")
 PREFIXED = TABLE.pop("prefixed")["units"]
 OTHERS = TABLE.pop("others")["units"]
 # Each unit, with a prefix or without, with its quantity and the factor to that quantity's first.
@@ -47,10 +47,10 @@ def conversion(unit: str, wanted: str) -> float:
     Raises DataError if they are of different quantities, or one is unknown.
     """
     unit, wanted = bare(unit), bare(wanted)
-    if unit == wanted or not unit or not wanted:
+    if not unit or not wanted:
         return 1.0
-    quantity, factor = UNITS.get(unit, (unit, 1.0))
-    other, wanted_factor = UNITS.get(wanted, (wanted, 1.0))
+    quantity, factor = UNITS.get(unit, (f"unknown {unit}", 1.0))
+    other, wanted_factor = UNITS.get(wanted, (f"unknown {wanted}", 1.0))
     if quantity != other:
         raise DataError(f"Expected the unit {wanted}, or one that converts to it, got {unit}")
     return factor / wanted_factor

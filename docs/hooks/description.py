@@ -1,14 +1,17 @@
-"""Writes the reference page of descriptions from the fields of `Description` themselves."""
+"""Writes the reference page of descriptions from the fields of `Description` and its docstrings."""
 
 from __future__ import annotations
 
+import inspect
+import re
 from dataclasses import MISSING, fields
 from typing import Any
 
 from dengine.datasets.description import SECTIONS, Description
 
 MARK = "<!-- every key of a description -->"
-TITLES = {"rows": "rows.COLUMN", "check": "[check]"}
+TITLES = {"check": "[check]"}
+SENTENCES = re.compile(r"^(\w+)\n((?:    .+\n?)+)", re.MULTILINE)  # of each key in a docstring
 
 
 def on_page_markdown(markdown: str, **others: Any) -> str:
@@ -28,10 +31,12 @@ def keys() -> str:
 
 def table(section: type) -> str:
     """Return the keys of a section with their defaults and their sentences."""
+    doc = inspect.getdoc(section) or ""
+    sentences = {name: " ".join(text.split()) for name, text in SENTENCES.findall(doc)}
     rows = [
-        f"| `{f.name}` | {default(f.default)} | {f.metadata['doc']} |"
+        f"| `{f.name}` | {default(f.default)} | {sentences[f.name]} |"
         for f in fields(section)  # type: ignore[arg-type]
-        if "doc" in f.metadata
+        if f.compare and not (section is Description and f.name in SECTIONS)
     ]
     return "\n".join(["| key | default | what it says |", "| --- | --- | --- |", *rows])
 

@@ -8,6 +8,7 @@ import pytest
 
 from dengine import load_dataset
 from dengine.datasets import make_dataset
+from dengine.datasets.units import conversion
 from dengine.errors import DataError
 
 
@@ -82,3 +83,11 @@ def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(
     loaded = load_dataset(tmp_path / "data.parquet", channels=data.channels)
     for name in ("X", "y", "part"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(data, name))
+
+
+def test_a_unit_that_is_called_like_a_quantity_is_no_unit_of_it() -> None:
+    assert conversion("[kN]", "N") == 1000.0
+    assert conversion("kraft", "kraft") == 1.0
+    for unit, wanted in (("force", "N"), ("N", "length"), ("N", "mm")):
+        with pytest.raises(DataError, match=f"Expected the unit {wanted}"):
+            conversion(unit, wanted)

@@ -19,7 +19,6 @@ from hypothesis.extra.numpy import arrays
 
 from dengine import Dataset, Description, describe, load_dataset
 from dengine.datasets.description import (
-    KEYS,
     SECTIONS,
     Channel,
     Clock,
@@ -522,7 +521,7 @@ def test_one_sentence_says_what_to_type(tmp_path: Path) -> None:
         ("[time]\nrate_hz = nan", "a number in recordings.toml, time, rate_hz"),
         ("[text]\nheader = true", "a whole number"),
         ("text = 1", "text to be a table"),
-        ("check = 1", "tables in recordings.toml, check"),
+        ("check = 1", "check to be a table"),
         ("version = '?'", "version 1"),
     ],
 )
@@ -588,7 +587,7 @@ def test_a_stated_key_replaces_one_and_a_stated_source_the_others() -> None:
 
 def of_field(about: Any) -> Any:
     """Return what a key may be."""
-    default, choices = about.default, about.metadata["choices"]
+    default, choices = about.default, about.metadata.get("choices")
     if choices:
         return st.sampled_from(choices)
     if isinstance(default, tuple):
@@ -601,7 +600,7 @@ def of_field(about: Any) -> Any:
 
 def of_class(cls: Any) -> Any:
     """Return any instance of a section."""
-    names = {f.name: of_field(f) for f in fields(cls) if "doc" in f.metadata}
+    names = {f.name: of_field(f) for f in fields(cls)}
     return st.builds(cls, **names)
 
 
@@ -615,7 +614,8 @@ def of_section(name: str, cls: Any) -> Any:
     return named if name in ("rows", "ignored") else one
 
 
-KEYS_ = {f.name: of_field(f) for f in fields(Description) if f.name in KEYS[""]}
+NAMES = [f for f in fields(Description) if f.compare and f.name not in SECTIONS]
+KEYS_ = {f.name: of_field(f) for f in NAMES}
 
 
 SECTIONS_ = {name: of_section(name, cls) for name, cls in SECTIONS.items()}
