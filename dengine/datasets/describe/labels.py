@@ -5,28 +5,32 @@ the end of a name, a folder, a cell of a column, or a line, whose name is a verd
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
-from pathlib import Path
+from typing import Any
 
 from ...errors import DataError, listed
-from ..description import UNKNOWN, LabelSource, TextForm
-from ..read.places import SUFFIX, LabelReader, Place, listing_table, read_labels
-from ..table import UnreadableError
-from .cells import MOST_WORDS, Column, Notes, Values, counts_of
+from ..description import UNKNOWN, LabelSource, PartSource, Words
+from ..read.places import LabelReader, Place, listing_table, part_of, read_labels, without_suffix
+from ..table import Table, UnreadableError
+from .columns import MOST_WORDS, Column, Proposal, counts_of
 
-GOOD = (
-    *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
+GOOD_ALONE: Words = (
+    *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o"),
     *("accepted", "合格"),
 )
-BAD = (
+GOOD: Words = (
+    *GOOD_ALONE,
+    "io",
+)  # which is plain only beside `nio`: it also stands for input and output
+BAD: Words = (
     *("nok", "not ok", "not_ok", "not-ok", "fail", "failed", "bad", "failure", "schlecht", "false"),
     *("n.i.o.", "n.i.o", "n_i_o", "nio", "ng", "reject", "rejected", "不合格"),
 )
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
-YES, NO = ("1", "true", "yes", "ja"), ("0", "false", "no", "nein")
+YES: Words = ("1", "true", "yes", "ja")
+NO: Words = ("0", "false", "no", "nein")
 NAME = re.compile(
     r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
     r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)([^a-z]|$)"
@@ -47,8 +51,6 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
 )
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
-Words = Sequence[str]
-Sources = list[LabelSource]
 Places = Mapping[str, Place]
 
 
@@ -60,16 +62,13 @@ class Candidate:
     words: Mapping[str, str]
 
     @property
-    def kind(self) -> str:
-        """What kind of place it is."""
-        return next(kind for kind in KINDS if getattr(self.source, kind))
-
-    @property
     def labels(self) -> dict[str, int | None]:
         """The label of each recording whose word has a meaning that is known."""
-        reader = LabelReader(self.source)
-        meanings = {*self.source.good, *self.source.bad, *self.source.unchecked}
-        return {name: reader.meaning(w) for name, w in self.words.items() if w in meanings}
+        reader, labels = LabelReader(self.source), dict[str, int | None]()
+        for name, word in self.words.items():
+            with suppress(UnreadableError):
+                labels[name] = reader.meaning(word)
+        return labels
 
     @property
     def is_known(self) -> bool:
@@ -85,8 +84,8 @@ class Candidate:
 
     def disagreements(self, other: "Candidate") -> int:
         """Return for how many recordings that were checked another candidate has another label."""
-        pairs = [(label, other.labels.get(name)) for name, label in self.labels.items()]
-        return sum({*pair} == {0, 1} for pair in pairs)
+        labels = other.labels
+        return sum({label, labels.get(name)} == {0, 1} for name, label in self.labels.items())
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -97,149 +96,156 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     what the column's name says: good for `success`, bad for `failed`; of other names nothing.
     """
     words = sorted({*words})
-    good, bad = _verdicts(source.column or source.line, {word.lower() for word in words})
-    kinds = {"good": good, "bad": bad, "unchecked": UNCHECKED}
-    meanings = {
-        key: tuple(w for w in words if w.lower() in verdicts) for key, verdicts in kinds.items()
+    lower = {word.lower() for word in words}
+    name = source.column or source.line or source.topic
+    good, bad = GOOD if "nio" in lower else GOOD_ALONE, BAD
+    if name and lower <= {*YES, *NO, *UNCHECKED}:
+        is_good = GOOD_NAME.search(name) or (lower & {"true", "false"} and NAME.search(name))
+        good, bad = (YES, NO) if is_good else ((), ())
+        good, bad = (NO, YES) if BAD_NAME.search(name) else (good, bad)
+    meanings: dict[str, Any] = {
+        key: getattr(source, key) or tuple(word for word in words if word.lower() in verdicts)
+        for key, verdicts in (("good", good), ("bad", bad), ("unchecked", UNCHECKED))
     }
     is_one_sided = source.path and not (meanings["good"] and meanings["bad"])
-    if is_one_sided or len(words) > sum(map(len, meanings.values())):
+    if is_one_sided or {*words}.difference(*meanings.values()):
         meanings |= {key: meanings[key] or (UNKNOWN,) for key in ("good", "bad")}
-    stated: Values = {key: getattr(source, key) or meanings[key] for key in kinds}
-    return replace(source, **stated)
+    return replace(source, **meanings)
 
 
-def _verdicts(name: str, words: set[str]) -> tuple[Words, Words]:
-    """Return the words for good and for bad in a column or line of this name."""
-    if not name or not words <= {*YES, *NO, *UNCHECKED}:
-        return [word for word in GOOD if word != "io" or "nio" in words], BAD
-    if BAD_NAME.search(name):
-        return NO, YES
-    is_good = GOOD_NAME.search(name) or (words & {"true", "false"} and NAME.search(name))
-    return (YES, NO) if is_good else ((), ())
+def is_plain(source: LabelSource) -> bool:
+    """Return whether a source has words for good or bad, and the meaning of all is known."""
+    words = source.good + source.bad
+    return bool(words) and UNKNOWN not in words
 
 
-@dataclass(frozen=True, slots=True)
-class Labels:
-    """Finds the sources of labels of some recordings.
-
-    base : folder with the listings. places, parts : where each recording stands, and its part.
-    """
-
-    base: Path
-    places: Places
-    parts: Mapping[str, str]
-    form: TextForm
-
-    def candidate(self, source: LabelSource) -> Candidate:
-        """Return a source with the word of each recording that has one, and their meanings."""
-        words = dict[str, str]()
-        with suppress(DataError):
-            reader = read_labels(self.base, source, self.form)
-            for name, place in self.places.items():
-                with suppress(UnreadableError):
-                    words[name] = reader.words(place, self.parts.get(name, ""))[0]
-        return Candidate(with_meanings(source, words.values()), words)
-
-    def in_listings(self, names: Names) -> Sources:
-        """Return the columns of verdicts in files that list most recordings, with their key."""
-        sources: Sources = []
-        for name in names:
-            try:
-                table = listing_table(self.base / name, (), self.form)
-            except (DataError, ValueError):
-                continue
-            for key in table.columns:
-                plain = LabelSource(listing=name, key=key, column=key)
-                if len(self.candidate(plain).words) > len(self.places) / 2:
-                    verdicts = [c for c in table.columns if is_verdict(c, table.words(c))]
-                    sources += [replace(plain, column=c) for c in verdicts if c != key]
-                    break
-        return sources
-
-
-def in_paths(paths: Names) -> Sources:
+def in_paths(paths: Names) -> list[str]:
     """Return the expressions that find verdicts in most paths; none if a not stands before one."""
-    stems = [SUFFIX.sub("", path) for path in paths]
-    sources: Sources = []
+    stems = [*map(without_suffix, paths)]
+    patterns = []
     for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
         words = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
         if len(words) > len(stems) / 2:
             used = sorted({*words}, key=lambda text: (-len(text), text))
-            sources.append(LabelSource(path=pattern.replace(WORD, "|".join(map(re.escape, used)))))
-    return sources
+            patterns.append(pattern.replace(WORD, "|".join(map(re.escape, used))))
+    return patterns
 
 
 def is_verdict(name: str, words: Names) -> bool:
     """Return whether a column has the name of a verdict, and few words; a single one is plain."""
     words = {*words}
-    source = with_meanings(LabelSource(column=name), words)
-    is_label = len(words) > 1 or bool(source.good or source.bad)
     is_named = NAME.search(name) or BAD_NAME.search(name)
-    return is_named is not None and is_label and len(words) <= MOST_WORDS
+    is_label = len(words) > 1 or is_plain(with_meanings(LabelSource(column=name), words))
+    return bool(is_named) and is_label and len(words) <= MOST_WORDS
 
 
-def in_columns(columns: Iterable[Column]) -> Sources:
-    """Return the columns of verdicts.
+def row_of(column: Column) -> str:
+    """Return which row of a recording has the label in a column, `same` or `last`; "" for none.
 
-    A label that changes within a recording is that of its last row, if above it stand only words
-    for not checked.
+    It is the last if above it stand only words for not checked.
     """
-    sources: Sources = []
-    for column in columns:
-        last = [str(words[-1]) for words in column.words if len(words)]
-        above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
-        if above <= {*UNCHECKED} and is_verdict(column.name, last):
-            sources.append(LabelSource(column=column.name, at="same" if column.fixed else "last"))
-    return sources
+    last = [str(words[-1]) for words in column.words if len(words)]
+    above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
+    row = "same" if column.fixed else "last"
+    return row if above <= {*UNCHECKED} and is_verdict(column.name, last) else ""
 
 
-def line_keys(above: Sequence[str]) -> list[str]:
-    """Return the beginnings of lines above a header, before the first mark."""
-    return [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0].strip(" \"'") for line in above]
+def lines_of(p: Proposal, pattern: re.Pattern[str]) -> list[str]:
+    """Return the beginnings of lines above a header, before the first mark, that a pattern fits."""
+    lines = [line.lstrip("#%* \t\"'") for line in p.tables[0].above]
+    return [*filter(pattern.search, (re.split(r"[;:=\t,]", x)[0].strip(" \"'") for x in lines))]
 
 
-def in_lines(above: Sequence[str]) -> Sources:
-    """Return the beginnings of lines above a header that are the name of a verdict."""
-    return [LabelSource(line=key) for key in line_keys(above) if NAME.search(key)]
+def part_words(source: PartSource, places: Places) -> dict[str, str]:
+    """Return the number of the part of each recording that states one."""
+    words = dict[str, str]()
+    for name, place in places.items():
+        with suppress(DataError):
+            words[name] = part_of(source, place)
+    return words
 
 
-def choose(
-    candidates: Sequence[Candidate], notes: Notes, hints: Names, n: int
-) -> tuple[LabelSource, Sources]:
-    """Return the source of the labels, and those that must agree with it.
+@dataclass(frozen=True, slots=True)
+class Labels:
+    """The sources of labels of some recordings, and of the parts they are of."""
 
-    The first candidate whose words are known is the label if all such agree, and the others are
-    checks if they have a word for each recording. If two disagree, or there is none, the label is
-    `?`, and the note lists them all.
+    p: Proposal
+    places: Places
+    parts: Mapping[str, str]
 
-    hints : columns that may hold labels under other names. n : recordings that were looked at.
+    def candidate(self, source: LabelSource) -> Candidate:
+        """Return a source with the word of each recording that has one, and their meanings."""
+        words = dict[str, str]()
+        with suppress(DataError):
+            reader = read_labels(self.p.base, source, self.p.description.text)
+            for name, place in self.places.items():
+                with suppress(UnreadableError):
+                    words[name] = reader.words(place, self.parts.get(name, ""))[0]
+        return Candidate(with_meanings(source, words.values()), words)
+
+    def sources(self) -> Iterator[LabelSource]:
+        """Yield the sources that may hold labels: listings, paths, columns and lines."""
+        p, label = self.p, self.p.description.label
+        for name in p.others:
+            with suppress(DataError, ValueError):
+                table = listing_table(p.base / name, (), p.description.text)
+                plain = (replace(label, listing=name, key=k, column=k) for k in table.columns)
+                counts = {source.key: len(self.candidate(source).words) for source in plain}
+                key = max(counts, key=lambda name: counts[name])
+                verdicts = [c for c in table.columns if is_verdict(c, table.words(c)) and c != key]
+                if counts[key] > len(self.places) / 2:
+                    yield from (replace(label, listing=name, key=key, column=c) for c in verdicts)
+        if p.description.layout in ("files", "columns"):
+            for path in in_paths(place.path for place in self.places.values()):
+                yield replace(label, path=path)
+        for column in p.unused:
+            if row := row_of(column):
+                yield replace(label, column=column.name, at=row)
+        for line in lines_of(p, NAME):
+            yield replace(label, line=line)
+
+
+def propose_label(p: Proposal) -> None:
+    """Find the source of the labels, and those that must agree with it.
+
+    The first candidate whose words are known is the label if all such agree with it, and the others
+    are checks if they have a word for each recording. If one disagrees, or there is none, the label
+    is `?`, and the note lists them all.
     """
+    places = {name: Place(name, Table(name, {}, [])) for name in p.names} | {**p.places}
+    finder = Labels(p, places, part_words(p.description.part, places))
+    label = p.description.label
+    is_stated = any(getattr(label, kind) for kind in KINDS)
+    found = map(finder.candidate, [label] if is_stated else finder.sources())
+    candidates = [candidate for candidate in found if candidate.words or is_stated]
     certain = [candidate for candidate in candidates if candidate.is_known]
-    over = f"over {n:,} recordings"
-    if text := _disagreement(certain):
-        notes["label.column"] = f"{text} of {n:,} recordings: which is right?"
-        return LabelSource(column=UNKNOWN), []
-    if certain or len(candidates) == 1:
-        best, *others = certain or candidates
-        checks = [other for other in others if other.words.keys() >= best.words.keys()]
-        counts = counts_of(best.words.values())
-        kinds = {True: "agrees", False: "of unknown meaning"}
-        also = [f"{kinds[c in certain]}: {c.title}" for c in candidates if c is not best]
-        notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *also])
-        if UNKNOWN in best.source.good + best.source.bad:
-            notes["label.good"] = notes["label.bad"] = f"which of the words? {counts}"
-        return best.source, [check.source for check in checks]
-    titles = "; ".join([candidate.title for candidate in candidates])
-    text = titles or "none was found: state label.column, path, line or listing"
-    few = f"; columns of few words: {columns}" if (columns := listed(hints)) else ""
-    notes["label.column"] = f"{text}{few}; {over}"
-    return LabelSource(column=UNKNOWN), []
+    over = f"{len(places):,} recordings"
+    for other in certain:
+        if n := certain[0].disagreements(other):
+            text = f"{certain[0].title} and {other.title} disagree on {n:,} of {over}"
+            ask_for_label(p, f"{text}: which is right?")
+            return
+    if not certain and len(candidates) != 1:
+        titles = [candidate.title for candidate in candidates]
+        text = "; ".join(titles) or "none was found: state label.column, path, line or listing"
+        few = [column for column in p.unused if 1 < len({*column.fixed}) <= MOST_WORDS]
+        hints = listed(f"{column.name} ({counts_of(column.fixed)})" for column in few)
+        text += f"; columns of few words: {hints}" if hints else ""
+        ask_for_label(p, f"{text}; over {over}")
+        return
+    best = (certain or candidates)[0]
+    checks = [other.source for other in certain[1:] if other.words.keys() >= best.words.keys()]
+    p.description = replace(p.description, label=best.source, check=tuple(checks))
+    counts = counts_of(best.words.values())
+    kinds = {True: "agrees", False: "of unknown meaning"}
+    also = [f"{kinds[c.is_known]}: {c.title}" for c in candidates if c is not best]
+    kind = next(kind for kind in KINDS if getattr(best.source, kind))
+    p.notes[f"label.{kind}"] = "; ".join([f"{counts}, over {over}", *also])
+    if UNKNOWN in best.source.good + best.source.bad:
+        p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")
 
 
-def _disagreement(candidates: Sequence[Candidate]) -> str:
-    """Return which two candidates disagree, and on how many recordings; "" if all agree."""
-    for first, second in combinations(candidates, 2):
-        if count := first.disagreements(second):
-            return f"{first.title} and {second.title} disagree on {count:,}"
-    return ""
+def ask_for_label(p: Proposal, text: str) -> None:
+    """Leave the source of the labels open."""
+    p.description = replace(p.description, label=replace(p.description.label, column=UNKNOWN))
+    p.notes["label.column"] = text
