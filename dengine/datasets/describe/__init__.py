@@ -16,16 +16,15 @@ from typing import Any
 from ...errors import DataError, listed
 from ..description import UNKNOWN, Description
 from ..read.files import natural_key, read_file
-from ..read.frames import MOST_CHANNELS, part_tables, read_frame
-from ..read.places import Place
+from ..read.frames import part_tables, read_frame
 from ..read.split import tables_of
 from ..read.text import read_text
 from ..table import UnreadableError
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
-from .layout import LEAST_RUN, layout_of, places_of, propose_parts
+from .layout import layout_of, places_of
 from .roles import propose_roles
-from .text_form import Look, look, propose_form
+from .text_form import propose_form
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -93,20 +92,20 @@ def choose_files(p: Proposal, root: Path) -> bool:
     """
     if not root.exists():
         raise DataError(f"Expected a file or a folder of recordings, got {root}, which is none.")
-    groups = group_files(root, p.description.files)
+    stated = p.description.files
+    groups = group_files(root, stated)
     if not groups:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}; found none in {root}.")
     p.base = root if root.is_dir() else root.parent
     bags = [groups[BAG]] if BAG in groups else [*groups.values()]
     clear = [names for names in groups.values() if len(names) > 1] or bags
-    if len(clear) > 1 and not p.description.files:
+    if len(clear) > 1 and not stated:
         counts = listed(f"{' '.join(globs(n))} ({len(n)} files)" for n in groups.values())
         p.put("files", UNKNOWN, f"one of {counts}")
         p.notes["channels"] = "they follow from files"
         return False
-    p.names = [*chain(*groups.values())] if p.description.files else clear[0]
-    every = chain(*group_files(root, ()).values())
-    p.others = [name for name in every if name not in {*p.names}]
+    p.names = [*chain(*groups.values())] if stated else clear[0]
+    p.others = [*{*chain(*group_files(root, ()).values())}.difference(p.names)]
     p.put("files", globs(p.names))
     p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
     return True
@@ -136,68 +135,44 @@ def group_files(root: Path, patterns: Names) -> Mapping[str, Names]:
 
 def globs(names: Names) -> list[str]:
     """Return the patterns of files of one suffix, or the only file."""
-    if len(names) == 1:
-        return [*names]
     folders = "**/" if any("/" in name for name in names) else ""
     endings = {match[0] for name in names if (match := ENDING.search(name))}
-    return [f"{folders}*{ending}" for ending in sorted(endings) or [""]]
-
-
-def read_contents(p: Proposal) -> dict[str, bytes]:
-    """Return the content of some files, as far as the budget goes.
-
-    They are those whose names are like no other but for numbers, and others evenly spread.
-    """
-    shapes = {name: NUMBERS.sub("0", name) for name in p.names}
-    counts = Counter(shapes.values())
-    rare = [name for name in p.names if counts[shapes[name]] == 1]
-    step = max(1, len(p.names) // MOST_FILES)
-    contents = dict[str, bytes]()
-    for name in [*rare[:MOST_FILES], *p.names[::step][:MOST_FILES]]:
-        if sum(map(len, contents.values())) < MOST_BYTES:
-            with suppress(UnreadableError):
-                contents[name] = read_file(p.base / name)
-    return {name: contents[name] for name in p.names if name in contents}
+    return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]
 
 
 def read_tables(p: Proposal) -> list[Tables]:
-    """Return the first tables of files of one format, which have the same columns."""
-    contents = read_contents(p)
+    """Return the first tables of some files, of those with the columns of most.
+
+    These are files whose names are like few others but for numbers, and others evenly spread.
+    """
+    shapes = {name: NUMBERS.sub("0", name) for name in p.names}
+    counts = Counter(shapes.values())
+    rare = sorted(p.names, key=lambda name: counts[shapes[name]])[:MOST_FILES]
+    spread = p.names[:: max(1, len(p.names) // MOST_FILES)]
+    contents = dict[str, bytes]()
+    for name in dict.fromkeys([*rare, *spread]):
+        if sum(map(len, contents.values())) < MOST_BYTES:
+            with suppress(UnreadableError):
+                contents[name] = read_file(p.base / name)
     if p.description.format == "text":
-        forms = {name: look(content, p.stated) for name, content in contents.items()}
-        looks = {name: form for name, form in forms.items() if form is not None}
-        if not looks:
-            raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
-        leave_out(p, {name: looks[name] for name in propose_form(p, looks)})
-    files: list[Tables] = []
+        propose_form(p, contents)
+    files = []
     for name in [name for name in p.names if name in contents]:
         with suppress(*([DataError] if len(contents) > 1 else [])):
             files.append(tables_in(p, contents[name], name))
-    heads = Counter(tuple(tables[0].columns) for tables in files if tables)
-    usual = heads.most_common(1)[0][0] if heads else ()
-    return [tables for tables in files if tables and tuple(tables[0].columns) == usual]
-
-
-def leave_out(p: Proposal, odd: Mapping[str, Look]) -> None:
-    """Leave out files of another form; if several of one form have samples, it is asked why."""
-    p.others = [*p.others, *odd]
-    p.names = [name for name in p.names if name not in odd]
-    forms = Counter(look.form for look in odd.values() if len(look.rows) >= LEAST_RUN)
-    if max(forms.values(), default=0) > 1:
-        p.put("exclude", UNKNOWN)
+    heads = Counter(tuple(tables[0].columns) for tables in files if tables).most_common(1)
+    return [tables for tables in files if tables and tuple(tables[0].columns) == heads[0][0]]
 
 
 def tables_in(p: Proposal, content: bytes, name: str) -> Tables:
     """Return the first tables of a file, of a text with all cells as words.
 
-    An archive holds all parts if it is the only one, or has many, and its arrays hold curves.
-    Raises DataError if it is damaged.
+    The only archive holds all parts if its arrays hold curves. Raises DataError if it is damaged.
     """
-    form, kind, layout = p.description.text, p.description.format, p.stated.get("layout", "npz")
-    if kind == "npz" and layout == "npz":
+    form, kind, layout = p.description.text, p.description.format, p.stated.get("layout", "")
+    if kind == "npz" and (layout == "npz" or (len(p.names) == 1 and not layout)):
         parts = part_tables(content, name)
-        has_many = len(p.names) == 1 or len(parts) > MOST_CHANNELS
-        if has_many and any(len(cells) > 1 for cells in parts[0].columns.values()):
+        if any(len(cells) > 1 for cells in parts[0].columns.values()):
             return parts
     if kind in ("text", "jsonl") and len(content) > MOST_BYTES:
         content = content[: content.rfind(b"\n", 0, MOST_BYTES)]
@@ -214,13 +189,10 @@ def propose_tables(p: Proposal, files: Sequence[Tables]) -> None:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")
     p.is_cut |= any(len(table.lines) > MOST_ROWS for tables in files for table in tables)
     files = [[table.take(slice(0, MOST_ROWS)) for table in tables] for tables in files]
-    is_archive = p.description.format == "npz" and len(files[0]) > 1
-    p.put("layout", "npz" if is_archive else layout_of(p, files))
-    if p.description.layout == "long":
-        propose_parts(p, files)
-    p.places = {tables[0].source: Place(tables[0].source, tables[0]) for tables in files}
-    if UNKNOWN not in p.description.part.column:
-        p.places = places_of(p, files)
+    p.put("layout", layout_of(p, files))
+    if UNKNOWN in (p.description.layout, *p.description.part.column):
+        return
+    p.places = places_of(p, files)
     if not p.places:
         raise DataError(f"Expected recordings in {listed(p.names)}, found none.")
     if p.description.layout != "files" or len(p.places) != len(files):

@@ -2,7 +2,7 @@
 
 import re
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 
@@ -21,7 +21,6 @@ NAME = re.compile(
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
-UNNAMED = re.compile(r"c0|column1")  # the first column without a name
 FRACTIONS = re.compile(r"(?i)^milli|^ms$|^micro")
 UNIT_IN_NAME = re.compile(
     r"(?:[\[(/_ ]|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|sec))\s*[\])]?$"
@@ -42,22 +41,18 @@ YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 
 SLOWEST_STEP = 0.04  # of numbers that are taken for seconds because they are small
 GAP = 1.5
 FEW = 0.1  # of the recordings that may have a gap, and of the steps that may fall
-COARSE = 0.05  # of the steps that are 0
 ROUNDING = 0.005
 
 
 def propose_clock(p: Proposal) -> None:
     """Find the columns of the clock, and their forms."""
     names = p.description.time.column
-    clock = [p.columns[name] for name in names if name in p.columns] if names else find_clock(p)
+    clock = [p.columns[name] for name in names if name in p.columns] or find_clock(p)
     odd = [c for c in p.columns.values() if NAME.search(c.name) and c.odd and not c.fixed]
     if clock:
         p.put("time.column", [column.name for column in clock])
-        formats = [form_of(column, p, len(clock) == 1) for column in clock]
-        p.put("time.format", formats)
-        if any(map(has_day, formats)) or any(map(is_epoch, clock, formats)):
-            p.put("order", "time")
-    elif odd and not odd[0].forms:
+        p.put("time.format", [form_of(column, p, len(clock) == 1) for column in clock])
+    elif odd:
         text = f"{odd[0].name} has cells of no known form, like {listed([*odd[0].odd][:3])}"
         p.put("time.column", UNKNOWN, f"{text}: state time.format or text.drop, or time.column=[]")
     else:
@@ -65,10 +60,7 @@ def propose_clock(p: Proposal) -> None:
 
 
 def find_clock(p: Proposal) -> list[Column]:
-    """Return the columns of the clock: seconds and nanoseconds, a date and a time, or one column.
-
-    A first column without a name is one if it rises by equal steps other than 1.
-    """
+    """Return the columns of the clock: seconds and nanoseconds, a date and a time, or one column."""
     kinds = defaultdict[str, list[Column]](list)
     for column in p.columns.values():
         kinds[_kind_of(column)].append(column)
@@ -86,8 +78,6 @@ def find_clock(p: Proposal) -> list[Column]:
 
 def _kind_of(column: Column) -> str:
     """Return what a column tells of the times of samples; "" for nothing."""
-    steps = column.steps if not column.forms else np.empty(0)
-    usual = float(np.median(steps)) if len(steps) else 0.0
     if column.forms:
         if column.forms[0] != ISO and "%S" not in column.forms[0]:
             return "day"
@@ -95,8 +85,6 @@ def _kind_of(column: Column) -> str:
         return "" if column.fixed else kind
     if FRACTIONS.search(column.name):
         return "fraction"
-    if UNNAMED.fullmatch(column.name):
-        return "number" if 0 < usual != 1 and np.ptp(steps) < FEW * usual else ""
     return "number" if NAME.search(column.name) and is_rising(column) else ""
 
 
@@ -106,12 +94,6 @@ def is_rising(column: Column) -> bool:
     return bool((steps > 0).any() and (steps < 0).sum() <= FEW * len(steps))
 
 
-def is_epoch(column: Column, unit: str) -> bool:
-    """Return whether numbers count from some day, since they are of 30 years or more."""
-    is_known = bool(column.numbers) and unit != UNKNOWN
-    return is_known and float(column.numbers[0][0]) * scale_of(unit) > YEARS[0]
-
-
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     """Return the unit or form of a column of times; `?` where several fit.
 
@@ -119,16 +101,13 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     the time; of several days, or with the time, they do not.
     """
     forms = column.forms
-    if forms:
-        is_open = len(forms) > 1 and (is_alone or len(column.counts) > 1)
-        if len(forms) > 1:
-            p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
-        return UNKNOWN if is_open else forms[0]
-    for unit in (column.unit, _unit_in(column.name)):
-        if unit.lstrip("0123456789. ") in UNITS:
+    if len(forms) > 1 and (is_alone or not column.fixed):
+        p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
+        return UNKNOWN
+    for unit in (*forms, column.unit, _unit_in(column.name)):
+        if unit in forms or unit.lstrip("0123456789. ") in UNITS:
             return unit.replace("sec", "s")
-    unit, note = _unit_by_size(column)
-    p.notes["time.format"] = note
+    unit, p.notes["time.format"] = _unit_by_size(column)
     return unit
 
 
@@ -163,45 +142,47 @@ def is_rate(step: float) -> bool:
 
 
 def propose_rate(p: Proposal, tables: Tables) -> None:
-    """Find the rate of the clock; ask about times that fall, stand still, or leave gaps."""
-    recordings: list[Floats] = []
+    """Find the rate of the clock; ask about times that fall, leave gaps or are not even."""
+    recordings, starts = list[Floats](), list[float]()
     for table in tables:
         with suppress(UnreadableError):
-            steps = np.diff(times_of(table, p.description.time, p.description.text)[0])
-            recordings += [steps] if len(steps) else []
-
-    def count(test: Callable[[Floats], bool]) -> str:
-        """Return how many recordings pass a test, if they are more than a few."""
-        n = sum(map(test, recordings))
-        return f"{n} of {len(recordings)} recordings" if n > FEW * len(recordings) + 1 else ""
-
-    uneven = count(is_uneven)
-    middle = np.mean if uneven else np.median
-    usual = float(np.median([*map(middle, recordings)] or 0.0))
-    longest = max((float(steps.max()) for steps in recordings), default=0.0)
-    if not p.description.time.wrap and (n := count(lambda steps: bool((steps < 0).any()))):
-        text = f"times fall in {n}: does the counter begin again (state time.wrap), or are rows in"
-        p.put("time.wrap", UNKNOWN, f"{text} another order (time.wrap=0 and time.sort=true)?")
-    elif n := count(lambda steps: float((steps == 0).mean()) > COARSE):
-        text = f"the clock is coarser than the samples in {n}: state the rate, and time.gap=0"
-        p.put("time.rate_hz", UNKNOWN, text)
-        p.put("time.gap", 0.0)
-        return
-    elif n := count(lambda steps: float(steps.max()) > GAP * usual):
-        text = f"{n} have steps of more than {GAP:g} usual ones, the longest {longest / usual:.3g}"
-        p.put("time.gap", UNKNOWN, f"{text}; how long may one be?")
-    if uneven:
-        p.put("traces.lengths", "resample", f"the samples of {uneven} are not taken at even times")
-    text = f"steps of {usual:.6g} s are of no force: is time.format right?"
+            seconds, start = times_of(table, p.description.time, p.description.text)
+            starts.append(start)
+            recordings += [np.diff(seconds)] if len(seconds) > 1 else []
+    means = [steps[steps >= 0].mean() for steps in recordings if (steps >= 0).any()]
+    usual = float(np.median(means or 0.0))
+    for key, is_odd, text in QUESTIONS:
+        n = sum(is_odd(steps, usual) for steps in recordings)
+        if n > FEW * len(recordings) + 1:
+            p.put(key, UNKNOWN, f"{n} of {len(recordings)} recordings have {text}")
     rate = round_rate(1 / usual) if is_rate(usual) else UNKNOWN
+    text = f"steps of {usual:.6g} s are of no force: is time.format right?"
     p.put("time.rate_hz", rate, text if rate == UNKNOWN else "")
+    if min(starts, default=0.0) > YEARS[0]:
+        p.put("order", "time")
 
 
-def is_uneven(steps: Floats) -> bool:
+def is_uneven(steps: Floats, usual: float) -> bool:
     """Return whether samples stand more than half a step from even times."""
     even = steps.mean() * np.arange(1, len(steps) + 1)
-    is_forward = bool((steps >= 0).all())
-    return is_forward and bool(np.abs(np.cumsum(steps) - even).max() > steps.mean() / 2)
+    return bool((steps >= 0).all() and np.abs(np.cumsum(steps) - even).max() > steps.mean() / 2)
+
+
+# What is asked about a clock if many recordings have such steps, whose usual one is known.
+QUESTIONS: Sequence[tuple[str, Callable[[Floats, float], bool], str]] = (
+    (
+        "time.wrap",
+        lambda steps, _: bool((steps < 0).any()),
+        "times that fall: does the counter begin again (state time.wrap), or are rows in another "
+        "order (time.wrap=0 and time.sort=true)?",
+    ),
+    (
+        "time.gap",
+        lambda steps, usual: bool(steps.min() >= 0 and steps.max() > GAP * usual),
+        f"steps of more than {GAP:g} usual ones: how many usual steps may one be? 0: any",
+    ),
+    ("traces.lengths", is_uneven, "no even times: resample, or strict to take them as even"),
+)
 
 
 def round_rate(rate: float) -> float:

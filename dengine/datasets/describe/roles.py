@@ -5,7 +5,6 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -29,18 +28,18 @@ PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|we
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
+LOADS = ("force", "torque")
 FORCES = (
     re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
     re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
+    re.compile(r"(?i)^(.*\.)?_?(f\b.*|value)$"),
 )
-VALUE = re.compile(r"(?i)(.*\.)?_?(f\b.*|value)")
 
 
 def propose_roles(p: Proposal) -> None:
     """Give each column a role, one after the other; what is stated stays."""
     p.columns = columns_of(p.tables, p.description.text)
-    if UNKNOWN not in p.description.part.column:
-        qualify_rows(p)
+    qualify_rows(p)
     propose_clock(p)
     if p.description.layout not in ("long", "columns"):
         propose_part(p)
@@ -48,27 +47,19 @@ def propose_roles(p: Proposal) -> None:
     propose_channels(p, _units(p))
     find_lost(p)
     clock = p.description.time
-    needed = clock.column + clock.format + p.description.part.column
-    if clock.column and UNKNOWN not in needed:
-        propose_rate(p, [kept_rows(p, table) for table in p.tables])
-    propose_lengths(p)
+    if any(UNKNOWN in about.keep for about in p.description.rows.values()):
+        p.put("traces.samples", UNKNOWN, "it follows from rows")
+    else:
+        if clock.column and UNKNOWN not in clock.column + clock.format:
+            propose_rate(p, [kept_rows(p, table) for table in p.tables])
+        propose_lengths(p)
     list_others(p)
 
 
 def kept_rows(p: Proposal, table: Table) -> Table:
-    """Return the rows of a table that are samples, as far as their words are known.
-
-    Of a column whose words are not known yet, and of which none is in most rows, the rows of the
-    most frequent word are taken: it may tell signals apart.
-    """
-    rows = {**p.description.rows}
-    for name, about in rows.items():
-        if UNKNOWN in about.keep:
-            counts = p.columns[name].counts
-            word, n = counts.most_common(1)[0]
-            is_signal = n < MOST_FREQUENT * counts.total()
-            rows[name] = RowWords((word,), (ANY,)) if is_signal else RowWords((ANY,))
-    plain = replace(p.description, rows=rows, channels=())
+    """Return the rows of a table that are samples, as far as their words are known."""
+    known = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
+    plain = replace(p.description, rows=known, channels=())
     with suppress(DataError):
         return Reader(plain, LabelReader(LabelSource())).kept_rows(table)[0]
     return table
@@ -124,20 +115,15 @@ def qualifies(column: Column) -> bool:
 
 def propose_part(p: Proposal) -> None:
     """Find the column or line with the part's number, if exactly one has its name."""
-    sources = [("column", c.name) for c in p.unused if PART_NAME.search(c.name)]
-    sources += [("line", line) for line in lines_of(p, PART_LINE)]
-    found = []
-    for key, name in sources:
-        value: Any = (name,) if key == "column" else name
-        words = part_words(PartSource(**{key: value}), p.places)
-        if len({*words.values()}) > len(p.places) / 2:
-            found.append((key, name))
-    if any(key.startswith("part.") for key in p.stated):
-        return
-    if len(found) == 1:
-        p.put(f"part.{found[0][0]}", found[0][1])
-    elif found:
-        p.notes["part.column"] = f"may be one of {listed(name for _, name in found)}"
+    sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
+    sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
+    least = len(p.places) / 2
+    found = [s for s in sources if len({*part_words(s, p.places).values()}) > least]
+    names = [f"{source.line}{''.join(source.column)}" for source in found]
+    if len(found) > 1:
+        p.notes["part.column"] = f"may be one of {listed(names)}"
+    elif p.description.part == PartSource() and found:
+        p.description = replace(p.description, part=found[0])
 
 
 def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
@@ -149,21 +135,16 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     """
     if p.description.channels:
         return
-    quantities = {name: (quantity_of(unit) or ("",))[0] for name, unit in units.items()}
-    rules = [
-        [*units] if len(units) == 1 else [],
-        *([*filter(pattern.search, units)] for pattern in FORCES),
-        [name for name in units if quantities[name] in ("force", "torque")],
-        [*filter(VALUE.fullmatch, units)],
-    ]
-    best = next(filter(None, rules), [])
-    name = best[0] if len(best) == 1 else UNKNOWN
-    others = listed(f"{n} [{unit}]" if unit else n for n, unit in units.items() if n != name)
-    note = f"one or several of: {others}" if units else "no column has numbers that change"
-    if name != UNKNOWN:
-        p.description = replace(p.description, channels=(Channel(name, units[name]),))
-        note = f"others: {others}" if others else ""
-    p.notes |= {f"channels.{name}": note, "channels": note}
+    forces = [name for name, unit in units.items() if (quantity_of(unit) or ("",))[0] in LOADS]
+    named = [[*filter(pattern.search, units)] for pattern in FORCES]
+    best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
+    others = listed(name for name in units if [name] != best)
+    if len(best) == 1:
+        p.description = replace(p.description, channels=(Channel(best[0], units[best[0]]),))
+        p.notes |= {f"channels.{best[0]}": f"others: {others}"} if others else {}
+    else:
+        text = f"one or several of: {others}" if units else "no column has numbers that change"
+        p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), text)
 
 
 def _units(p: Proposal) -> dict[str, str]:
@@ -201,34 +182,28 @@ def find_lost(p: Proposal) -> None:
 
 def propose_lengths(p: Proposal) -> None:
     """Find how many samples the traces have, and what happens to those of other lengths."""
-    names = [channel.column for channel in p.description.channels]
-    words = [w for name in names[:1] if name in p.columns for w in p.columns[name].words]
-    lengths = [n for n in map(len, words) if n]
-    if not lengths:
-        return
-    usual = int(np.median(lengths))
-    n_other = sum(n != usual for n in lengths)
-    if n_other and p.description.traces.lengths == "strict":
-        text = f"{n_other} of {len(lengths)} have other lengths, {min(lengths)} to {max(lengths)}"
-        how = "pad" if n_other > SPARSE * len(lengths) else "strict"
+    words = [p.columns[c.column].words for c in p.description.channels if c.column in p.columns]
+    lengths = [n for n in map(len, words[0] if words else ()) if n]
+    usual = int(np.median(lengths or 0))
+    others = [n for n in lengths if n != usual]
+    if others and p.description.traces.lengths == "strict":
+        text = f"{len(others)} of {len(lengths)} have other lengths, {min(others)} to {max(others)}"
+        how = "pad" if len(others) > SPARSE * len(lengths) else "strict"
         p.put("traces.lengths", how, f"{text}; or cut, pad-all, resample, strict")
-    p.put("traces.samples", min(lengths) if p.description.traces.lengths == "cut" else usual)
+    p.put("traces.samples", usual)
 
 
 def list_others(p: Proposal) -> None:
     """List the columns without a role, and the files beside the recordings."""
     description = p.description
-    listings = {source.listing for source in (description.label, *description.check)}
-    names = {*p.others} - listings
+    names = {*p.others}.difference(s.listing for s in (description.label, *description.check))
     for pattern in description.exclude:
         names -= {*fnmatch.filter(names, pattern)}
     others = sorted(names, key=natural_key)
-    exclude = description.exclude
     text = f"not read, for they are of another form: {listed(others)}"
+    exclude = (*description.exclude, *others)
     if UNKNOWN in exclude:
-        text += "; are these recordings? State files or exclude"
-    else:
-        exclude += tuple(others)
+        text, exclude = f"{text}; are these recordings? State files or exclude", (UNKNOWN,)
     p.notes |= {"exclude": text} if others else {}
     units = {column.name: unit_in(column.name) or column.unit for column in p.unused}
     ignored = units if description.layout != "columns" else {}

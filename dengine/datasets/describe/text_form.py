@@ -12,15 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...errors import DataError, listed
 from ..description import UNKNOWN
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..units import is_unit
-from .columns import NUMBER, Proposal, Stated
+from .columns import LEAST_RUN, NUMBER, Proposal, Stated
 
 DELIMITERS = (";", "\t", "|", ",", BLANK)
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
 GROUPS = "'’\u202f\xa0 "  # marks between groups of digits that are no decimal mark
 HEAD_BYTES = 400_000
+LATIN = "cp1252"
 MOST_LINES = 200  # of a file that are looked at
 MOST_NAMES = 20  # columns without a header that get a name each
 MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
@@ -43,22 +45,29 @@ Rows = Sequence[Sequence[str]]
 class Look:
     """The first lines of a file.
 
-    width : cells of a row. places : the lines of the header, the units and the first samples, from
-    1; 0 for none. header : that line. names : in it. rows : the cells of the samples.
+    width : cells of a row. header, units, data : the lines of the header, the units and the first
+    samples, from 1; 0 for none. line : the header. rows : the cells of the samples.
     """
 
     encoding: str
     delimiter: str
     width: int
-    places: tuple[int, int, int]
-    header: str
-    names: Sequence[str]
+    header: int
+    units: int
+    data: int
+    line: str
     rows: Rows
 
     @property
-    def form(self) -> tuple[str, int]:
-        """The delimiter and the number of columns, by which files are alike."""
-        return self.delimiter, self.width
+    def names(self) -> list[str]:
+        """The names in the header."""
+        line = COMMENT.sub("", self.line.lstrip())
+        return header_names(split_line(line, self.delimiter))
+
+    def is_like(self, other: "Look") -> bool:
+        """Return whether another file has this form, and a column in common."""
+        is_same = (self.delimiter, self.width) == (other.delimiter, other.width)
+        return is_same and (not self.line or not {*self.names}.isdisjoint(other.names))
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
@@ -67,7 +76,7 @@ def look(content: bytes, stated: Stated) -> Look | None:
     lines = text.splitlines()[:MOST_LINES]
     if "\0" in text or not text.strip():
         return None
-    marks = [stated["text.delimiter"]] if "text.delimiter" in stated else DELIMITERS
+    marks = stated.get("text.delimiter", DELIMITERS)
     share, width, delimiter = max((*_share_of_numbers(lines, mark), mark) for mark in marks)
     if share == 0:  # a single column
         delimiter, width = ",", 1
@@ -75,10 +84,9 @@ def look(content: bytes, stated: Stated) -> Look | None:
     data = _first_row(rows, width)
     heads = [i for i in range(data) if len(rows[i]) >= width and any(map(str.strip, rows[i]))]
     units = heads.pop() + 1 if len(heads) > 1 and _are_units(rows[heads[-1]]) else 0
-    header = lines[heads[-1]] if heads else ""
-    names = header_names(split_line(COMMENT.sub("", header.lstrip()), delimiter))
-    places = (heads[-1] + 1 if heads else 0, units, data + 1)
-    return Look(encoding, delimiter, width, places, header, names, rows[data:])
+    header = heads[-1] + 1 if heads else 0
+    line = lines[header - 1] if header else ""
+    return Look(encoding, delimiter, width, header, units, data + 1, line, rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -87,7 +95,7 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     The encoding is what is stated, else UTF-16 by the mark at its beginning, UTF-8 or cp1252.
     """
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    encodings = ["utf-16"] if is_wide else ["utf-8", "cp1252"]
+    encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
     for encoding in [stated] if stated else encodings:
         with suppress(UnicodeDecodeError):
             text = codecs.getincrementaldecoder(encoding)().decode(content[:HEAD_BYTES])
@@ -128,36 +136,39 @@ def _are_units(row: Sequence[str]) -> bool:
     return all(is_unit(c) or UNIT_WORDS.fullmatch(c) for c in map(str.strip, row) if c)
 
 
-def propose_form(p: Proposal, looks: Mapping[str, Look]) -> list[str]:
-    """Find the keys of `[text]` for most of the files; return the files of another form.
+def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
+    """Find the keys of `[text]` for most of the files, and leave out files of another form.
 
-    These have another delimiter, another number of columns, or no column in common with most.
+    These have another delimiter, another number of columns, or no column in common with most. If
+    several have samples, it is asked why. A header below other lines may stand elsewhere in others.
     """
-    form, _ = Counter(look.form for look in looks.values()).most_common(1)[0]
-    alike = [look for look in looks.values() if look.form == form]
-    places, _ = Counter(look.places for look in alike).most_common(1)[0]
-    usual = next(look for look in alike if look.places == places)
-    common = {*usual.names}
-    same = [look for look in alike if not common or common & {*look.names}]
-    encoding = min({look.encoding for look in same} - {"utf-8"}, default="utf-8")
-    is_latin = encoding == "cp1252"
-    note = "not UTF-8; cp1252 reads any text: look at the letters below" if is_latin else ""
-    p.put("text.encoding", encoding, note)
-    p.put("text.delimiter", usual.delimiter)
-    header, units, data = usual.places
-    names, text = _column_names(usual), "it stands at another line in each file"
-    if header and any(look.places != places for look in same):
-        first, mark, _ = usual.header.partition(usual.delimiter)
-        p.put("text.header", first + mark, text)
-        data, units = data - header, units and units - header
-    else:
-        p.put("text.header", header)
-    p.put("text.units", units)
-    p.put("text.data", data)
-    p.put("text.names", names, "no header names each column" if names else "")
-    cells = {cell.strip() for look in same for row in look.rows for cell in row}
+    found = {name: look(content, p.stated) for name, content in contents.items()}
+    looks = {name: form for name, form in found.items() if form is not None}
+    if not looks:
+        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
+    lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
+    usual = next(form for form in looks.values() if (form.width, form.line) == lines[0][0])
+    odd = {name: form for name, form in looks.items() if not usual.is_like(form)}
+    same = [form for name, form in looks.items() if name not in odd]
+    above = usual.header if usual.header > 1 else 0
+    values = {
+        "encoding": min({form.encoding for form in same} - {"utf-8"}, default="utf-8"),
+        "delimiter": usual.delimiter,
+        "header": usual.line if above else usual.header,
+        "units": usual.units and usual.units - above,
+        "data": usual.data - above,
+        "names": _column_names(usual),
+    }
+    for key, value in values.items():
+        p.put(f"text.{key}", value)
+    if p.description.text.encoding == LATIN:
+        p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
+    cells = {cell.strip() for form in same for row in form.rows for cell in row}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
-    return [name for name, look in looks.items() if look not in same]
+    p.others = [*p.others, *odd]
+    p.names = [name for name in p.names if name not in odd]
+    if sum(len(form.rows) >= LEAST_RUN for form in odd.values()) > 1:
+        p.put("exclude", UNKNOWN)
 
 
 def _column_names(usual: Look) -> list[str]:
@@ -166,8 +177,8 @@ def _column_names(usual: Look) -> list[str]:
     In a matrix, whose rows are parts, a first column of few whole numbers is their class.
     """
     width = usual.width
-    if usual.names:
-        return [*usual.names[:width]] if len(usual.names) > width else []
+    if usual.line:
+        return usual.names[:width] if len(usual.names) > width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
@@ -187,12 +198,8 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     text = "\n".join(cells)
     group = next((mark for mark in GROUPS if re.search(rf"\d{mark}\d{{3}}", text)), "")
     example = min(seen["."] + seen[","], default="")
-    decimal, note = ".", ""
-    if example:
-        note = "both marks are used for decimals, in other files or columns"
-        if not any(proofs.values()):
-            note = f"'.' or ','; {example} may be a fraction or a thousand"
-        decimal = UNKNOWN
+    note = f"'.' or ','; {example} may be a fraction or a thousand" if example else ""
+    decimal = UNKNOWN if example else "."
     for mark, other in (".,", ",."):
         repeats = any(cell.count(other) > 1 for cell in seen[other])
         if proofs[mark] > 20 * proofs[other] or (repeats and not proofs[other]):
