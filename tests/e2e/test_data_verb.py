@@ -14,7 +14,6 @@ from dengine.experiments.survey import survey_dataset
 from tests.support.command_line import dengine, document, well
 from training.make_recordings import write_plants, write_recordings
 
-
 # What nothing proves about a bag.
 BAG = {
     "windows.trigger": "register=1@/phase",

@@ -5,11 +5,10 @@ candidates. `load_dataset` then reads exactly what the description says.
 """
 
 import re
-from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -93,19 +92,20 @@ def choose_files(p: Proposal, root: Path) -> bool:
     if not root.exists():
         raise DataError(f"Expected a file or a folder of recordings, got {root}, which is none.")
     stated = p.description.files
-    groups = group_files(root, stated)
-    if not groups:
+    names = names_in(root, stated)
+    if not names:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}; found none in {root}.")
     p.base = root if root.is_dir() else root.parent
-    bags = [groups[BAG]] if BAG in groups else [*groups.values()]
-    clear = [names for names in groups.values() if len(names) > 1] or bags
-    if len(clear) > 1 and not stated:
-        counts = listed(f"{' '.join(globs(n))} ({len(n)} files)" for n in groups.values())
-        p.put("files", UNKNOWN, f"one of {counts}")
+    counts = Counter(map(suffix_of, names))
+    likely = [suffix for suffix, n in counts.items() if n > 1] or [BAG] * (BAG in counts)
+    likely = likely or [*counts]
+    if len(likely) > 1 and not stated:
+        text = listed(f"*{suffix} ({n} files)" for suffix, n in counts.items())
+        p.put("files", UNKNOWN, f"one of {text}")
         p.notes["channels"] = "they follow from files"
         return False
-    p.names = [*chain(*groups.values())] if stated else clear[0]
-    p.others = [*{*chain(*group_files(root, ()).values())}.difference(p.names)]
+    p.names = names if stated else [name for name in names if suffix_of(name) == likely[0]]
+    p.others = [name for name in names_in(root, ()) if name not in {*p.names}]
     p.put("files", globs(p.names))
     p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
     return True
@@ -116,21 +116,19 @@ def suffix_of(name: str) -> str:
     return Path(name.lower().removesuffix(".gz")).suffix
 
 
-def group_files(root: Path, patterns: Names) -> Mapping[str, Names]:
-    """Return the files of a folder by their suffix, each as seen from it, in their natural order.
+def names_in(root: Path, patterns: Names) -> Names:
+    """Return the files of a folder, each as seen from it, in their natural order.
 
     Left out are hidden files, descriptions, pages for people, and files of other suffixes.
 
     patterns : of the files, if they are known.
     """
+    if root.is_file():
+        return [root.name]
     paths = {path for pattern in patterns or ["**/*"] for path in root.glob(pattern)}
     names = [path.relative_to(root).as_posix() for path in paths if path.is_file()]
-    groups = defaultdict[str, list[str]](list)
-    for name in [root.name] if root.is_file() else sorted(names, key=natural_key):
-        is_known = suffix_of(name) in SUFFIXES or patterns or root.is_file()
-        if is_known and not NO_RECORDING.search(name):
-            groups[suffix_of(name)].append(name)
-    return groups
+    names = [name for name in names if patterns or suffix_of(name) in SUFFIXES]
+    return sorted((name for name in names if not NO_RECORDING.search(name)), key=natural_key)
 
 
 def globs(names: Names) -> list[str]:
@@ -169,7 +167,7 @@ def tables_in(p: Proposal, content: bytes, name: str) -> Tables:
 
     The only archive holds all parts if its arrays hold curves. Raises DataError if it is damaged.
     """
-    form, kind, layout = p.description.text, p.description.format, p.stated.get("layout", "")
+    kind, layout = p.description.format, p.stated.get("layout", "")
     if kind == "npz" and (layout == "npz" or (len(p.names) == 1 and not layout)):
         parts = part_tables(content, name)
         if any(len(cells) > 1 for cells in parts[0].columns.values()):
@@ -179,8 +177,7 @@ def tables_in(p: Proposal, content: bytes, name: str) -> Tables:
         p.is_cut = True
     if kind != "text":
         return tables_of(content, name, replace(p.description, layout="files"))
-    form = replace(form, decimal=form.decimal.replace(UNKNOWN, "."))
-    return [read_text(content, name, form, lambda _: False, lambda _: True)]
+    return [read_text(content, name, p.description.text, lambda _: False, lambda _: True)]
 
 
 def propose_tables(p: Proposal, files: Sequence[Tables]) -> None:
@@ -191,6 +188,7 @@ def propose_tables(p: Proposal, files: Sequence[Tables]) -> None:
     files = [[table.take(slice(0, MOST_ROWS)) for table in tables] for tables in files]
     p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
+        p.notes["channels"] = "they follow from layout and part.column"
         return
     p.places = places_of(p, files)
     if not p.places:

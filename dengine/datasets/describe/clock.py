@@ -60,20 +60,19 @@ def propose_clock(p: Proposal) -> None:
 
 
 def find_clock(p: Proposal) -> list[Column]:
-    """Return the columns of the clock: seconds and nanoseconds, a date and a time, or one column."""
-    kinds = defaultdict[str, list[Column]](list)
-    for column in p.columns.values():
-        kinds[_kind_of(column)].append(column)
+    """Return the columns of the clock: one, seconds and nanoseconds, or a date and a time."""
     for first, second in pairwise(p.columns.values()):
         if _unit_in(first.name) == "s" and _unit_in(second.name) == "ns":
             return [first, second]
-    fractions = kinds["fraction"][:1]
+    kinds = defaultdict[str, list[Column]](list)
+    for column in p.columns.values():
+        kinds[_kind_of(column)].append(column)
     times = kinds["moment"] or kinds["time"]
-    clocks = times or kinds["number"] or fractions
+    clocks = times or kinds["number"] or kinds["fraction"][:1]
     if len(clocks) > 1:
         p.notes["time.column"] = f"one of {listed(column.name for column in clocks)}"
     days = [] if kinds["moment"] else kinds["day"][:1]
-    return [*days, times[0], *fractions] if times else clocks[:1]
+    return [*days, times[0], *kinds["fraction"][:1]] if times else clocks[:1]
 
 
 def _kind_of(column: Column) -> str:

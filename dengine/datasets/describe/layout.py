@@ -54,7 +54,6 @@ def layout_of(p: Proposal, files: Files) -> str:
         return "files"
     _refuse_results([*columns.values()])
     p.notes["layout"] = f"columns, a part in each, or long: part.column is of {listed(columns)}"
-    p.notes["channels"] = "they follow from layout"
     return UNKNOWN
 
 

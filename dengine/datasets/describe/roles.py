@@ -1,6 +1,5 @@
 """The role of each column: of rows, of the clock, of parts, labels and channels, or ignored."""
 
-import fnmatch
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -119,9 +118,9 @@ def propose_part(p: Proposal) -> None:
     sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
     least = len(p.places) / 2
     found = [s for s in sources if len({*part_words(s, p.places).values()}) > least]
-    names = [f"{source.line}{''.join(source.column)}" for source in found]
     if len(found) > 1:
-        p.notes["part.column"] = f"may be one of {listed(names)}"
+        names = listed(source.line or source.column[0] for source in found)
+        p.notes["part.column"] = f"may be one of {names}"
     elif p.description.part == PartSource() and found:
         p.description = replace(p.description, part=found[0])
 
@@ -195,16 +194,9 @@ def propose_lengths(p: Proposal) -> None:
 
 def list_others(p: Proposal) -> None:
     """List the columns without a role, and the files beside the recordings."""
-    description = p.description
-    names = {*p.others}.difference(s.listing for s in (description.label, *description.check))
-    for pattern in description.exclude:
-        names -= {*fnmatch.filter(names, pattern)}
-    others = sorted(names, key=natural_key)
-    text = f"not read, for they are of another form: {listed(others)}"
-    exclude = (*description.exclude, *others)
-    if UNKNOWN in exclude:
-        text, exclude = f"{text}; are these recordings? State files or exclude", (UNKNOWN,)
-    p.notes |= {"exclude": text} if others else {}
+    listings = {source.listing for source in (p.description.label, *p.description.check)}
+    others = sorted({*p.others} - listings, key=natural_key)
+    if UNKNOWN not in p.description.exclude and others:
+        p.put("exclude", others, f"not read, for they are of another form: {listed(others)}")
     units = {column.name: unit_in(column.name) or column.unit for column in p.unused}
-    ignored = units if description.layout != "columns" else {}
-    p.description = replace(description, ignored=ignored, exclude=exclude)
+    p.description = replace(p.description, ignored=units)

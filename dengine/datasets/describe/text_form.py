@@ -168,7 +168,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
     if sum(len(form.rows) >= LEAST_RUN for form in odd.values()) > 1:
-        p.put("exclude", UNKNOWN)
+        p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
 
 
 def _column_names(usual: Look) -> list[str]:
