@@ -187,19 +187,24 @@ def propose_label(p: Proposal) -> None:
     known = {s: {*s.good, *s.bad, *s.unchecked}.issuperset(w.values()) for s, w in counted.items()}
     certain = [s for s in counted if known[s] and any(sides_of(s, counted[s]).values())]
     chosen = certain or ([*counted] if len(counted) == 1 else [])
-    texts = [title_of(source, words) for source, words in counted.items()] or [NO_LABEL]
+    texts = []
     for other in certain[1:]:
         sides, others = (sides_of(source, counted[source]) for source in (certain[0], other))
         if n_other := sum(side * others.get(name, 0) < 0 for name, side in sides.items()):
-            texts.append(f"two of these disagree on {n_other:,} of {n:,} recordings")
+            texts = [f"two of these disagree on {n_other:,} of {n:,} recordings: which is right?"]
             chosen = []
     best = chosen[0] if chosen else replace(label, column=UNKNOWN)
     checks = [source for source in chosen[1:] if counted[source].keys() >= counted[best].keys()]
     p.description = replace(p.description, label=best, check=tuple(checks))
-    if UNKNOWN in best.good + best.bad:
-        text = f"which of the words? {title_of(best, counted[best])}"
-        p.notes |= {"label.good": text, "label.bad": text}
+    titles = [title_of(source, words) for source, words in counted.items() if source != best]
     few = [c for c in p.unused if 1 < len({*c.fixed}) <= MOST_WORDS and not chosen]
-    texts += [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]
+    titles += [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]
+    if chosen:
+        counts = counts_of(counted[best].values())
+        titles = [f"{counts}, over {n:,} recordings", *titles]
+        if UNKNOWN in best.good + best.bad:
+            p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")
+    elif not counted:
+        texts = [NO_LABEL]
     kind = next(kind for kind in KINDS if getattr(best, kind))
-    p.notes[f"label.{kind}"] = f"{'; '.join(texts)}; over {n:,} recordings"
+    p.notes[f"label.{kind}"] = "; ".join([*titles, *texts])
