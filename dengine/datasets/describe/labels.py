@@ -48,7 +48,7 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
-NO_LABEL = "none was found: state label.column, path, line or listing"
+NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
 Places = Mapping[str, Place]
@@ -63,18 +63,23 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     they mean what its name says: good for `success`, bad for `failed`.
     """
     words = sorted({*words})
-    name = source.column or source.line or source.topic
-    verdicts: Sequence[Sequence[str]] = (GOOD, BAD)
-    if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
-        verdicts = next(pair for pattern, *pair in MEANINGS if pattern.search(name))
+    verdicts = (*_verdicts(source, {word.lower() for word in words}), UNCHECKED)
     about: dict[str, Any] = {
         key: getattr(source, key) or tuple(word for word in words if word.lower() in some)
-        for key, some in zip(("good", "bad", "unchecked"), (*verdicts, UNCHECKED), strict=True)
+        for key, some in zip(("good", "bad", "unchecked"), verdicts, strict=True)
     }
     is_one_sided = source.path and not (about["good"] and about["bad"])
     if is_one_sided or {*words}.difference(*about.values()):
         about |= {key: about[key] or (UNKNOWN,) for key in ("good", "bad")}
     return replace(source, **about)
+
+
+def _verdicts(source: LabelSource, words: set[str]) -> Sequence[Sequence[str]]:
+    """Return the words for good and for bad in a source."""
+    name = source.column or source.line or source.topic
+    if not name or not words <= {*YES, *NO, *UNCHECKED}:
+        return GOOD, BAD
+    return next(pair for pattern, *pair in MEANINGS if pattern.search(name))
 
 
 def is_plain(source: LabelSource) -> bool:
@@ -162,49 +167,66 @@ def title_of(source: LabelSource, words: Words) -> str:
     return f"{stated} ({counts_of(words.values())})"
 
 
+def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
+    """Return the stated source, or all with words for most recordings, with their words."""
+    label, parts = p.description.label, part_words(p.description.part, places)
+    is_stated = any(getattr(label, kind) for kind in KINDS)
+    paths = [place.path for place in places.values()]
+    counted = dict[LabelSource, Words]()
+    for source in [label] if is_stated else sources_of(p, paths):
+        words = words_of(p, source, places, parts)
+        if is_stated or len(words) > len(places) / 2:
+            counted[with_meanings(source, words.values())] = words
+    return counted
+
+
 def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
-    """Return 1 for each recording with a word for good, -1 for bad, 0 for not checked."""
-    return {name: (word in source.good) - (word in source.bad) for name, word in words.items()}
+    """Return 1 for each recording with a word for good, -1 for bad, 0 for not checked.
+
+    There is none if the meaning of a word is not known, or no word is for good or bad.
+    """
+    is_known = {*source.good, *source.bad, *source.unchecked}.issuperset(words.values())
+    sides = {name: (word in source.good) - (word in source.bad) for name, word in words.items()}
+    return sides if is_known and any(sides.values()) else {}
 
 
 def propose_label(p: Proposal) -> None:
     """Find the source of the labels, and those that must agree with it.
 
-    A source has words for most recordings. The first whose words are known is the label if all such
-    agree with it, and the others are checks if they have a word for each recording. If one
-    disagrees, or there is none, the label is `?`, and the note lists them all.
+    The first source whose words are known is the label if all such agree with it, and the others
+    are checks if they have a word for each recording. If one disagrees, or there is none, the label
+    is `?`, and the note lists them all.
     """
     places = {name: Place(name, Table(name, {}, [])) for name in p.names} | {**p.places}
-    parts = part_words(p.description.part, places)
-    label, n = p.description.label, len(places)
-    is_stated = any(getattr(label, kind) for kind in KINDS)
-    sources = [label] if is_stated else sources_of(p, [place.path for place in places.values()])
-    counted = dict[LabelSource, Words]()
-    for source in sources:
-        words = words_of(p, source, places, parts)
-        if is_stated or len(words) > n / 2:
-            counted[with_meanings(source, words.values())] = words
-    known = {s: {*s.good, *s.bad, *s.unchecked}.issuperset(w.values()) for s, w in counted.items()}
-    certain = [s for s in counted if known[s] and any(sides_of(s, counted[s]).values())]
+    counted = count_sources(p, places)
+    sides = {source: sides_of(source, words) for source, words in counted.items()}
+    certain = [source for source in counted if sides[source]]
+    doubt = _disagreement([sides[source] for source in certain])
     chosen = certain or ([*counted] if len(counted) == 1 else [])
-    texts = []
-    for other in certain[1:]:
-        sides, others = (sides_of(source, counted[source]) for source in (certain[0], other))
-        if n_other := sum(side * others.get(name, 0) < 0 for name, side in sides.items()):
-            texts = [f"two of these disagree on {n_other:,} of {n:,} recordings: which is right?"]
-            chosen = []
-    best = chosen[0] if chosen else replace(label, column=UNKNOWN)
+    chosen = [] if doubt else chosen
+    best = chosen[0] if chosen else replace(p.description.label, column=UNKNOWN)
     checks = [source for source in chosen[1:] if counted[source].keys() >= counted[best].keys()]
     p.description = replace(p.description, label=best, check=tuple(checks))
-    titles = [title_of(source, words) for source, words in counted.items() if source != best]
-    few = [c for c in p.unused if 1 < len({*c.fixed}) <= MOST_WORDS and not chosen]
-    titles += [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]
+    others = [title_of(source, words) for source, words in counted.items() if source != best]
     if chosen:
         counts = counts_of(counted[best].values())
-        titles = [f"{counts}, over {n:,} recordings", *titles]
-        if UNKNOWN in best.good + best.bad:
-            p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")
-    elif not counted:
-        texts = [NO_LABEL]
-    kind = next(kind for kind in KINDS if getattr(best, kind))
-    p.notes[f"label.{kind}"] = "; ".join([*titles, *texts])
+        note = "; ".join([f"{counts}, over {len(places):,} recordings", *others])
+        open_keys = ("label.good", "label.bad") if UNKNOWN in best.good + best.bad else ()
+        p.notes |= dict.fromkeys(open_keys, f"which of the words? {counts}")
+        p.notes[f"label.{next(kind for kind in KINDS if getattr(best, kind))}"] = note
+    else:
+        p.notes["label.column"] = "; ".join([*others, *_few_words(p), doubt or NO_LABEL])
+
+
+def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
+    """Return on how many recordings a source disagrees with the first; "" if none does."""
+    for other in sides[1:]:
+        if n := sum(side * other.get(name, 0) < 0 for name, side in sides[0].items()):
+            return f"two of these disagree on {n:,} of {len(sides[0]):,} recordings"
+    return ""
+
+
+def _few_words(p: Proposal) -> list[str]:
+    """Return the columns of few words that may be labels under other names."""
+    few = [column for column in p.unused if 1 < len({*column.fixed}) <= MOST_WORDS]
+    return [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -31,30 +31,44 @@ def layout_of(p: Proposal, files: Files) -> str:
 
     Raises DataError for a table of results without samples.
     """
-    first, kind = files[0][0], p.description.format
-    if kind == "npz" and len(files[0]) > 1:
+    if p.description.format == "npz" and len(files[0]) > 1:
         return "npz"
-    is_json = kind in ("json", "jsonl") and (len(files) == 1 or len(files[0]) > 1)
-    has_curves = is_json and max(map(len, first.columns.values())) > 1
-    if kind == "ts" or has_curves or numbered_columns(first) or _has_lists(first):
+    if _is_wide(p.description.format, files):
         return "wide"
     tables = [tables[0] if len(tables) == 1 else join(tables) for tables in files]
     columns = columns_of(tables, TextForm())
     stated = [columns[name] for name in p.description.part.column if name in columns]
-    runs = [column for column in columns.values() if _has_runs(column)]
-    named = [column for column in runs if PART_NAME.search(column.name)]
-    if named or runs or any(len(column.counts) > 1 for column in stated):
-        numbered = [column for column in runs if re.search(r"\d", min(column.counts))]
-        best = named[:1] or numbered or runs
-        names = [column.name for column in named or runs]
-        note = f"one of {listed(names)}" if len(names) > 1 else ""
-        p.put("part.column", best[0].name if len(best) == 1 else UNKNOWN, note)
+    if _propose_part(p, columns.values()) or any(len(c.counts) > 1 for c in stated):
         return "long"
     if len(files) > 1:
         return "files"
-    _refuse_results([*columns.values()])
+    _refuse_results(columns.values())
     p.notes["layout"] = f"columns, a part in each, or long: part.column is of {listed(columns)}"
     return UNKNOWN
+
+
+def _is_wide(kind: str, files: Files) -> bool:
+    """Return whether a row, or an object, has all samples of a part."""
+    first = files[0][0]
+    is_json = kind in ("json", "jsonl") and (len(files) == 1 or len(files[0]) > 1)
+    has_curves = is_json and max(map(len, first.columns.values())) > 1
+    return kind == "ts" or has_curves or bool(numbered_columns(first)) or _has_lists(first)
+
+
+def _propose_part(p: Proposal, columns: Iterable[Column]) -> bool:
+    """Find the column that tells the parts of a table apart; return whether there is any.
+
+    It has the name of a part, or is the only one, or the only one whose words have numbers in them.
+    """
+    runs = [column for column in columns if _has_runs(column)]
+    named = [column for column in runs if PART_NAME.search(column.name)]
+    numbered = [column for column in runs if re.search(r"\d", min(column.counts))]
+    best = named[:1] or numbered or runs
+    names = [column.name for column in named or runs]
+    if runs:
+        note = f"one of {listed(names)}" if len(names) > 1 else ""
+        p.put("part.column", best[0].name if len(best) == 1 else UNKNOWN, note)
+    return bool(runs)
 
 
 def numbered_columns(table: Table) -> list[str]:
@@ -81,7 +95,7 @@ def _has_runs(column: Column) -> bool:
     return not (is_clock or is_fraction or column.forms)
 
 
-def _refuse_results(columns: Sequence[Column]) -> None:
+def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table with a row for each result, and no samples."""
     for column in columns:
         words = column.words[0]

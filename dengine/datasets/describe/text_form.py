@@ -149,7 +149,15 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
     usual = next(form for form in looks.values() if (form.width, form.line) == lines[0][0])
     odd = {name: form for name, form in looks.items() if not usual.is_like(form)}
-    same = [form for name, form in looks.items() if name not in odd]
+    p.others = [*p.others, *odd]
+    p.names = [name for name in p.names if name not in odd]
+    if sum(len(form.rows) >= LEAST_RUN for form in odd.values()) > 1:
+        p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
+    _propose_keys(p, usual, [form for name, form in looks.items() if name not in odd])
+
+
+def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
+    """Set the keys of `[text]` for files that are written like one."""
     above = usual.header if usual.header > 1 else 0
     values = {
         "encoding": min({form.encoding for form in same} - {"utf-8"}, default="utf-8"),
@@ -165,10 +173,6 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
     cells = {cell.strip() for form in same for row in form.rows for cell in row}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
-    p.others = [*p.others, *odd]
-    p.names = [name for name in p.names if name not in odd]
-    if sum(len(form.rows) >= LEAST_RUN for form in odd.values()) > 1:
-        p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
 
 
 def _column_names(usual: Look) -> list[str]:
