@@ -168,14 +168,18 @@ def title_of(source: LabelSource, words: Words) -> str:
 
 
 def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
-    """Return the stated source, or all with words for most recordings, with their words."""
+    """Return the stated source, or all with words for most recordings, with their words.
+
+    Of columns and lines, these are the recordings that were looked at.
+    """
     label, parts = p.description.label, part_words(p.description.part, places)
     is_stated = any(getattr(label, kind) for kind in KINDS)
     paths = [place.path for place in places.values()]
     counted = dict[LabelSource, Words]()
     for source in [label] if is_stated else sources_of(p, paths):
         words = words_of(p, source, places, parts)
-        if is_stated or len(words) > len(places) / 2:
+        looked_at = places if source.listing or source.path else p.places
+        if is_stated or len(words) > len(looked_at) / 2:
             counted[with_meanings(source, words.values())] = words
     return counted
 
@@ -210,7 +214,7 @@ def propose_label(p: Proposal) -> None:
     others = [title_of(source, words) for source, words in counted.items() if source != best]
     if chosen:
         counts = counts_of(counted[best].values())
-        note = "; ".join([f"{counts}, over {len(places):,} recordings", *others])
+        note = "; ".join([f"{counts}, over {len(counted[best]):,} recordings", *others])
         open_keys = ("label.good", "label.bad") if UNKNOWN in best.good + best.bad else ()
         p.notes |= dict.fromkeys(open_keys, f"which of the words? {counts}")
         p.notes[f"label.{next(kind for kind in KINDS if getattr(best, kind))}"] = note

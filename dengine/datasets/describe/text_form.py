@@ -140,7 +140,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     """Find the keys of `[text]` for most of the files, and leave out files of another form.
 
     These have another delimiter, another number of columns, or no column in common with most. If
-    several have samples, it is asked why. A header below other lines may stand elsewhere in others.
+    several have samples, it is asked why.
     """
     found = {name: look(content, p.stated) for name, content in contents.items()}
     looks = {name: form for name, form in found.items() if form is not None}
@@ -157,8 +157,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 
 
 def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
-    """Set the keys of `[text]` for files that are written like one."""
-    above = usual.header if usual.header > 1 else 0
+    """Set the keys of `[text]` for files like one; a header may stand at another line in each."""
+    above = 0 if all(form.header == usual.header for form in same) else usual.header
     values = {
         "encoding": min({form.encoding for form in same} - {"utf-8"}, default="utf-8"),
         "delimiter": usual.delimiter,
