@@ -14,6 +14,13 @@ from dengine.experiments.survey import survey_dataset
 from tests.support.command_line import dengine, document, well
 from training.make_recordings import write_plants, write_recordings
 
+# What nothing proves about a bag.
+BAG = {
+    "windows.trigger": "register=1@/phase",
+    "label.topic": "/height_check/ok",
+    "traces.samples": 200,
+}
+
 
 def shown(*words: object) -> str:
     """Return what a command prints that must succeed, its lines joined."""
@@ -108,12 +115,12 @@ def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder: Path) -> N
         ("latin", {}),
         ("historian", {}),
         ("wide", {}),
-        ("bag", {}),
+        ("bag", BAG),
         ("lab", {"channels.force": "N"}),
     ],
 )
 def test_the_recordings_of_five_plants_are_read_as_proposed(
-    plants: Path, plant: str, stated: dict[str, str]
+    plants: Path, plant: str, stated: dict[str, object]
 ) -> None:
     data = load_dataset(plants / plant, describe(plants / plant, stated))
     first = load_dataset(plants / "latin", describe(plants / "latin"))

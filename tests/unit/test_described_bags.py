@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dengine import Dataset, describe, load_dataset
+from dengine.cli.options import parse_stated
 from dengine.errors import DataError
 
 pytest.importorskip("mcap_ros2.writer", reason='mcap is not installed: pip install "dengine[mcap]"')
@@ -101,10 +102,16 @@ def bag() -> Bag:
     return Bag()
 
 
+STATED = {
+    "windows.trigger": f"register=1@{PHASE}",
+    "label.topic": CHECK,
+    "traces.samples": SAMPLES,
+}
+
+
 def read(path: Path, **stated: object) -> Dataset:
-    """Read a bag as proposed, with 60 samples for a part."""
-    keys = {name.replace("__", "."): value for name, value in stated.items()}
-    return load_dataset(path, describe(path, {"traces.samples": SAMPLES, **keys}))
+    """Read a bag by its proposal and three stated keys: its trigger, its labels and its lengths."""
+    return load_dataset(path, describe(path, {**STATED, **stated}))
 
 
 def listing(bag: Bag, path: Path) -> None:
@@ -118,11 +125,16 @@ def listing(bag: Bag, path: Path) -> None:
 
 
 @pytest.mark.parametrize("stamped", [True, False])
-def test_a_bag_is_cut_as_proposed_by_its_trigger_and_labelled_by_a_topic(
+def test_a_bag_is_cut_by_its_trigger_and_labelled_by_a_topic(
     bag: Bag, tmp_path: Path, stamped: bool
 ) -> None:
     bag.stamped = stamped
-    data = read(bag.write(tmp_path / "cell.mcap"))
+    proposal = describe(bag.write(tmp_path / "cell.mcap"))
+    assert sorted(proposal.open_keys) == sorted(STATED)
+    for key in ("windows.trigger", "label.topic"):
+        assert "/phase (1: 480, 0: 360)" in proposal.notes[key]
+        assert f"{CHECK} (" in proposal.notes[key]
+    data = read(tmp_path / "cell.mcap")
     np.testing.assert_array_equal(data.X, bag.fz)
     assert data.y.tolist() == bag.good.tolist()
     assert (data.rate_hz, data.unit) == (500.0, "N")
@@ -131,10 +143,13 @@ def test_a_bag_is_cut_as_proposed_by_its_trigger_and_labelled_by_a_topic(
     np.testing.assert_array_equal(both.X[:, 0], bag.traces[:, 0].astype(np.float32))
 
 
-def test_a_listing_of_starts_and_ends_cuts_a_bag_as_proposed(bag: Bag, tmp_path: Path) -> None:
+def test_a_listing_of_starts_and_ends_cuts_a_bag(bag: Bag, tmp_path: Path) -> None:
     bag.write(tmp_path / "cell.mcap")
     listing(bag, tmp_path / "cycles.csv")
-    data = load_dataset(tmp_path, describe(tmp_path))
+    windows = '{listing="cycles.csv", key="part", start="start", end="end", format="iso"}'
+    label = '{listing="cycles.csv", key="part", column="result", good="OK", bad="NOK"}'
+    stated = parse_stated([f"windows={windows}", f"label={label}", f"traces.samples={SAMPLES}"])
+    data = load_dataset(tmp_path, describe(tmp_path, stated))
     np.testing.assert_array_equal(data.X, bag.fz)
     assert data.y.tolist() == bag.good.tolist()
     assert data.part is not None
@@ -170,7 +185,7 @@ def test_a_file_that_was_not_closed_is_read_up_to_its_end_and_a_damaged_one_is_r
     bag: Bag, tmp_path: Path
 ) -> None:
     path = bag.write(tmp_path / "cell.mcap", chunk_bytes=4096)
-    description = describe(path, {"traces.samples": SAMPLES})
+    description = describe(path, STATED)
     content = path.read_bytes()
     path.write_bytes(content[: int(len(content) * 0.6)])
     data = load_dataset(path, description)

@@ -577,6 +577,15 @@ def test_rows_are_kept_or_lost_by_the_words_of_a_column(tmp_path: Path) -> None:
 # Descriptions.
 
 
+def test_a_label_in_a_column_is_counted_over_the_files_that_were_looked_at(tmp_path: Path) -> None:
+    for i in range(150):
+        rows = "".join(f"{k * 0.004:.3f},{k + i},{WORDS[i % 2]}\n" for k in range(8))
+        (tmp_path / f"part_{i}.csv").write_text(f"time,FZ,verdict\n{rows}")
+    proposal = describe(tmp_path)
+    assert (proposal.open_keys, proposal.label.column) == ((), "verdict")
+    assert proposal.notes["label.column"] == "NOK: 75, OK: 30, over 105 recordings"
+
+
 def test_a_stated_key_replaces_one_and_a_stated_source_the_others() -> None:
     d = Description(channels=(Channel("F.z", "N"), Channel("?")), label=LabelSource("verdict"))
     stated = d.with_values({"channels.F.z.limit": 100.0, "label.path": "(OK)"})

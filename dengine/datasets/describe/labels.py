@@ -5,17 +5,17 @@ the end of a name, a folder, a cell of a column, or a line, whose name is a verd
 """
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import combinations
-from pathlib import Path
+from dataclasses import replace
+from itertools import permutations
+from typing import Any
 
-from ...errors import DataError, listed
-from ..description import UNKNOWN, LabelSource, TextForm
-from ..read.places import SUFFIX, LabelReader, Place, listing_table, read_labels
-from ..table import UnreadableError
-from .cells import MOST_WORDS, Column, Notes, Values, counts_of
+from ...errors import DataError
+from ..description import UNKNOWN, LabelSource, PartSource
+from ..read.places import Place, listing_table, part_of, read_labels, without_suffix
+from ..table import Table, UnreadableError
+from .columns import MOST_WORDS, Column, Proposal, counts_of
 
 GOOD = (
     *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
@@ -26,7 +26,8 @@ BAD = (
     *("n.i.o.", "n.i.o", "n_i_o", "nio", "ng", "reject", "rejected", "不合格"),
 )
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
-YES, NO = ("1", "true", "yes", "ja"), ("0", "false", "no", "nein")
+YES = ("1", "true", "yes", "ja")
+NO = ("0", "false", "no", "nein")
 NAME = re.compile(
     r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
     r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)([^a-z]|$)"
@@ -37,6 +38,8 @@ BAD_NAME = re.compile(
 GOOD_NAME = re.compile(
     r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
 )
+# The words for good and for bad in a column of only YES and NO, by its name.
+MEANINGS = ((BAD_NAME, NO, YES), (GOOD_NAME, YES, NO), (re.compile(""), GOOD, BAD))
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
 NEGATED = re.compile(rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})")
@@ -45,201 +48,189 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
+NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
-Words = Sequence[str]
-Sources = list[LabelSource]
 Places = Mapping[str, Place]
-
-
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A source that may hold the labels, and the word of each recording that has one."""
-
-    source: LabelSource
-    words: Mapping[str, str]
-
-    @property
-    def kind(self) -> str:
-        """What kind of place it is."""
-        return next(kind for kind in KINDS if getattr(self.source, kind))
-
-    @property
-    def labels(self) -> dict[str, int | None]:
-        """The label of each recording whose word has a meaning that is known."""
-        reader = LabelReader(self.source)
-        meanings = {*self.source.good, *self.source.bad, *self.source.unchecked}
-        return {name: reader.meaning(w) for name, w in self.words.items() if w in meanings}
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the meaning of every word is known, and some word is a label."""
-        return len(self.labels) == len(self.words) and {*self.labels.values()} != {None}
-
-    @property
-    def title(self) -> str:
-        """What to type for it, with the counts of its words."""
-        keys = ("listing", "key", "column", "path", "line")
-        stated = [f"label.{key}={value}" for key in keys if (value := getattr(self.source, key))]
-        return f"{' '.join(stated)} ({counts_of(self.words.values())})"
-
-    def disagreements(self, other: "Candidate") -> int:
-        """Return for how many recordings that were checked another candidate has another label."""
-        pairs = [(label, other.labels.get(name)) for name, label in self.labels.items()]
-        return sum({*pair} == {0, 1} for pair in pairs)
+Words = Mapping[str, str]  # by recording
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     """Return a source with the meanings of its words; `?` for those that are not known.
 
-    Plain verdicts mean the same everywhere; `io` is one only beside `nio`, and in a path each is
-    one only if some part is good and some bad: `pass_1.csv` may be anything. True, yes and 1 mean
-    what the column's name says: good for `success`, bad for `failed`; of other names nothing.
+    Plain verdicts mean the same everywhere, but in a path each is one only if some part is good and
+    some bad: `pass_1.csv` may be anything. In a column of only true, yes or 1 and their opposites
+    they mean what its name says: good for `success`, bad for `failed`.
     """
     words = sorted({*words})
-    good, bad = _verdicts(source.column or source.line, {word.lower() for word in words})
-    kinds = {"good": good, "bad": bad, "unchecked": UNCHECKED}
-    meanings = {
-        key: tuple(w for w in words if w.lower() in verdicts) for key, verdicts in kinds.items()
+    verdicts = (*_verdicts(source, {word.lower() for word in words}), UNCHECKED)
+    about: dict[str, Any] = {
+        key: getattr(source, key) or tuple(word for word in words if word.lower() in some)
+        for key, some in zip(("good", "bad", "unchecked"), verdicts, strict=True)
     }
-    is_one_sided = source.path and not (meanings["good"] and meanings["bad"])
-    if is_one_sided or len(words) > sum(map(len, meanings.values())):
-        meanings |= {key: meanings[key] or (UNKNOWN,) for key in ("good", "bad")}
-    stated: Values = {key: getattr(source, key) or meanings[key] for key in kinds}
-    return replace(source, **stated)
+    is_one_sided = source.path and not (about["good"] and about["bad"])
+    if is_one_sided or {*words}.difference(*about.values()):
+        about |= {key: about[key] or (UNKNOWN,) for key in ("good", "bad")}
+    return replace(source, **about)
 
 
-def _verdicts(name: str, words: set[str]) -> tuple[Words, Words]:
-    """Return the words for good and for bad in a column or line of this name."""
+def _verdicts(source: LabelSource, words: set[str]) -> Sequence[Sequence[str]]:
+    """Return the words for good and for bad in a source."""
+    name = source.column or source.line or source.topic
     if not name or not words <= {*YES, *NO, *UNCHECKED}:
-        return [word for word in GOOD if word != "io" or "nio" in words], BAD
-    if BAD_NAME.search(name):
-        return NO, YES
-    is_good = GOOD_NAME.search(name) or (words & {"true", "false"} and NAME.search(name))
-    return (YES, NO) if is_good else ((), ())
+        return GOOD, BAD
+    return next(pair for pattern, *pair in MEANINGS if pattern.search(name))
 
 
-@dataclass(frozen=True, slots=True)
-class Labels:
-    """Finds the sources of labels of some recordings.
-
-    base : folder with the listings. places, parts : where each recording stands, and its part.
-    """
-
-    base: Path
-    places: Places
-    parts: Mapping[str, str]
-    form: TextForm
-
-    def candidate(self, source: LabelSource) -> Candidate:
-        """Return a source with the word of each recording that has one, and their meanings."""
-        words = dict[str, str]()
-        with suppress(DataError):
-            reader = read_labels(self.base, source, self.form)
-            for name, place in self.places.items():
-                with suppress(UnreadableError):
-                    words[name] = reader.words(place, self.parts.get(name, ""))[0]
-        return Candidate(with_meanings(source, words.values()), words)
-
-    def in_listings(self, names: Names) -> Sources:
-        """Return the columns of verdicts in files that list most recordings, with their key."""
-        sources: Sources = []
-        for name in names:
-            try:
-                table = listing_table(self.base / name, (), self.form)
-            except (DataError, ValueError):
-                continue
-            for key in table.columns:
-                plain = LabelSource(listing=name, key=key, column=key)
-                if len(self.candidate(plain).words) > len(self.places) / 2:
-                    verdicts = [c for c in table.columns if is_verdict(c, table.words(c))]
-                    sources += [replace(plain, column=c) for c in verdicts if c != key]
-                    break
-        return sources
+def is_plain(source: LabelSource) -> bool:
+    """Return whether a source has words for good or bad, and the meaning of all is known."""
+    words = source.good + source.bad
+    return bool(words) and UNKNOWN not in words
 
 
-def in_paths(paths: Names) -> Sources:
-    """Return the expressions that find verdicts in most paths; none if a not stands before one."""
-    stems = [SUFFIX.sub("", path) for path in paths]
-    sources: Sources = []
+def in_paths(paths: Names) -> list[str]:
+    """Return the expressions that find verdicts in paths; none if a not stands before one."""
+    stems = [*map(without_suffix, paths)]
+    patterns = []
     for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
-        words = [m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))]
-        if len(words) > len(stems) / 2:
-            used = sorted({*words}, key=lambda text: (-len(text), text))
-            sources.append(LabelSource(path=pattern.replace(WORD, "|".join(map(re.escape, used)))))
-    return sources
+        words = {m[1] for stem in stems if (m := re.search(f"(?i){pattern}", stem))}
+        used = sorted(map(re.escape, words), key=lambda text: (-len(text), text))
+        patterns += [pattern.replace(WORD, "|".join(used))] if words else []
+    return patterns
 
 
 def is_verdict(name: str, words: Names) -> bool:
     """Return whether a column has the name of a verdict, and few words; a single one is plain."""
     words = {*words}
-    source = with_meanings(LabelSource(column=name), words)
-    is_label = len(words) > 1 or bool(source.good or source.bad)
     is_named = NAME.search(name) or BAD_NAME.search(name)
-    return is_named is not None and is_label and len(words) <= MOST_WORDS
+    is_label = len(words) > 1 or is_plain(with_meanings(LabelSource(column=name), words))
+    return bool(is_named) and is_label and len(words) <= MOST_WORDS
 
 
-def in_columns(columns: Iterable[Column]) -> Sources:
-    """Return the columns of verdicts.
+def row_of(column: Column) -> str:
+    """Return which row of a recording has the label in a column, `same` or `last`; "" for none.
 
-    A label that changes within a recording is that of its last row, if above it stand only words
-    for not checked.
+    It is the last if above it stand only words for not checked.
     """
-    sources: Sources = []
-    for column in columns:
-        last = [str(words[-1]) for words in column.words if len(words)]
-        above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
-        if above <= {*UNCHECKED} and is_verdict(column.name, last):
-            sources.append(LabelSource(column=column.name, at="same" if column.fixed else "last"))
-    return sources
+    last = [str(words[-1]) for words in column.words if len(words)]
+    above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
+    row = "same" if column.fixed else "last"
+    return row if above <= {*UNCHECKED} and is_verdict(column.name, last) else ""
 
 
-def line_keys(above: Sequence[str]) -> list[str]:
-    """Return the beginnings of lines above a header, before the first mark."""
-    return [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0].strip(" \"'") for line in above]
+def lines_of(p: Proposal, pattern: re.Pattern[str]) -> list[str]:
+    """Return the beginnings of lines above a header, before the first mark, that a pattern fits."""
+    lines = [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
+    return [*filter(pattern.search, (line.strip(" \"'") for line in lines))]
 
 
-def in_lines(above: Sequence[str]) -> Sources:
-    """Return the beginnings of lines above a header that are the name of a verdict."""
-    return [LabelSource(line=key) for key in line_keys(above) if NAME.search(key)]
+def part_words(source: PartSource, places: Places) -> dict[str, str]:
+    """Return the number of the part of each recording that states one."""
+    words = dict[str, str]()
+    for name, place in places.items():
+        with suppress(DataError):
+            words[name] = part_of(source, place)
+    return words
 
 
-def choose(
-    candidates: Sequence[Candidate], notes: Notes, hints: Names, n: int
-) -> tuple[LabelSource, Sources]:
-    """Return the source of the labels, and those that must agree with it.
+def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
+    """Yield the sources that may hold labels: in listings, paths, columns and lines."""
+    label = p.description.label
+    for name in p.others:
+        with suppress(DataError, ValueError):
+            table = listing_table(p.base / name, (), p.description.text)
+            for key, column in permutations(table.columns, 2):
+                if is_verdict(column, table.words(column)):
+                    yield replace(label, listing=name, key=key, column=column)
+    if p.description.layout in ("files", "columns"):
+        yield from (replace(label, path=path) for path in in_paths(paths))
+    rows = {column.name: row_of(column) for column in p.unused}
+    yield from (replace(label, column=name, at=row) for name, row in rows.items() if row)
+    yield from (replace(label, line=line) for line in lines_of(p, NAME))
 
-    The first candidate whose words are known is the label if all such agree, and the others are
-    checks if they have a word for each recording. If two disagree, or there is none, the label is
-    `?`, and the note lists them all.
 
-    hints : columns that may hold labels under other names. n : recordings that were looked at.
+def words_of(p: Proposal, source: LabelSource, places: Places, parts: Words) -> Words:
+    """Return the word of each recording that has one in a source."""
+    words = dict[str, str]()
+    with suppress(DataError):
+        reader = read_labels(p.base, source, p.description.text)
+        for name, place in places.items():
+            with suppress(UnreadableError):
+                words[name] = reader.words(place, parts.get(name, ""))[0]
+    return words
+
+
+def title_of(source: LabelSource, words: Words) -> str:
+    """Return what to type for a source, with the counts of its words."""
+    keys = [key for key in ("listing", "key", *KINDS[1:]) if getattr(source, key)]
+    stated = " ".join(f"label.{key}={getattr(source, key)}" for key in keys)
+    return f"{stated} ({counts_of(words.values())})"
+
+
+def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
+    """Return the stated source, or all with words for most recordings, with their words.
+
+    Of columns and lines, these are the recordings that were looked at.
     """
-    certain = [candidate for candidate in candidates if candidate.is_known]
-    over = f"over {n:,} recordings"
-    if text := _disagreement(certain):
-        notes["label.column"] = f"{text} of {n:,} recordings: which is right?"
-        return LabelSource(column=UNKNOWN), []
-    if certain or len(candidates) == 1:
-        best, *others = certain or candidates
-        checks = [other for other in others if other.words.keys() >= best.words.keys()]
-        counts = counts_of(best.words.values())
-        kinds = {True: "agrees", False: "of unknown meaning"}
-        also = [f"{kinds[c in certain]}: {c.title}" for c in candidates if c is not best]
-        notes[f"label.{best.kind}"] = "; ".join([f"{counts}, {over}", *also])
-        if UNKNOWN in best.source.good + best.source.bad:
-            notes["label.good"] = notes["label.bad"] = f"which of the words? {counts}"
-        return best.source, [check.source for check in checks]
-    titles = "; ".join([candidate.title for candidate in candidates])
-    text = titles or "none was found: state label.column, path, line or listing"
-    few = f"; columns of few words: {columns}" if (columns := listed(hints)) else ""
-    notes["label.column"] = f"{text}{few}; {over}"
-    return LabelSource(column=UNKNOWN), []
+    label, parts = p.description.label, part_words(p.description.part, places)
+    is_stated = any(getattr(label, kind) for kind in KINDS)
+    paths = [place.path for place in places.values()]
+    counted = dict[LabelSource, Words]()
+    for source in [label] if is_stated else sources_of(p, paths):
+        words = words_of(p, source, places, parts)
+        looked_at = places if source.listing or source.path else p.places
+        if is_stated or len(words) > len(looked_at) / 2:
+            counted[with_meanings(source, words.values())] = words
+    return counted
 
 
-def _disagreement(candidates: Sequence[Candidate]) -> str:
-    """Return which two candidates disagree, and on how many recordings; "" if all agree."""
-    for first, second in combinations(candidates, 2):
-        if count := first.disagreements(second):
-            return f"{first.title} and {second.title} disagree on {count:,}"
+def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
+    """Return 1 for each recording with a word for good, -1 for bad, 0 for not checked.
+
+    There is none if the meaning of a word is not known, or no word is for good or bad.
+    """
+    is_known = {*source.good, *source.bad, *source.unchecked}.issuperset(words.values())
+    sides = {name: (word in source.good) - (word in source.bad) for name, word in words.items()}
+    return sides if is_known and any(sides.values()) else {}
+
+
+def propose_label(p: Proposal) -> None:
+    """Find the source of the labels, and those that must agree with it.
+
+    The first source whose words are known is the label if all such agree with it, and the others
+    are checks if they have a word for each recording. If one disagrees, or there is none, the label
+    is `?`, and the note lists them all.
+    """
+    places = {name: Place(name, Table(name, {}, [])) for name in p.names} | {**p.places}
+    counted = count_sources(p, places)
+    sides = {source: sides_of(source, words) for source, words in counted.items()}
+    certain = [source for source in counted if sides[source]]
+    doubt = _disagreement([sides[source] for source in certain])
+    chosen = certain or ([*counted] if len(counted) == 1 else [])
+    chosen = [] if doubt else chosen
+    best = chosen[0] if chosen else replace(p.description.label, column=UNKNOWN)
+    checks = [source for source in chosen[1:] if counted[source].keys() >= counted[best].keys()]
+    p.description = replace(p.description, label=best, check=tuple(checks))
+    others = [title_of(source, words) for source, words in counted.items() if source != best]
+    if chosen:
+        counts = counts_of(counted[best].values())
+        note = "; ".join([f"{counts}, over {len(counted[best]):,} recordings", *others])
+        open_keys = ("label.good", "label.bad") if UNKNOWN in best.good + best.bad else ()
+        p.notes |= dict.fromkeys(open_keys, f"which of the words? {counts}")
+        p.notes[f"label.{next(kind for kind in KINDS if getattr(best, kind))}"] = note
+    else:
+        p.notes["label.column"] = "; ".join([*others, *_few_words(p), doubt or NO_LABEL])
+
+
+def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
+    """Return on how many recordings a source disagrees with the first; "" if none does."""
+    for other in sides[1:]:
+        if n := sum(side * other.get(name, 0) < 0 for name, side in sides[0].items()):
+            return f"two of these disagree on {n:,} of {len(sides[0]):,} recordings"
     return ""
+
+
+def _few_words(p: Proposal) -> list[str]:
+    """Return the columns of few words that may be labels under other names."""
+    few = [column for column in p.unused if 1 < len({*column.fixed}) <= MOST_WORDS]
+    return [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]

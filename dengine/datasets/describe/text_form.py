@@ -3,23 +3,26 @@
 Each value follows from a count over the lines that were looked at; where two fit, it is `?`.
 """
 
+import codecs
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
+from ...errors import DataError, listed
 from ..description import UNKNOWN
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..units import is_unit
-from .cells import NUMBER, Notes, Stated, Values
+from .columns import LEAST_RUN, NUMBER, Proposal, Stated
 
 DELIMITERS = (";", "\t", "|", ",", BLANK)
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
 GROUPS = "'’\u202f\xa0 "  # marks between groups of digits that are no decimal mark
 HEAD_BYTES = 400_000
+LATIN = "cp1252"
 MOST_LINES = 200  # of a file that are looked at
 MOST_NAMES = 20  # columns without a header that get a name each
 MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
@@ -35,71 +38,72 @@ DECIMAL = {
     )
     for mark, m in ((".", r"\."), (",", ","))
 }
-Row = Sequence[str]
+Rows = Sequence[Sequence[str]]
 
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """The first lines of a file, and where its samples are.
+    """The first lines of a file.
 
-    places : the lines of the header, the units and the first samples, from 1; 0 for none.
-    width : cells of a row.
+    width : cells of a row. header, units, data : the lines of the header, the units and the first
+    samples, from 1; 0 for none. line : the header. rows : the cells of the samples.
     """
 
-    lines: Row
     encoding: str
     delimiter: str
     width: int
-    places: tuple[int, int, int]
+    header: int
+    units: int
+    data: int
+    line: str
+    rows: Rows
 
     @property
     def names(self) -> list[str]:
         """The names in the header."""
-        header = self.places[0]
-        line = COMMENT.sub("", self.lines[header - 1].lstrip()) if header else ""
-        return header_names(split_line(line, self.delimiter)) if header else []
+        line = COMMENT.sub("", self.line.lstrip())
+        return header_names(split_line(line, self.delimiter))
 
-    @property
-    def rows(self) -> list[list[str]]:
-        """The cells of the lines of samples."""
-        return [split_line(line, self.delimiter) for line in self.lines[self.places[2] - 1 :]]
+    def is_like(self, other: "Look") -> bool:
+        """Return whether another file has this form, and a column in common."""
+        is_same = (self.delimiter, self.width) == (other.delimiter, other.width)
+        return is_same and (not self.line or not {*self.names}.isdisjoint(other.names))
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
     """Return how a file is written, by its first lines; None if it is no text."""
-    encoding, text = decode(content, stated.get("text.encoding"))
+    encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.splitlines()[:MOST_LINES]
     if "\0" in text or not text.strip():
         return None
-    candidates = (stated["text.delimiter"],) if "text.delimiter" in stated else DELIMITERS
-    shapes = {mark: _share_of_numbers(lines, mark) for mark in candidates}
-    delimiter = max(shapes, key=lambda mark: shapes[mark][0])
-    share, width = shapes[delimiter]
+    marks = stated.get("text.delimiter", DELIMITERS)
+    share, width, delimiter = max((*_share_of_numbers(lines, mark), mark) for mark in marks)
     if share == 0:  # a single column
         delimiter, width = ",", 1
     rows = [split_line(line, delimiter) if line.strip() else [] for line in lines]
     data = _first_row(rows, width)
-    above = [i + 1 for i in range(data) if len(rows[i]) >= width and any(map(str.strip, rows[i]))]
-    units = above.pop() if len(above) > 1 and _are_units(rows[above[-1] - 1]) else 0
-    header = above[-1] if above else 0
-    return Look(lines, encoding, delimiter, width, (header, units, data + 1))
+    heads = [i for i in range(data) if len(rows[i]) >= width and any(map(str.strip, rows[i]))]
+    units = heads.pop() + 1 if len(heads) > 1 and _are_units(rows[heads[-1]]) else 0
+    header = heads[-1] + 1 if heads else 0
+    line = lines[header - 1] if header else ""
+    return Look(encoding, delimiter, width, header, units, data + 1, line, rows[data:])
 
 
-def decode(content: bytes, stated: str | None) -> tuple[str, str]:
-    """Return the encoding of a text and its first part: what is stated, else UTF-8 or 16."""
-    head = content[:HEAD_BYTES]
-    head = head[: head.rfind(b"\n") + 1] or head
-    is_wide = content[:2] in (b"\xff\xfe", b"\xfe\xff")
-    if is_wide:
-        head = content[: len(head) // 2 * 2]
-    encoding = stated or ("utf-16" if is_wide else "utf-8")
-    with suppress(UnicodeDecodeError):
-        return encoding, head.decode(encoding).removeprefix("\ufeff")
-    encoding = stated or "cp1252"
-    return encoding, head.decode(encoding, "replace")
+def decode(content: bytes, stated: str) -> tuple[str, str]:
+    """Return the encoding of a text and its first part, "" if it is none.
+
+    The encoding is what is stated, else UTF-16 by the mark at its beginning, UTF-8 or cp1252.
+    """
+    is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
+    for encoding in [stated] if stated else encodings:
+        with suppress(UnicodeDecodeError):
+            text = codecs.getincrementaldecoder(encoding)().decode(content[:HEAD_BYTES])
+            return encoding, text.removeprefix("\ufeff")
+    return "", ""
 
 
-def _share_of_numbers(lines: Row, delimiter: str) -> tuple[float, int]:
+def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]:
     """Return how well a delimiter parts lines into rows of numbers, and the cells of a row.
 
     The share is that of the lines with the usual number of cells, times that of numbers in their
@@ -115,97 +119,95 @@ def _share_of_numbers(lines: Row, delimiter: str) -> tuple[float, int]:
     return round(share / (BLANKS_LEAD if delimiter == BLANK else 1), 2), width
 
 
-def _count_numbers(cells: Row) -> int:
+def _count_numbers(cells: Sequence[str]) -> int:
     """Return how many cells are numbers."""
     return sum(1 for cell in cells if NUMBER.fullmatch(cell))
 
 
-def _first_row(rows: Sequence[Row], width: int) -> int:
+def _first_row(rows: Rows, width: int) -> int:
     """Return the first row of samples: as many numbers as usual, as have those behind it."""
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
-def _are_units(row: Row) -> bool:
+def _are_units(row: Sequence[str]) -> bool:
     """Return whether the cells of a row that are filled are units."""
-    cells = [cell.strip() for cell in row if cell.strip()]
-    return all(is_unit(cell) or UNIT_WORDS.fullmatch(cell) for cell in cells)
+    return all(is_unit(c) or UNIT_WORDS.fullmatch(c) for c in map(str.strip, row) if c)
 
 
-def describe_form(looks: Mapping[str, Look], notes: Notes) -> tuple[Values, list[str]]:
-    """Return the keys of `[text]` for most of the files, and the files of another form.
+def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
+    """Find the keys of `[text]` for most of the files, and leave out files of another form.
 
-    These have another delimiter, another number of columns, or no column in common with most.
+    These have another delimiter, another number of columns, or no column in common with most. If
+    several have samples, it is asked why.
     """
-    usual, same = _usual(looks)
-    header, units, data = usual.places
-    encoding = min({look.encoding for look in same} - {"utf-8"}, default="utf-8")
-    if encoding == "cp1252":
-        notes["text.encoding"] = "not UTF-8; cp1252 reads any text: look at the letters below"
-    values: Values = {"text.encoding": encoding, "text.delimiter": usual.delimiter}
-    values |= {"text.header": header, "text.units": units, "text.data": data}
-    if len({look.places for look in same}) > 1 and header:
-        notes["text.header"] = "it stands at another line in each file"
-        first, mark, _ = usual.lines[header - 1].partition(usual.delimiter)
-        values |= {"text.header": first + mark, "text.data": data - header}
-        values["text.units"] = units and units - header
-    if missing := _missing_names(usual):
-        values["text.names"] = missing
-        notes["text.names"] = "no header names each column"
-    cells = {cell.strip() for look in same for row in look.rows for cell in row}
-    values |= marks([cell for cell in cells if NUMBER.fullmatch(cell)], notes)
-    return values, [name for name, look in looks.items() if look not in same]
+    found = {name: look(content, p.stated) for name, content in contents.items()}
+    looks = {name: form for name, form in found.items() if form is not None}
+    if not looks:
+        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
+    lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
+    usual = next(form for form in looks.values() if (form.width, form.line) == lines[0][0])
+    odd = {name: form for name, form in looks.items() if not usual.is_like(form)}
+    p.others = [*p.others, *odd]
+    p.names = [name for name in p.names if name not in odd]
+    if sum(len(form.rows) >= LEAST_RUN for form in odd.values()) > 1:
+        p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
+    _propose_keys(p, usual, [form for name, form in looks.items() if name not in odd])
 
 
-def _usual(looks: Mapping[str, Look]) -> tuple[Look, list[Look]]:
-    """Return a file like most, and those that are written in its form."""
-    forms = Counter((look.delimiter, look.width) for look in looks.values())
-    same = [x for x in looks.values() if (x.delimiter, x.width) == forms.most_common(1)[0][0]]
-    places = Counter(look.places for look in same).most_common(1)[0][0]
-    usual = next(look for look in same if look.places == places)
-    names = {*usual.names}
-    return usual, [look for look in same if not names or not names.isdisjoint(look.names)]
+def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
+    """Set the keys of `[text]` for files like one; a header may stand at another line in each."""
+    above = 0 if all(form.header == usual.header for form in same) else usual.header
+    values = {
+        "encoding": min({form.encoding for form in same} - {"utf-8"}, default="utf-8"),
+        "delimiter": usual.delimiter,
+        "header": usual.line if above else usual.header,
+        "units": usual.units and usual.units - above,
+        "data": usual.data - above,
+        "names": _column_names(usual),
+    }
+    for key, value in values.items():
+        p.put(f"text.{key}", value)
+    if p.description.text.encoding == LATIN:
+        p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
+    cells = {cell.strip() for form in same for row in form.rows for cell in row}
+    propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
-def _missing_names(usual: Look) -> list[str]:
+def _column_names(usual: Look) -> list[str]:
     """Return names for the columns where the header does not give one for each; else none.
 
     In a matrix, whose rows are parts, a first column of few whole numbers is their class.
     """
-    names, width = usual.names, usual.width
-    if names or width < MOST_NAMES:
-        numbered = [f"c{i}" for i in range(width)]
-        return (names[:width] if len(names) > width else []) if names else numbered
+    width = usual.width
+    if usual.line:
+        return usual.names[:width] if len(usual.names) > width else []
+    if width < MOST_NAMES:
+        return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
-    is_class = 1 < len(firsts) <= MOST_CLASSES and len(firsts) < len(seconds)
+    is_class = 1 < len(firsts) <= min(MOST_CLASSES, len(seconds) - 1)
     return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
 
 
-def marks(cells: Iterable[str], notes: Notes) -> Values:
-    """Return the decimal mark and that of groups, which numbers prove.
+def propose_marks(p: Proposal, cells: Collection[str]) -> None:
+    """Find the decimal mark and that of groups, which numbers prove.
 
     A mark is a decimal one where other than three digits follow it, it follows a 0 or more than
     three digits, or stands behind the other mark: `0,004` and `1.043,5` prove a comma, `1.043`
     proves nothing. Where both fit, the decimal mark is `?`.
     """
-    counts = {mark: _count_marks(cells, mark) for mark in ".,"}
+    seen = {mark: [cell for cell in cells if mark in cell] for mark in ".,"}
+    proofs = {mark: len([*filter(DECIMAL[mark].fullmatch, seen[mark])]) for mark in ".,"}
     text = "\n".join(cells)
     group = next((mark for mark in GROUPS if re.search(rf"\d{mark}\d{{3}}", text)), "")
-    for decimal, other in (".,", ",."):
-        (_, proof, _), (n_other, against, repeats) = counts[decimal], counts[other]
-        if proof > 20 * against or (repeats and not against):
-            return {"text.decimal": decimal, "text.thousands": other if n_other else group}
-    example = min(filter(re.compile("[.,]").search, cells), default="")
-    text = "both marks are used for decimals, in other files or columns"
-    if not counts["."][1] and not counts[","][1]:
-        text = f"'.' or ','; {example} may be a fraction or a thousand"
-    notes |= {"text.decimal": text} if example else {}
-    return {"text.decimal": UNKNOWN if example else ".", "text.thousands": group}
-
-
-def _count_marks(cells: Iterable[str], mark: str) -> tuple[int, int, int]:
-    """Return how many numbers have a mark, prove that it is the decimal one, or have it twice."""
-    seen = [cell for cell in cells if mark in cell]
-    proofs = [cell for cell in seen if DECIMAL[mark].fullmatch(cell)]
-    return len(seen), len(proofs), sum(cell.count(mark) > 1 for cell in seen)
+    example = min(seen["."] + seen[","], default="")
+    note = f"'.' or ','; {example} may be a fraction or a thousand" if example else ""
+    decimal = UNKNOWN if example else "."
+    for mark, other in (".,", ",."):
+        repeats = any(cell.count(other) > 1 for cell in seen[other])
+        if proofs[mark] > 20 * proofs[other] or (repeats and not proofs[other]):
+            decimal, note = mark, ""
+            group = other if seen[other] else group
+    p.put("text.decimal", decimal, note)
+    p.put("text.thousands", group)

@@ -1,0 +1,160 @@
+"""`Column`, what the cells of one column are in all recordings, and `Proposal`, what is known."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import DataError
+from ..description import Description, TextForm
+from ..read.clock import ISO
+from ..read.places import Place
+from ..read.split import column_kinds
+from ..table import Table
+from ..units import bare
+
+DAY = "%Y-%m-%d"
+DAYS = ("%d.%m.%Y", "%Y/%m/%d", "%m/%d/%Y", "%d/%m/%Y", "%d.%m.%y", "%d-%b-%y", "%d-%b-%Y")
+TIMES = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%I:%M:%S.%f %p", "%I:%M:%S %p")
+MOMENTS = (f"{day} {time}" for day in DAYS for time in TIMES)
+ZONED = ("%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f")
+FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
+LIKE_A_TIME = r"^\d+[:\-./T](?:\d+|[A-Za-z]{3})[:\-./T]\d|^\d+:\d+\.\d|^\d{8}T\d{6}"
+LEAST_RUN = 8  # rows of a part
+MOST_WORDS = 12  # that are told apart, as labels
+MOST_CELLS = 20  # of a recording whose form of times is looked at
+# A number with any decimal mark and any mark of groups.
+NUMBER = re.compile(
+    r"\s*[-+−]?(?=[.,]?\d)(\d{1,3}([ '’\u202f\xa0.,]\d{3})+|\d*)([.,]\d*)?([eE][-+]?\d+)?\s*"
+)
+Stated = Mapping[str, Any]
+Tables = Sequence[Table]
+Floats = NDArray[np.float64]
+
+
+def counts_of(words: Iterable[str]) -> str:
+    """Return how often each word comes, most frequent first."""
+    return ", ".join(f"{w or 'empty'}: {n:,}" for w, n in Counter(words).most_common(MOST_WORDS))
+
+
+@dataclass
+class Column:
+    """One column in the tables that have it."""
+
+    name: str
+    tables: Tables
+    form: TextForm
+
+    @cached_property
+    def words(self) -> list[NDArray[Any]]:
+        """The words of each recording."""
+        return [table.words(self.name) for table in self.tables]
+
+    @cached_property
+    def counts(self) -> Counter[str]:
+        """How often each word comes."""
+        return Counter(np.concatenate(self.words).tolist())
+
+    @cached_property
+    def odd(self) -> Counter[str]:
+        """How often each word comes that is no number."""
+        return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
+
+    @cached_property
+    def fixed(self) -> list[str]:
+        """The word of each recording; none if it changes within one."""
+        is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
+        return [str(words[0]) for words in self.words] if is_fixed else []
+
+    @cached_property
+    def numbers(self) -> list[Floats]:
+        """The numbers of each recording; none if a cell is none."""
+        with suppress(DataError):
+            return [table.numbers(self.name, self.form) for table in self.tables]
+        return []
+
+    @cached_property
+    def steps(self) -> Floats:
+        """The steps from number to number within the recordings."""
+        return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
+
+    @cached_property
+    def unit(self) -> str:
+        """The unit that most files state for it; "" if none does."""
+        units = Counter(bare(table.units.get(self.name, "")) for table in self.tables)
+        return units.most_common(1)[0][0]
+
+    @cached_property
+    def forms(self) -> list[str]:
+        """All forms of dates and times that fit its cells."""
+        import pandas as pd
+
+        if self.tables[0].columns[self.name].dtype.kind == "M":
+            return [ISO]
+        cells = {word for words in self.words for word in (*words[:MOST_CELLS], *words[-1:])}
+        texts = pd.Series(sorted(cells), dtype=object)
+        if not cells or not texts.str.contains(LIKE_A_TIME).all():
+            return []
+        forms = [form for form in FORMS if _fits(texts, form)]
+        return forms[:1] if forms[:1] in ([DAY], [ISO]) else forms
+
+
+def _fits(texts: Any, form: str) -> bool:
+    """Return whether all texts are dates or times of a form."""
+    import pandas as pd
+
+    texts = texts.str.replace(",", ".") if "%f" in form else texts
+    form = "ISO8601" if form == ISO else form
+    return not pd.to_datetime(texts, format=form, errors="coerce", utc=True).isna().any()
+
+
+def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
+    """Return the columns of the first table, each with the tables that have it."""
+    names = tables[0].columns if tables else ()
+    return {name: Column(name, [t for t in tables if name in t.columns], form) for name in names}
+
+
+@dataclass
+class Proposal:
+    """A description that is put together key by key, and what its keys are inferred from.
+
+    stated : keys that the user knows. base : the folder. names : of all recordings, if each is a
+    file. others : of the files beside them. is_cut : whether some file was read in part. places :
+    where each recording stands that was looked at, by its source. columns : of the rows that are
+    samples, as far as that is known.
+    """
+
+    stated: Stated
+    description: Description
+    base: Path = Path()
+    names: Sequence[str] = ()
+    others: Sequence[str] = ()
+    is_cut: bool = False
+    places: Mapping[str, Place] = field(default_factory=dict)
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def put(self, key: str, value: Any, note: str = "") -> None:
+        """Set a key like `time.column`, with a note on it, unless the user stated it."""
+        if key not in self.stated:
+            self.description = self.description.with_values({key: value})
+            self.notes |= {key: note} if note else {}
+
+    @property
+    def tables(self) -> list[Table]:
+        """The table of each recording that was looked at."""
+        return [place.table for place in self.places.values()]
+
+    @property
+    def unused(self) -> list[Column]:
+        """The columns that have no role yet."""
+        is_number, is_word = column_kinds(self.description)
+        names = [name for name in self.columns if not (is_number(name) or is_word(name))]
+        return [self.columns[name] for name in names]
