@@ -6,29 +6,31 @@ another topic has the newest `data` of it.
 """
 
 import struct
-from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import replace
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...errors import DataError, listed
+from ...errors import DataError, instead, listed
 from ...files import UNREADABLE, check_size, read_errors
 from ..dataset import Fault
 from ..description import Description
 from ..table import Table, UnreadableError
+from .files import caught
 from .frames import as_cells
 from .split import Parts, signals_of
-from .windows import cut, label_events
+from .windows import cut
 
 SUFFIX = ".mcap"
 STAMP, LOG_TIME = "stamp", "log_time"
 MESSAGE_BYTES = 1000.0  # in memory
 RECOVER = "mcap recover or ros2 bag reindex may save what is whole"
 Message = tuple[str, str, int, Any]  # topic, type, nanoseconds of the log, message
+Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, data
 
 
 def read_messages(
@@ -67,73 +69,6 @@ def read_messages(
         notes.append(f"{path.name} was not closed: {n} messages before its end are read.")
 
 
-def value_of(message: Any, path: str) -> Any:
-    """Return a field of a message, like `wrench.force.z`; UnreadableError if it has none such."""
-    for name in path.split("."):
-        if not hasattr(message, name):
-            fields = listed(getattr(message, "__slots__", ()))
-            raise UnreadableError(f"Expected a field {path}, got {fields}", column=path)
-        message = getattr(message, name)
-    return message
-
-
-@dataclass
-class Bag:
-    """The messages of a bag that a description needs.
-
-    topic : that of the channels. others : topics whose `data` is read. rows : for each message of
-    the channels the times of the log and of its header, in nanoseconds, and their values. events :
-    for each other topic its messages, as (nanoseconds of the log, value).
-    """
-
-    topic: str
-    fields: Sequence[str]
-    others: Collection[str]
-    rows: list[tuple[int, int, list[Any]]] = field(default_factory=list)
-    events: dict[str, list[tuple[int, Any]]] = field(default_factory=lambda: defaultdict(list))
-
-    def add(self, messages: Iterable[Message]) -> None:
-        """Add messages; raise UnreadableError if one lacks a field."""
-        for topic, _, logged, message in messages:
-            if topic in self.others:
-                self.events[topic].append((logged, value_of(message, "data")))
-            if topic == self.topic:
-                stamp = getattr(getattr(message, "header", None), "stamp", None)
-                time = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-                values = [value_of(message, name) for name in self.fields]
-                self.rows.append((logged, time, values))
-
-    def table(self, name: str, columns: Sequence[str]) -> Table:
-        """Return a table with a row for each message of the channels, in the order of the log.
-
-        It has the column `stamp` only if all messages have one.
-        """
-        self.rows.sort(key=lambda row: row[0])
-        logs, stamps, values = zip(*self.rows, strict=True)
-        cells = dict(zip(columns, map(as_cells, zip(*values, strict=True)), strict=True))
-        cells |= {LOG_TIME: as_cells(logs)} | ({STAMP: as_cells(stamps)} if all(stamps) else {})
-        for topic, events in self.events.items():
-            events.sort(key=lambda event: event[0])
-            begins = np.array([time for time, _ in events])
-            newest = [None, *(value for _, value in events)]
-            places = np.searchsorted(begins, cells[LOG_TIME], side="right")
-            cells[topic] = as_cells([newest[place] for place in places.tolist()])
-        return Table(name, cells, [])
-
-
-def bag_of(description: Description) -> Bag:
-    """Return an empty bag for a description; DataError if its channels are of several topics."""
-    pairs = [channel.column.partition(".") for channel in description.channels]
-    topics = sorted({topic for topic, _, _ in pairs})
-    if len(topics) != 1:
-        raise DataError(f"Expected channels of one topic, got {listed(topics)}.")
-    sources = (description.label, *description.check)
-    others = {source.topic for source in sources} | {*description.part.column, description.order}
-    others |= {*signals_of(description)}
-    others = {name for name in others if name.startswith("/") and "." not in name}
-    return Bag(topics[0], [name for _, _, name in pairs], others)
-
-
 def split_bag(
     files: Sequence[tuple[Path, str]],
     description: Description,
@@ -142,6 +77,8 @@ def split_bag(
     faults: list[Fault],
 ) -> Parts:
     """Yield each part of a bag, with the labels of its topics; see `windows.cut`.
+
+    The label is the first message of its topic after the part began, and before the next one did.
 
     Parameters
     ----------
@@ -159,21 +96,63 @@ def split_bag(
         If the topic of the channels has no messages, or if a file before the last is not whole and
         a trigger cuts.
     """
-    bag = bag_of(description)
+    verdicts = {source.topic for source in (description.label, *description.check)} - {""}
+    others = verdicts.union(description.part.column, signals_of(description), [description.order])
+    events: Events = {name: [] for name in others if name.startswith("/") and "." not in name}
+    table = _joined(files, description, events, notes, faults)
+    parts = [
+        *cut(table, files[0][1] if len(files) == 1 else base.resolve().name, description, base)
+    ]
+    begins = np.array([part.columns[LOG_TIME][0] for *_, part in parts])
+    for source, key, part in parts:
+        begin = part.columns[LOG_TIME][0]
+        end = min(begins[begins > begin], default=2**63)
+        words = {
+            topic: [word for time, word in events[topic] if begin <= time < end][:1]
+            for topic in verdicts
+        }
+        labels = {topic: np.array(some, dtype=object) for topic, some in words.items()}
+        yield source, key, replace(part, columns={**part.columns, **labels})
+
+
+def _joined(
+    files: Sequence[tuple[Path, str]],
+    description: Description,
+    events: Events,
+    notes: list[str],
+    faults: list[Fault],
+) -> Table:
+    """Return a table with a row for each message of the channels, in the order of the log.
+
+    The messages of other topics are put into `events`, and the newest of each is a column.
+    """
+    columns = [channel.column for channel in description.channels]
+    fields = [attrgetter(column.partition(".")[2]) for column in columns]
+    topics = {column.partition(".")[0] for column in columns}
+    if len(topics) > 1:
+        raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
+    rows: list[Any] = []
     for path, name in files:
         if description.windows.trigger and (notes or faults):
             why = (*notes, *faults)[0]
             raise DataError(f"Expected whole files before {name}, since a trigger cuts: {why}")
-        try:
-            bag.add(list(read_messages(path, {bag.topic, *bag.others}, notes)))
-        except UnreadableError as error:
-            faults.append(Fault(name, 0, str(error), error.column))
-    if not bag.rows:
+        with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
+            for topic, _, logged, message in [*read_messages(path, {*topics, *events}, notes)]:
+                if topic in events:
+                    events[topic].append((logged, message.data))
+                if topic in topics:
+                    stamp = message.header.stamp if hasattr(message, "header") else None
+                    time = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
+                    rows.append((logged, time, *(field(message) for field in fields)))
+    if not rows:
         why = f" {faults[0]}." if faults else ""
-        raise DataError(f"Expected messages of {bag.topic}, found none.{why}")
-    name = files[0][1] if len(files) == 1 else base.resolve().name
-    table = bag.table(name, [channel.column for channel in description.channels])
-    parts = cut(table, name, description, base, faults)
-    for topic in {source.topic for source in (description.label, *description.check)} - {""}:
-        parts = label_events(parts, topic, bag.events[topic], LOG_TIME)
-    return parts
+        raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
+    rows.sort(key=itemgetter(0))
+    cells = map(as_cells, zip(*rows, strict=True))
+    table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
+    for topic, messages in events.items():
+        messages.sort(key=itemgetter(0))
+        newest = [None, *(word for _, word in messages)]
+        places = np.searchsorted([time for time, _ in messages], table[LOG_TIME], side="right")
+        table[topic] = as_cells([newest[place] for place in places])
+    return Table(files[0][1], table, [])

@@ -1,12 +1,15 @@
-"""The files that a description names, and their content."""
+"""The files that a description names, their content, and the faults in them."""
 
 import gzip
 import re
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from ...errors import DataError, instead
+from ..dataset import Fault
 from ..description import FOLDER_FILE, Description
 from ..table import UnreadableError
 
@@ -60,3 +63,13 @@ def read_file(path: Path) -> bytes:
     if (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
         raise UnreadableError("Expected a file that stays, it changed while it was read")
     return content
+
+
+@contextmanager
+def caught(faults: list[Fault], source: str) -> Iterator[None]:
+    """Context manager that puts an error into `faults`, with the file or part in which it is."""
+    try:
+        yield
+    except DataError as error:
+        line, column = getattr(error, "line", 0), getattr(error, "column", "")
+        faults.append(Fault(source, line, str(error).rstrip("."), column))
