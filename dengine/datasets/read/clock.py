@@ -8,7 +8,7 @@ import numpy as np
 
 from ...errors import DataError, instead
 from ..description import Clock, TextForm
-from ..table import Cells, Floats, Recording, Table, UnreadableError
+from ..table import Cells, Floats, Table, UnreadableError
 
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -107,26 +107,22 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     return values, (times.iloc[0] - zero).total_seconds()
 
 
-def check_steps(recording: Recording, clock: Clock) -> None:
+def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
     A rate of 0 stands for any that is even: steps are then compared with their mean. Equal times
     are none that rise, unless any gap is allowed.
     """
-    seconds, rate, column = recording.seconds, clock.rate_hz, " + ".join(clock.column)
-    if seconds is None or len(seconds) < 2:
-        return
-    steps = np.diff(seconds)
+    steps, rate, column = np.diff(seconds), clock.rate_hz, " + ".join(clock.column)
     n, span = len(steps), float(seconds[-1] - seconds[0])
-    most = clock.gap / rate if rate else clock.gap * span / n
-    may_repeat = clock.gap == 0 and span > 0
-    is_bad = (steps < 0) | (steps > (most or np.inf)) | ((steps == 0) & (not may_repeat))
+    most = clock.gap / rate if rate else clock.gap * span / max(n, 1)
+    is_equal = (steps == 0) & (clock.gap > 0 or span == 0)
+    is_bad = (steps < 0) | is_equal | (steps > (most or np.inf))
     if is_bad.any():
         row = int(is_bad.argmax()) + 1
-        line = int(recording.lines[row]) if len(recording.lines) else 0
         wanted = f"Expected a later time, by at most time.gap steps, which are {most:.6g} s"
         message = f"{wanted}, got {steps[row - 1]:.6g} s before row {row + 1}"
-        raise UnreadableError(message, line, column)
-    if rate and abs(rate * span - n) > RATE_TOLERANCE * rate * span:
+        raise UnreadableError(message, table.line(row), column)
+    if abs(rate * span - n) > RATE_TOLERANCE * rate * span and rate:
         message = f"Expected {rate:g} Hz as time.rate_hz says, its times give {n / span:.5g} Hz"
         raise UnreadableError(message, column=column)

@@ -27,9 +27,10 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
     """Return a table for each object of a JSON file: one, a list of them, or one a line."""
     text = to_utf8(content, form.encoding).decode()
     tables: list[Table] = []
-    for number, line in enumerate(text.split("\n"), 1) if has_lines else [(0, text)]:
+    lines = enumerate(text.split("\n"), 1) if has_lines else [(0, text)]
+    for number, line in lines:
         try:
-            found = json.loads(line) if line.strip() or not has_lines else []
+            found = json.loads(line.strip() or "[]")
         except (ValueError, RecursionError) as error:
             raise UnreadableError(f"Expected JSON: {error}", number) from error
         for value in found if isinstance(found, list) else [found]:
@@ -47,21 +48,20 @@ def columns_of(prefix: str, value: Any) -> Columns:
 
     Of an array (C, n), or (n, C) with C < n, each channel is a column.
     """
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        value = value.tolist()
     items = value if isinstance(value, list | np.ndarray) else [value]
-    if isinstance(items, np.ndarray) and items.dtype == object:
-        items = items.tolist()
     first = items[0] if len(items) else None
-    nested: Mapping[Any, Any] = {}
     with instead(UnreadableError, f"Expected items of one form in {prefix}", *DAMAGES):
-        if isinstance(value, Mapping):
-            nested = value
-        elif isinstance(first, Mapping):
-            nested = {key: [item[key] for item in items] for key in first}
+        if isinstance(first, Mapping) and value is items:
+            value = {key: [item[key] for item in items] for key in first}
         elif isinstance(first, list | np.ndarray):
-            x = items if isinstance(items, np.ndarray) else np.array(items, dtype=object)
-            nested = dict(enumerate(x if len(x) <= x.shape[1] else np.swapaxes(x, 0, 1)))
-    columns: Columns = {} if nested else {prefix: as_cells(items)}
-    for name, item in nested.items():
+            x = np.array(items, dtype=object)
+            value = dict(enumerate(x if len(x) <= x.shape[1] else x.swapaxes(0, 1)))
+    if not isinstance(value, Mapping):
+        return {prefix: as_cells(items)}
+    columns: Columns = {}
+    for name, item in value.items():
         columns |= columns_of(f"{prefix}.{name}" if prefix else str(name), item)
     return columns
 
@@ -106,23 +106,18 @@ def read_npz(content: bytes, source: str) -> Table:
     return Table(source, columns_of("", squeezed), [])
 
 
-def part_tables(content: bytes, source: str, channel: str = "") -> list[Table]:
+def part_tables(content: bytes, source: str) -> list[Table]:
     """Return a table for each part of an archive whose arrays hold all parts.
 
-    Parts are the first axis of the channel's array, or of the largest without one. Arrays of
-    another first axis hold for all parts.
+    Parts are the first axis of the largest array. Arrays of another first axis hold for all parts.
     """
     arrays, _ = read_archive(content, name=source)
-    largest = max(arrays, key=lambda name: arrays[name].size, default="")
-    names = (channel, channel.rpartition(".")[0], largest)
-    n = len(np.atleast_1d(next((arrays[name] for name in names if name in arrays), [])))
-    tables = []
-    for i in range(n):
-        of_part = {
-            name: np.atleast_1d(x[i] if x.ndim and len(x) == n else x) for name, x in arrays.items()
-        }
-        tables.append(Table(source, columns_of("", of_part), []))
-    return tables
+    found = {name: np.atleast_1d(x) for name, x in arrays.items()}
+    n = len(max(found.values(), key=np.size, default=()))
+    parts = [
+        {k: np.atleast_1d(x[i]) if len(x) == n else x for k, x in found.items()} for i in range(n)
+    ]
+    return [Table(source, columns_of("", part), []) for part in parts]
 
 
 def read_ts(content: bytes, source: str, form: TextForm) -> list[Table]:

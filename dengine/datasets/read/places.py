@@ -11,7 +11,7 @@ from ...errors import DataError, instead, listed, shortened
 from ..description import ANY, LabelSource, PartSource, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
-from .frames import join, read_objects, read_parquet
+from .frames import read_parquet
 from .text import header_names, read_text, split_line, to_utf8
 
 DELIMITERS = (",", ";", "\t", "|")
@@ -80,11 +80,9 @@ def listing_table(path: Path, columns: Sequence[str], form: TextForm) -> Table:
     A text is parted by the one of `, ; tab |` that parts its header into these columns, or into
     most. Raises UnreadableError if it cannot be read.
     """
-    content, suffix = read_file(path), path.suffix.lower()
-    if suffix == ".parquet":
+    content = read_file(path)
+    if path.suffix == ".parquet":
         return read_parquet(content, path.name)
-    if suffix in (".json", ".jsonl"):
-        return join(read_objects(content, path.name, form, suffix == ".jsonl"))
     header = to_utf8(content, form.encoding).decode().partition("\n")[0]
 
     def fit(mark: str) -> tuple[bool, int]:

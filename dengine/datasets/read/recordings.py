@@ -21,7 +21,7 @@ from ..description import ANY, Channel, Description
 from ..table import Cells, Floats, Recording, Table, UnreadableError
 from ..units import conversion
 from . import frames
-from .bags import split_bag
+from .bags import read_bag
 from .clock import check_steps, times_of
 from .files import caught, find_files, natural_key, read_file
 from .places import LabelReader, Place, part_of, read_labels
@@ -59,29 +59,32 @@ class Reader:
         seconds, start = None, np.nan
         if about.time.column:
             seconds, start = times_of(table, about.time, about.text)
+            if about.time.sort:
+                order = np.argsort(seconds, kind="stable")
+                table, is_lost = table.take(order), is_lost[order]
+                seconds, start = times_of(table, about.time, about.text)
+            check_steps(seconds, about.time, table)
         rows = [self.channel(table, channel) for channel in about.channels]
         lengths = [*map(len, rows if seconds is None else [*rows, seconds])]
         if len({*lengths}) > 1:
             raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
-        samples = np.where(is_lost, np.nan, np.stack(rows))
-        if about.time.sort and seconds is not None:
-            places = np.argsort(seconds, kind="stable")
-            table, samples, seconds = table.take(places), samples[:, places], seconds[places]
-            start, seconds = start + seconds[0], seconds - seconds[0]
-        lines = table.lines if len(table.lines) == samples.shape[1] else ()
+        samples = np.stack(rows)
+        if about.rows:
+            samples[:, is_lost] = np.nan
         place = Place(path, table)
         is_window = about.windows.trigger or about.windows.listing
         part = part_of(about.part, place) or (path if is_window else "")
         label = self.label_of(place, part)
-        order = "" if about.order in ("name", "time") else table.one_word(about.order, "first")
-        return Recording(source, samples, seconds, float(start), part, label, order, lines)
+        rank = "" if about.order in ("name", "time") else table.one_word(about.order, "first")
+        return Recording(source, samples, seconds, start, part, label, rank)
 
     def kept_rows(self, table: Table) -> tuple[Table, Cells]:
         """Return the rows of a table that are samples, and which of these are lost.
 
         Raises UnreadableError for a word of `[rows]` whose meaning is not stated.
         """
-        is_lost: Cells = np.zeros(1, dtype=bool)
+        n = max(map(len, table.columns.values()), default=0)
+        is_lost: Cells = np.zeros(n, dtype=bool)
         for column, about in self.description.rows.items():
             kinds = {"keep": about.keep, "drop": about.drop, "invalid": about.invalid}
             known = {word: kind for kind, words in kinds.items() for word in words}
@@ -147,20 +150,19 @@ def read_recordings(
         files = find_files(source, description)
     notes: list[str] = []
     faults: list[Fault] = []
-    groups = [(of, _parts_of(place, of, description, base, faults)) for place, of in files]
     if description.layout == "mcap":
-        groups = [(name, split_bag(files, description, base, notes, faults))]
+        title = files[0][1] if len(files) == 1 else name
+        files = [(read_bag(files, description, notes, faults), title)]
     sources = (description.label, *description.check)
     labels = [read_labels(base, one, description.text) for one in sources]
     reader = Reader(description, labels[0], labels[1:])
     fitted: list[Fitted] = []
     n_unlabelled = 0
-    for of, parts in groups:
-        with caught(faults, of):
-            for part in parts:
+    for file, title in files:
+        with caught(faults, title):
+            for part in _parts_of(file, title, description, base, faults):
                 with caught(faults, part[0]):
                     recording = reader.recording(*part)
-                    check_steps(recording, description.time)
                     if recording.label is None:
                         n_unlabelled += 1
                     else:
@@ -174,15 +176,14 @@ def read_recordings(
 def _parts_of(
     source: Any, name: str, description: Description, base: Path, faults: list[Fault]
 ) -> Parts:
-    """Yield the parts of a file or a DataFrame."""
+    """Yield the parts of a file, a DataFrame or the table of a bag."""
     if isinstance(source, Path):
         tables = tables_of(read_file(source), name, description)
     else:
-        tables = [frames.read_frame(source, name)]
+        tables = [source if isinstance(source, Table) else frames.read_frame(source, name)]
     if description.windows.trigger or description.windows.listing:
-        yield from cut(tables[0], name, description, base)
-    else:
-        yield from split(tables, name, description, faults)
+        return cut(tables[0], name, description, base)
+    return split(tables, name, description, faults)
 
 
 def _joined(
@@ -211,8 +212,10 @@ def _joined(
     recordings, traces = zip(*fitted, strict=True)
     X = np.stack(traces)
     y = np.array([recording.label for recording in recordings], dtype=np.int8)
-    part = np.array([recording.part for recording in recordings])
-    source = np.array([recording.source for recording in recordings])
+    part, source = (
+        np.array([getattr(recording, key) for recording in recordings])
+        for key in ("part", "source")
+    )
     channels, clock = description.channels, description.time
     lengths = description.traces.lengths.removesuffix("-all")
     is_grid = lengths == "resample" and clock.column and clock.rate_hz
@@ -247,18 +250,18 @@ def fit(recording: Recording, description: Description) -> NDArray[np.float32]:
         If the recording is too short, or too long, to be fitted without making up data.
     """
     samples, lengths = description.traces.samples, description.traces.lengths
-    x, rate, seconds = recording.samples, description.time.rate_hz, recording.seconds
-    n, is_resampled = x.shape[1], lengths == "resample"
-    if is_resampled and rate and seconds is not None:
+    x, rate = recording.samples, description.time.rate_hz
+    n = x.shape[1]
+    kind = lengths.removesuffix("-all")
+    can_fit = can_fit_length(n, samples, FITS.index(kind)) or (lengths == "pad-all" and n > 0)
+    seconds = np.arange(n, dtype=float) if recording.seconds is None else recording.seconds
+    step = float(seconds[-1:].sum()) / max(samples - 1, 1)
+    if kind == "resample" and recording.seconds is not None and rate:
         step = 1 / rate
         can_fit = (samples - 2) * step <= seconds[-1]
-    else:
-        seconds = np.arange(n) if seconds is None else seconds
-        step = seconds[-1:].sum() / max(samples - 1, 1)
-        can_fit = can_fit_length(n, samples, FITS.index(lengths.removesuffix("-all")))
-    if not (can_fit or (lengths == "pad-all" and n)):
+    if not can_fit:
         message = f"Expected {samples} samples, got {n}"
         raise UnreadableError(f"{message}; see traces.lengths, which is {lengths}")
-    if is_resampled:
+    if kind == "resample":
         x = np.stack([np.interp(np.arange(samples) * step, seconds, row) for row in x])
     return x[:, np.minimum(np.arange(samples), x.shape[1] - 1)].astype(np.float32)

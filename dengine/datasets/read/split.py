@@ -35,7 +35,7 @@ def tables_of(content: bytes, name: str, description: Description) -> list[Table
     if kind == "parquet":
         return [frames.read_parquet(content, name)]
     if kind == "npz" and layout == "npz":
-        return frames.part_tables(content, name, description.channels[0].column)
+        return frames.part_tables(content, name)
     if kind == "npz":
         return [frames.read_npz(content, name)]
     keep_damaged = layout in ("long", "wide")
@@ -64,6 +64,11 @@ def signals_of(description: Description) -> Sequence[str]:
     return as_trigger(trigger).signals if trigger else ()
 
 
+def verdicts_of(description: Description) -> set[str]:
+    """Return the topics of a bag that have labels."""
+    return {source.topic for source in (description.label, *description.check)} - {""}
+
+
 def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
     """Return the pattern of a channel's columns, in which `*` stands for any text."""
     return re.compile(any_text.join(map(re.escape, column.split(ANY))), re.DOTALL)
@@ -81,7 +86,7 @@ def split(
     """
     layout, table = description.layout, tables[0]
     if layout == "long":
-        table = table if len(tables) == 1 else frames.join(tables)
+        table = frames.join(tables) if len(tables) > 1 else table
         yield from _split_rows(table, name, description, faults)
     elif layout == "columns":
         yield from _split_columns(table, name, description)
@@ -126,10 +131,9 @@ def _split_rows(table: Table, name: str, description: Description, faults: list[
 def _split_wide(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
     """Yield each row."""
     groups: dict[str, list[str]] = {}
-    for key in [channel.column for channel in description.channels if ANY in channel.column]:
+    for key in [channel.column for channel in description.channels]:
         names = filter(pattern_of(key, NUMBER).fullmatch, table.columns)
-        groups[key] = sorted(names, key=natural_key)
-    groups = {key: names for key, names in groups.items() if names}
+        groups |= {key: sorted(names, key=natural_key)} if ANY in key else {}
     cells = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     used = {*chain(*groups.values())}
     others = {column: c for column, c in table.columns.items() if len(c) and column not in used}

@@ -59,31 +59,27 @@ def read_text(
     content = to_utf8(content, form.encoding)
     header, above = form.header, 0
     if isinstance(header, str):
-        lines = enumerate(io.BytesIO(content), 1)
-        header = above = next((i for i, x in lines if x.startswith(form.header.encode())), 0)
+        begin, lines = header.encode(), enumerate(io.BytesIO(content), 1)
+        header = above = next((i for i, line in lines if line.startswith(begin)), 0)
         if not header:
             raise UnreadableError(f"Expected a header that begins with {form.header!r}, got none")
     first, units = form.data + above, form.units and form.units + above
-    heads = content.split(b"\n", first)[:first]
-    start, end = sum(len(line) + 1 for line in heads[:-1]), len(content.rstrip(b"\n"))
-    if len(heads) < first or not content[start:].strip():
+    end = content.rstrip(b"\n").count(b"\n") + 2
+    if first >= end or not content.strip():
         line = first if content.strip() else 0
         raise UnreadableError("Expected rows of samples, got none", line)
-    top = [line.decode() for line in heads]
+    top = [line.decode() for line in content.split(b"\n", first)[:first]]
     names = _names(top, header, form)
     cells = split_line("".join(top[units - 1 : units]), form.delimiter)
     stated = dict(zip(names, map(str.strip, cells), strict=False))
-    n_rows = content.count(b"\n", start, end) + 1
-    rows = range(first, first + n_rows)
-    table = Table(source, {}, rows, stated, top[: (header or first) - 1], header)
-    file = io.BytesIO(content)
-    file.seek(start)
+    columns = dict.fromkeys(names, np.empty(0))
+    table = Table(source, columns, range(first, end), stated, top[: (header or first) - 1], header)
     words = {*filter(is_word, names)}
     numbers = {*filter(is_numeric, names)} - words
-    columns = None if form.drop else _read_plain(file, names, form, numbers, words, n_rows)
-    if columns is None:
-        return _read_strictly(content[start:end].decode(), table, names, form, keep_damaged)
-    return replace(table, columns=columns)
+    plain = {} if form.drop else _read_plain(content, table, form, numbers, words)
+    if plain:
+        return replace(table, columns={**columns, **plain})
+    return _read_strictly(content, table, form, keep_damaged)
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
@@ -92,14 +88,13 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
     Raises UnreadableError, with the line, if it is not in its encoding, or has a zero byte.
     """
     is_utf8 = codecs.lookup(encoding).name == "utf-8"
-    bad = -1
-    if not (is_utf8 and content.isascii()):
-        try:
+    try:
+        if not (is_utf8 and content.isascii()):
             text = content.decode("utf-8-sig" if is_utf8 else encoding)
             content = text.encode("utf-8", "replace")
-        except UnicodeDecodeError as error:
-            bad = error.start
-    bad = content.find(b"\0") if bad < 0 else bad
+        bad = content.find(b"\0")
+    except UnicodeDecodeError as error:
+        bad = error.start
     if bad >= 0:
         message = f"Expected a text in {encoding}, got the byte 0x{content[bad]:02x}"
         line = content.count(b"\n", 0, bad) + 1
@@ -117,73 +112,69 @@ def split_line(line: str, delimiter: str) -> list[str]:
 def header_names(cells: Sequence[str]) -> list[str]:
     """Return the columns' names: those that repeat get a number, like `X.2`, empty ones too."""
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
-    counts = [names[: i + 1].count(name) for i, name in enumerate(names)]
-    return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, counts, strict=True)]
+    places = [names[: i + 1].count(name) for i, name in enumerate(names)]
+    return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
 
 
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: as stated, or those of the header among the lines on top."""
-    *names, last = form.names or [""]
-    if last.endswith(REST):
+    names = [*form.names]
+    if names and names[-1].endswith(REST):
+        rest = names.pop()[: -len(REST)]
         n = len(split_line(top[-1], form.delimiter)) - len(names)
-        return [*names, *(f"{last[: -len(REST)]}{i}" for i in range(n))]
-    if form.names:
-        return [*form.names]
-    line = "".join(top[:-1][header - 1 : header]).lstrip(BLANK)
-    names = header_names(split_line(COMMENT.sub("", line), form.delimiter))
+        names += [f"{rest}{i}" for i in range(n)]
+    elif not names:
+        line = "".join(top[:-1][header - 1 : header]).lstrip(BLANK)
+        names = header_names(split_line(COMMENT.sub("", line), form.delimiter))
     if not names:
         raise UnreadableError("Expected a header, or text.names; got neither", header)
     return names
 
 
 def _read_plain(
-    file: io.BytesIO,
-    names: Sequence[str],
-    form: TextForm,
-    numbers: set[str],
-    words: set[str],
-    n_rows: int,
-) -> dict[str, Cells] | None:
-    """Return the columns by pandas' parser; None if anything in them is not plain."""
+    content: bytes, table: Table, form: TextForm, numbers: set[str], words: set[str]
+) -> dict[str, Cells]:
+    """Return the columns of numbers and words by pandas' parser; none if anything is not plain."""
     import pandas as pd
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", pd.errors.DtypeWarning)
             frame = pd.read_csv(
-                file,
+                io.BytesIO(content),
                 sep=r"\s+" if form.delimiter == BLANK else form.delimiter,
                 header=None,
-                names=[*names],
+                skiprows=table.lines[0] - 1,
+                names=[*table.columns],
                 decimal=form.decimal,
                 dtype=dict.fromkeys(words, "category"),
                 keep_default_na=False,
             )
     except (ValueError, OverflowError):  # a row of too many cells, among others
-        return None
-    is_whole = len(frame) == n_rows and isinstance(frame.index, pd.RangeIndex)
-    if not is_whole or frame[names[-1]].isin(["", np.nan]).any():  # the end of a cut row
-        return None
-    columns = dict.fromkeys(names, np.empty(0))
-    columns |= {name: np.asarray(frame.pop(name)) for name in numbers | words}
+        return {}
+    is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
+    if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
+        return {}
+    columns = {name: np.asarray(frame.pop(name)) for name in numbers | words}
     found = [columns[name] for name in numbers]
     is_plain = all(cells.dtype.kind in "iuf" and np.isfinite(cells).all() for cells in found)
-    return columns if is_plain else None
+    return columns if is_plain else {}
 
 
-def _read_strictly(
-    text: str, table: Table, names: Sequence[str], form: TextForm, keep_damaged: bool
-) -> Table:
+def _read_strictly(content: bytes, table: Table, form: TextForm, keep_damaged: bool) -> Table:
     """Return the table with the cells of a text, without lines that are empty or dropped."""
-    n, lines = len(names), zip(table.lines, text.split("\n"), strict=True)
-    kept = ((i, line) for i, line in lines if line.strip() and not line.startswith(form.drop))
-    rows = {i: split_line(line, form.delimiter) for i, line in kept}
+    names, lines = [*table.columns], enumerate(content.decode().split("\n"), 1)
+    rows = {
+        i: split_line(line, form.delimiter)
+        for i, line in lines
+        if i in table.lines and line.strip() and not line.startswith(form.drop)
+    }
+    n = len(names)
     wanted = f"Expected {n} cells, as there are columns"
     damage = {i: f"{wanted}, got {len(row)}" for i, row in rows.items() if len(row) != n}
     if damage and (not keep_damaged or len(damage) == len(rows)):
         line = min(damage)
         raise UnreadableError(damage[line], line)
     cells = [[""] * n if i in damage else row for i, row in rows.items()]
-    texts = np.array(cells, dtype=object).reshape(-1, n).T
-    columns = dict(zip(names, texts, strict=True))
+    columns = dict(zip(names, np.array(cells, dtype=object).reshape(-1, n).T, strict=True))
     return replace(table, columns=columns, lines=[*rows], damage=damage)

@@ -11,8 +11,9 @@ from ..description import Clock, Description
 from ..table import Floats, Table
 from ..triggers import StartFinder, as_trigger
 from .clock import column_times, times_of
+from .frames import as_cells
 from .places import in_listing, listing_table
-from .split import Parts
+from .split import Parts, verdicts_of
 
 EPOCH = 1e8  # seconds: smaller times of a listing count from the start of the recording
 TOLERANCE = 1e-5  # seconds: float64 rounds dates to less
@@ -32,9 +33,20 @@ def cut(table: Table, name: str, description: Description, base: Path) -> Parts:
     windows = [*find(table, seconds + start, description, base)]
     if not windows:
         raise DataError(f"Expected parts in {name}, found none; see [windows].")
-    for key, rows, fault in windows:
+    ends = [*(rows.start for _, rows, _ in windows[1:]), None]
+    for (key, rows, fault), end in zip(windows, ends, strict=True):
+        part = table.take(rows)
+        words = {topic: table.column(topic)[rows.start : end] for topic in verdicts_of(description)}
+        labels = {
+            topic: as_cells([w for w in cells if w is not None][:1])
+            for topic, cells in words.items()
+        }
         damage = {0: fault} if fault else {}
-        yield f"{name}, {key}", key, replace(table.take(rows), damage=damage)
+        yield (
+            f"{name}, {key}",
+            key,
+            replace(part, columns={**part.columns, **labels}, damage=damage),
+        )
 
 
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
