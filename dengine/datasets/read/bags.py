@@ -119,13 +119,12 @@ def read_bag(
     for topic, messages in events.items():
         messages.sort(key=itemgetter(0))
         times, words = [time for time, _ in messages], [word for _, word in messages]
-        is_verdict = topic in verdicts
-        places = np.searchsorted(times, table[LOG_TIME], side="left" if is_verdict else "right")
-        if is_verdict:
-            following = [*places[1:], len(times)]
-            pairs = zip(places, following, strict=True)
-            found = [words[i] if i < after else None for i, after in pairs]
+        if topic in verdicts:
+            places = np.searchsorted(times, table[LOG_TIME])
+            is_new = np.diff(places, append=len(times)) > 0
+            found = [words[i] if new else None for i, new in zip(places, is_new, strict=True)]
         else:
+            places = np.searchsorted(times, table[LOG_TIME], side="right")
             found = [words[i - 1] if i else None for i in places]
         table[topic] = as_cells(found)
     return Table(files[0][1], table, [])

@@ -19,6 +19,11 @@ SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
 MARKS = " \t;,:=\"'"  # around the words of a line
 
 
+def without_suffix(path: str) -> str:
+    """Return a path without the suffix of its file, and without `.gz` behind it."""
+    return SUFFIX.sub("", path)
+
+
 @dataclass(frozen=True, slots=True)
 class Place:
     """Where a recording stands: its path as seen from the folder, or its column, and its table."""
@@ -36,7 +41,7 @@ class Place:
             expression = re.compile(pattern)
         if expression.groups != 1:
             raise DataError(f"{wanted}.")
-        match = expression.search(SUFFIX.sub("", self.path))
+        match = expression.search(without_suffix(self.path))
         if match is None or match[1] is None:
             raise UnreadableError(f"Expected {pattern} in the path, it is not found")
         return str(match[1])
@@ -123,7 +128,7 @@ class LabelReader:
         if not source.listing:
             return place.words(source, [source.column or source.topic], source.at)
         name = PurePosixPath(path).name
-        names = filter(None, (part, path, name, SUFFIX.sub("", path), SUFFIX.sub("", name)))
+        names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
         if not keys:
             raise UnreadableError(f"Expected {part or name} in {source.listing}, it is not listed")
@@ -146,11 +151,10 @@ class LabelReader:
     def meaning(self, word: str, line: int = 0) -> int | None:
         """Return what a word means; raise UnreadableError for an unknown one."""
         source = self.source
-        good, bad = dict.fromkeys(source.good, 1), dict.fromkeys(source.bad, 0)
-        known: dict[str, int | None] = {**dict.fromkeys(source.unchecked), **bad, **good}
-        if not known.keys() & {word, ANY}:
-            wanted = f"{listed(source.good)} (good), {listed(source.bad)} (bad)"
-            message = f"Expected a label among {wanted}, got {shortened(word)}"
+        known: dict[str, int | None] = dict.fromkeys(source.unchecked)
+        known |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
+        if word not in known and ANY not in known:
+            message = f"Expected a label among {listed(known)}, got {shortened(word)}"
             raise UnreadableError(message, line, source.column)
         return known.get(word, known.get(ANY))
 

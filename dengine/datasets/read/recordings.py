@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DataError, listed
+from ...errors import DataError, instead, listed
 from ...records import FITS
 from ...traces import can_fit_length
 from ..checks import Fitted, check_description, finished_notes, without_repeats
@@ -55,7 +55,8 @@ class Reader:
         for line, message in table.damage.items():
             raise UnreadableError(message, line)
         about = self.description
-        table, is_lost = self.kept_rows(table)
+        with instead(UnreadableError, "Expected columns of one length", IndexError):
+            table, is_lost = self.kept_rows(table)
         seconds, start = None, np.nan
         if about.time.column:
             seconds, start = times_of(table, about.time, about.text)

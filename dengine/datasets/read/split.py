@@ -108,10 +108,11 @@ def _split_rows(table: Table, name: str, description: Description, faults: list[
     columns = [*description.part.column]
     if not columns:
         raise DataError("Expected part.column, the column that tells the parts apart.")
-    keys = pd.DataFrame({column: table.words(column) for column in columns})
     damaged = np.searchsorted(table.lines, [*table.damage]).tolist() if table.damage else []
-    for key, group in keys.drop(damaged).groupby(columns, sort=False):
-        rows = group.index.to_numpy()
+    kept = np.delete(np.arange(len(table.lines)), damaged)
+    keys = [table.words(column)[kept] for column in columns]
+    for key, group in pd.Series(kept).groupby(keys, sort=False):
+        rows = group.to_numpy()
         source = f"{name}, {' '.join(key)}"
         first, last = int(rows[0]), int(rows[-1])
         is_whole = last - first < len(rows)
@@ -131,9 +132,10 @@ def _split_rows(table: Table, name: str, description: Description, faults: list[
 def _split_wide(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
     """Yield each row."""
     groups: dict[str, list[str]] = {}
-    for key in [channel.column for channel in description.channels]:
-        names = filter(pattern_of(key, NUMBER).fullmatch, table.columns)
-        groups |= {key: sorted(names, key=natural_key)} if ANY in key else {}
+    for key in [channel.column for channel in description.channels if ANY in channel.column]:
+        names = sorted(filter(pattern_of(key, NUMBER).fullmatch, table.columns), key=natural_key)
+        if names:
+            groups[key] = names
     cells = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     used = {*chain(*groups.values())}
     others = {column: c for column, c in table.columns.items() if len(c) and column not in used}

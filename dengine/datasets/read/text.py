@@ -155,10 +155,13 @@ def _read_plain(
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
         return {}
-    columns = {name: np.asarray(frame.pop(name)) for name in numbers | words}
-    found = [columns[name] for name in numbers]
-    is_plain = all(cells.dtype.kind in "iuf" and np.isfinite(cells).all() for cells in found)
-    return columns if is_plain else {}
+    columns = {name: frame.pop(name).to_numpy() for name in numbers}
+    if not all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in columns.values()):
+        return {}
+    for name in words:
+        cells = frame.pop(name).array
+        columns[name] = np.array(cells.categories, dtype=object)[cells.codes]  # each text once
+    return columns
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm, keep_damaged: bool) -> Table:
