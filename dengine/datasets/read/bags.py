@@ -17,7 +17,7 @@ from ...errors import DataError, instead, listed
 from ...files import UNREADABLE, read_errors
 from ..dataset import Fault
 from ..description import Description
-from ..table import Table, UnreadableError
+from ..table import Cells, Table, UnreadableError
 from .files import caught
 from .frames import as_cells
 from .split import signals_of, verdicts_of
@@ -27,6 +27,7 @@ STAMP, LOG_TIME = "stamp", "log_time"
 MAGIC = b"\x89MCAP0\r\n"  # at the end of a file that was closed
 RECOVER = "mcap recover or ros2 bag reindex may save what is whole"
 Message = tuple[str, str, int, Any]  # topic, type, nanoseconds of the log, message
+Files = Sequence[tuple[Path, str]]
 Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, data
 
 
@@ -65,7 +66,7 @@ def read_messages(
 
 
 def read_bag(
-    files: Sequence[tuple[Path, str]],
+    files: Files,
     description: Description,
     notes: list[str],
     faults: list[Fault],
@@ -90,13 +91,31 @@ def read_bag(
         a trigger cuts.
     """
     columns = [channel.column for channel in description.channels]
-    fields = [attrgetter(column.partition(".")[2]) for column in columns]
     topics = {column.partition(".")[0] for column in columns}
     if len(topics) > 1:
         raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
     verdicts = verdicts_of(description)
     others = verdicts.union(description.part.column, signals_of(description), [description.order])
     events: Events = {name: [] for name in others if name.startswith("/") and "." not in name}
+    rows = _rows_of(files, description, topics, events, notes, faults)
+    rows.sort(key=itemgetter(0))
+    cells = map(as_cells, zip(*rows, strict=True))
+    table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
+    for topic, messages in events.items():
+        table[topic] = _cells_of(messages, table[LOG_TIME], topic in verdicts)
+    return Table(files[0][1], table, [])
+
+
+def _rows_of(
+    files: Files,
+    description: Description,
+    topics: set[str],
+    events: Events,
+    notes: list[str],
+    faults: list[Fault],
+) -> list[Any]:
+    """Return the times and values of each message of the channels, and put others into `events`."""
+    fields = [attrgetter(c.column.partition(".")[2]) for c in description.channels]
     rows: list[Any] = []
     for path, name in files:
         if description.windows.trigger and (notes or faults):
@@ -107,24 +126,26 @@ def read_bag(
                 if topic in events:
                     events[topic].append((logged, message.data))
                 if topic in topics:
-                    stamp = message.header.stamp if hasattr(message, "header") else None
-                    time = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
-                    rows.append((logged, time, *(field(message) for field in fields)))
+                    values = [field(message) for field in fields]
+                    rows.append((logged, _stamp_of(message), *values))
     if not rows:
         why = f" {faults[0]}." if faults else ""
         raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
-    rows.sort(key=itemgetter(0))
-    cells = map(as_cells, zip(*rows, strict=True))
-    table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
-    for topic, messages in events.items():
-        messages.sort(key=itemgetter(0))
-        times, words = [time for time, _ in messages], [word for _, word in messages]
-        if topic in verdicts:
-            places = np.searchsorted(times, table[LOG_TIME])
-            is_new = np.diff(places, append=len(times)) > 0
-            found = [words[i] if new else None for i, new in zip(places, is_new, strict=True)]
-        else:
-            places = np.searchsorted(times, table[LOG_TIME], side="right")
-            found = [words[i - 1] if i else None for i in places]
-        table[topic] = as_cells(found)
-    return Table(files[0][1], table, [])
+    return rows
+
+
+def _stamp_of(message: Any) -> int:
+    """Return the time in the header of a message, in nanoseconds; 0 if it has none."""
+    stamp = message.header.stamp if hasattr(message, "header") else None
+    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
+
+
+def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
+    """Return the column of a topic beside the rows of the log; see `read_bag`."""
+    messages.sort(key=itemgetter(0))
+    times, words = [time for time, _ in messages], [word for _, word in messages]
+    places = np.searchsorted(times, logs, side="left" if is_verdict else "right")
+    if not is_verdict:
+        return as_cells([words[i - 1] if i else None for i in places])
+    is_new = np.diff(places, append=len(times)) > 0
+    return as_cells([words[i] if new else None for i, new in zip(places, is_new, strict=True)])

@@ -51,19 +51,23 @@ def columns_of(prefix: str, value: Any) -> Columns:
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
     items = value if isinstance(value, list | np.ndarray) else [value]
-    first = items[0] if len(items) else None
     with instead(UnreadableError, f"Expected items of one form in {prefix}", *DAMAGES):
-        if isinstance(first, Mapping) and value is items:
-            value = {key: [item[key] for item in items] for key in first}
-        elif isinstance(first, list | np.ndarray):
-            x = np.array(items, dtype=object)
-            value = dict(enumerate(x if len(x) <= x.shape[1] else x.swapaxes(0, 1)))
-    if not isinstance(value, Mapping):
-        return {prefix: as_cells(items)}
-    columns: Columns = {}
-    for name, item in value.items():
+        nested = value if isinstance(value, Mapping) else _turned(items)
+    columns: Columns = {} if nested else {prefix: as_cells(items)}
+    for name, item in nested.items():
         columns |= columns_of(f"{prefix}.{name}" if prefix else str(name), item)
     return columns
+
+
+def _turned(items: Any) -> Mapping[Any, Any]:
+    """Return objects by their keys, or lists by their channels; nothing for other items."""
+    first = items[0] if len(items) else None
+    if isinstance(first, Mapping):
+        return {key: [item[key] for item in items] for key in first}
+    if not isinstance(first, list | np.ndarray):
+        return {}
+    x = np.array(items, dtype=object)
+    return dict(enumerate(x if len(x) <= x.shape[1] else x.swapaxes(0, 1)))
 
 
 def as_cells(values: Any) -> Cells:

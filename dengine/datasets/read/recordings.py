@@ -5,7 +5,7 @@ a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -210,31 +210,33 @@ def _joined(
     n_found, n_seen = len(fitted) + len(faults) + n_unlabelled, description.seen.recordings
     if n_found < n_seen:
         notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
+    data = _stacked(fitted, description)
+    notes += finished_notes(data.cube, [recording.source for recording, _ in fitted])
+    return replace(data, name=name, faults=(*faults,), notes=(*notes,), unlabelled=n_unlabelled)
+
+
+def _stacked(fitted: Sequence[Fitted], description: Description) -> Dataset:
+    """Return the data set of the traces, and of what is known of each."""
     recordings, traces = zip(*fitted, strict=True)
-    X = np.stack(traces)
-    y = np.array([recording.label for recording in recordings], dtype=np.int8)
-    part, source = (
-        np.array([getattr(recording, key) for recording in recordings])
-        for key in ("part", "source")
-    )
+    about = {
+        key: np.array([getattr(recording, key) for recording in recordings])
+        for key in ("label", "part", "source")
+    }
+    X, y, part = np.stack(traces), about["label"].astype(np.int8), about["part"]
     channels, clock = description.channels, description.time
     lengths = description.traces.lengths.removesuffix("-all")
     is_grid = lengths == "resample" and clock.column and clock.rate_hz
     return Dataset(
         X[:, 0] if len(channels) == 1 else X,
         y,
-        name,
         rate_hz=clock.rate_hz or None,
         unit=", ".join(channel.unit for channel in channels).strip(", "),
         limit=channels[0].limit or None,
         part=part if part.any() else None,
-        faults=(*faults,),
         channels=tuple(channel.column for channel in channels),
-        source=source,
+        source=about["source"],
         fit="strict" if is_grid else lengths,
         lengths=np.array([recording.samples.shape[1] for recording in recordings]),
-        notes=(*notes, *finished_notes(X, source.tolist())),
-        unlabelled=n_unlabelled,
         ordered=np.count_nonzero(np.diff(y)) != 1,
     )
 
