@@ -1,13 +1,14 @@
 """The times of samples, exactly as `[time]` says, and the check that none is missing."""
 
 import re
+from contextlib import suppress
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from ...errors import DataError, instead
 from ..description import Clock, TextForm
-from ..table import Floats, Recording, Table, UnreadableError
+from ..table import Cells, Floats, Table, UnreadableError
 
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -70,36 +71,31 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
     cells = table.column(name)
     if not len(cells):
         raise UnreadableError("Expected times, got none", column=name)
-    if cells.dtype.kind == "M" or is_dated(unit):
-        return _dates(table, name, unit, clock)
-    scale = scale_of(unit)
-    if cells.dtype.kind == "O":
-        texts = [str(cell).strip() for cell in cells.tolist()]
-        if all(map(WHOLE.fullmatch, texts)):
-            cells = np.array([*map(int, texts)])
-    if cells.dtype.kind in "iu":  # too long for a float, as nanoseconds since 1970 are
-        cells = cells.astype(np.int64)
+    is_date = cells.dtype.kind == "M"
+    if is_date or is_dated(unit):
+        values, first = _dates(table, name, unit, clock)
+        period = 0.0 if is_date or any(map(has_day, (unit, *clock.format))) else DAY
     else:
-        cells = table.numbers(name, form)
-        table.refuse(np.isnan(cells), "a time", name)
-    values = (cells - cells[0]).astype(np.float64) * scale
-    if clock.wrap:
-        values = values + np.cumsum(np.diff(values, prepend=0.0) < 0) * clock.wrap * scale
-    return values, float(cells[0]) * scale
+        scale = scale_of(unit)
+        times: Cells = table.numbers(name, form)
+        table.refuse(np.isnan(times), "a time", name)
+        with suppress(ValueError, OverflowError):
+            whole = cells.astype(np.int64)  # too long for a float, as nanoseconds since 1970 are
+            times = whole if (whole == times).all() else times
+        values, first = (times - times[0]) * scale, float(times[0]) * scale
+        period = clock.wrap * scale
+    return values + np.cumsum(np.diff(values, prepend=0.0) < -period / 2) * period, first
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
-    """Return the times of a column of dates, or times of day, which pass midnight without dates."""
+    """Return the times of a column of dates, or times of day."""
     import pandas as pd
 
+    has_date = "%" not in unit or has_day(unit)
     texts = pd.Series(table.column(name))
-    is_date = texts.dtype.kind == "M"
-    if not is_date:
-        texts = texts.astype(str).str.strip()
-        if "%f" in unit:
-            texts = texts.str.replace(",", ".", regex=False)
-    has_date = is_date or has_day(unit)
-    form = None if is_date else "ISO8601" if unit == ISO else unit
+    if texts.dtype.kind != "M":
+        texts = texts.astype(str).str.strip().str.replace(",", ".", regex=False)
+    form = unit.replace(",", ".") if "%" in unit else "ISO8601"
     with instead(UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError):
         times = pd.to_datetime(texts, format=form, errors="coerce")
         if times.dt.tz is None:
@@ -108,35 +104,25 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     table.refuse(times.isna().to_numpy(), f"a time of the form {unit}", name)
     zero = pd.Timestamp("1970-01-01" if has_date else "1900-01-01", tz="UTC")
     values = (times - times.iloc[0]).dt.total_seconds().to_numpy(np.float64)
-    if not has_date and not any(map(has_day, clock.format)):
-        values = values + DAY * np.cumsum(np.diff(values, prepend=0.0) < -DAY / 2)
     return values, (times.iloc[0] - zero).total_seconds()
 
 
-def check_steps(recording: Recording, clock: Clock) -> None:
+def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
-    A rate of 0 stands for any that is even: steps are then compared with their mean.
+    A rate of 0 stands for any that is even: steps are then compared with their mean. Equal times
+    are none that rise, unless any gap is allowed.
     """
-    seconds = recording.seconds
-    if seconds is None or len(seconds) < 2:
-        return
-    steps = np.diff(seconds)
-    span = float(seconds[-1] - seconds[0])
-    usual = 1 / clock.rate_hz if clock.rate_hz else span / len(steps)
-    column = " + ".join(clock.column)
-    for is_bad, wanted in (
-        (steps < 0 if clock.gap == 0 and span > 0 else steps <= 0, "a later time than before"),
-        ((steps > clock.gap * usual) & (clock.gap > 0), f"at most time.gap steps of {usual:.6g} s"),
-    ):
-        if is_bad.any():
-            row = int(is_bad.argmax())
-            line = int(recording.lines[row + 1]) if len(recording.lines) else 0
-            message = f"Expected {wanted}, got {steps[row]:.6g} s before row {row + 2}"
-            raise UnreadableError(message, line, column)
-    rate = len(steps) / span
-    if clock.rate_hz and abs(rate - clock.rate_hz) > RATE_TOLERANCE * clock.rate_hz:
-        message = (
-            f"Expected {clock.rate_hz:g} Hz as time.rate_hz says, its times give {rate:.5g} Hz"
-        )
+    steps, rate, column = np.diff(seconds), clock.rate_hz, " + ".join(clock.column)
+    n, span = len(steps), float(seconds[-1] - seconds[0])
+    most = clock.gap / rate if rate else clock.gap * span / max(n, 1)
+    is_equal = (steps == 0) & (clock.gap > 0 or span == 0)
+    is_bad = (steps < 0) | is_equal | (steps > (most or np.inf))
+    if is_bad.any():
+        row = int(is_bad.argmax()) + 1
+        wanted = f"Expected a later time, by at most time.gap steps, which are {most:.6g} s"
+        message = f"{wanted}, got {steps[row - 1]:.6g} s before row {row + 1}"
+        raise UnreadableError(message, table.line(row), column)
+    if abs(rate * span - n) > RATE_TOLERANCE * rate * span and rate:
+        message = f"Expected {rate:g} Hz as time.rate_hz says, its times give {n / span:.5g} Hz"
         raise UnreadableError(message, column=column)

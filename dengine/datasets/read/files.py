@@ -1,12 +1,15 @@
-"""The files that a description names, and their content."""
+"""The files that a description names, their content, and the faults in them."""
 
+import fnmatch
 import gzip
 import re
 import zlib
-from fnmatch import fnmatchcase
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from ...errors import DataError, instead
+from ..dataset import Fault
 from ..description import FOLDER_FILE, Description
 from ..table import UnreadableError
 
@@ -29,21 +32,21 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """
     if root.is_file():
         return [(root, root.name)]
-    listings = [source.listing for source in (description.label, *description.check)]
-    listings += [description.windows.listing, FOLDER_FILE]
-    others = {Path(listing).as_posix() for listing in listings}
-    names: dict[str, Path] = {}
+    names = set[str]()
     for pattern in description.files:
         with instead(DataError, f"Expected patterns below a folder in files, got {pattern}", *BAD):
-            names |= {path.relative_to(root).as_posix(): path for path in root.glob(pattern)}
-    found = [(path, name) for name, path in names.items() if path.is_file() and name not in others]
+            paths = filter(Path.is_file, root.glob(pattern))
+            names |= {path.relative_to(root).as_posix() for path in paths}
+    sources = (description.label, *description.check)
+    names -= {FOLDER_FILE, description.windows.listing, *(source.listing for source in sources)}
     for pattern in description.exclude:
-        found = [item for item in found if not fnmatchcase(item[1], pattern)]
-    if not found:
+        names -= {*fnmatch.filter(names, pattern)}
+    if not names:
         do = f"is it the description of another folder? See `dengine data {root}`"
         wanted = f"files {', '.join(description.files)} in {root}"
         raise DataError(f"Expected {wanted}, found none; {do}.")
-    return sorted(found, key=lambda item: (natural_key(item[0].name), natural_key(item[1])))
+    files = [(root / name, name) for name in names]
+    return sorted(files, key=lambda item: (natural_key(item[0].name), natural_key(item[1])))
 
 
 def read_file(path: Path) -> bytes:
@@ -60,3 +63,13 @@ def read_file(path: Path) -> bytes:
     if (before.st_mtime_ns, before.st_size) != (after.st_mtime_ns, after.st_size):
         raise UnreadableError("Expected a file that stays, it changed while it was read")
     return content
+
+
+@contextmanager
+def caught(faults: list[Fault], source: str) -> Iterator[None]:
+    """Context manager that puts an error into `faults`, with the file or part in which it is."""
+    try:
+        yield
+    except DataError as error:
+        line, column = getattr(error, "line", 0), getattr(error, "column", "")
+        faults.append(Fault(source, line, str(error).rstrip("."), column))

@@ -4,34 +4,32 @@ Files are split into one table for each part, each table becomes a `Recording`, 
 a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from ...errors import DataError, listed, shortened
+from ...errors import DataError, instead, listed
 from ...records import FITS
-from ...traces import can_fit_length, fit_length
+from ...traces import can_fit_length
 from ..checks import Fitted, check_description, finished_notes, without_repeats
 from ..dataset import Dataset, Fault
-from ..description import ANY, Channel, Description, LabelSource
+from ..description import ANY, Channel, Description
 from ..table import Cells, Floats, Recording, Table, UnreadableError
 from ..units import conversion
-from . import bags, frames, windows
+from . import frames
+from .bags import read_bag
 from .clock import check_steps, times_of
-from .files import find_files, natural_key, read_file
+from .files import caught, find_files, natural_key, read_file
 from .places import LabelReader, Place, part_of, read_labels
 from .split import Parts, split, tables_of
+from .windows import cut
 
-Found = Iterator[Recording | Fault]
-Progress = Callable[[int], None]
 FRAME = "table"  # what a DataFrame is called in messages
 WORDS = {1: "good", 0: "bad", None: "not checked"}
-KINDS = ("listing", "column", "path", "line", "topic")  # of sources of labels
 
 
 @dataclass
@@ -43,88 +41,61 @@ class Reader:
     description : Description
     label, checks : LabelReader, sequence of LabelReader
         Of its source of labels, and of those that must agree with it.
-    base : Path
-        The folder of the recordings, in which their listings stand.
     """
 
     description: Description
     label: LabelReader
     checks: Sequence[LabelReader] = ()
-    base: Path = Path()
 
-    def file(self, path: Path, name: str) -> Found:
-        """Yield the recordings of a file, and its faults."""
-        try:
-            tables = tables_of(read_file(path), name, self.description)
-            yield from self.recordings(tables, name)
-        except DataError as error:
-            yield fault_of(error, name)
+    def recording(self, source: str, path: str, table: Table) -> Recording:
+        """Return the recording of a part; UnreadableError if it does not follow the description.
 
-    def recordings(self, tables: Sequence[Table], name: str) -> Found:
-        """Yield the recordings of the tables of a file, and its faults."""
-        faults: list[Fault] = []
-        about = self.description.windows
-        if about.trigger or about.listing:
-            parts = windows.cut(tables[0], name, self.description, self.base, faults)
-        else:
-            parts = split(tables, name, self.description, faults)
-        yield from self.parts(parts)
-        yield from faults
-
-    def parts(self, parts: Parts) -> Found:
-        """Yield the recording of each part, or its fault."""
-        for source, path, table in parts:
-            try:
-                yield self.recording(table, path, source)
-            except UnreadableError as error:
-                yield fault_of(error, source)
-
-    def recording(self, table: Table, path: str, source: str) -> Recording:
-        """Return the recording of a table; UnreadableError if it does not follow the description.
-
-        path : by which the part is named. source : what it is called.
+        source : what it is called. path : by which it is named.
         """
-        clock = self.description.time
-        table, lost = self.kept_rows(table)
+        for line, message in table.damage.items():
+            raise UnreadableError(message, line)
+        about = self.description
+        with instead(UnreadableError, "Expected columns of one length", IndexError):
+            table, is_lost = self.kept_rows(table)
         seconds, start = None, np.nan
-        if clock.column:
-            seconds, start = times_of(table, clock, self.description.text)
-        rows = [self.channel(table, channel) for channel in self.description.channels]
+        if about.time.column:
+            seconds, start = times_of(table, about.time, about.text)
+            if about.time.sort:
+                order = np.argsort(seconds, kind="stable")
+                table, is_lost = table.take(order), is_lost[order]
+                seconds, start = times_of(table, about.time, about.text)
+            check_steps(seconds, about.time, table)
+        rows = [self.channel(table, channel) for channel in about.channels]
         lengths = [*map(len, rows if seconds is None else [*rows, seconds])]
         if len({*lengths}) > 1:
             raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
         samples = np.stack(rows)
-        if len(lost):
-            samples[:, lost] = np.nan
-        if clock.sort and seconds is not None:
-            order = np.argsort(seconds, kind="stable")
-            table, samples = table.take(order), samples[:, order]
-            start += float(seconds[order[0]])
-            seconds = seconds[order] - seconds[order[0]]
-        lines = table.lines if len(table.lines) == samples.shape[1] else ()
-        recording = Recording(source, samples, seconds, start, lines=lines)
-        self.name(recording, Place(path, table))
-        return recording
+        if about.rows:
+            samples[:, is_lost] = np.nan
+        place = Place(path, table)
+        is_window = about.windows.trigger or about.windows.listing
+        part = part_of(about.part, place) or (path if is_window else "")
+        label = self.label_of(place, part)
+        rank = "" if about.order in ("name", "time") else table.one_word(about.order, "first")
+        return Recording(source, samples, seconds, start, part, label, rank)
 
     def kept_rows(self, table: Table) -> tuple[Table, Cells]:
-        """Return the rows of a table that are samples, and which of these are lost; () for none.
+        """Return the rows of a table that are samples, and which of these are lost.
 
         Raises UnreadableError for a word of `[rows]` whose meaning is not stated.
         """
-        lost = np.empty(0, dtype=bool)
+        n = max(map(len, table.columns.values()), default=0)
+        is_lost: Cells = np.zeros(n, dtype=bool)
         for column, about in self.description.rows.items():
-            words = table.words(column)
-            known = {*about.keep, *about.drop, *about.invalid}
-            is_other = ~np.isin(words, [*known])
-            if ANY not in known:
-                table.refuse(is_other, f"one of the words {listed(sorted(known))}", column)
-            invalid, drop = (
-                np.isin(words, [*some]) | (is_other & (ANY in some))
-                for some in (about.invalid, about.drop)
-            )
-            lost = (invalid | lost if len(lost) else invalid)[~drop]
-            table = table.take(~drop)
-        return table, lost
+            kinds = {"keep": about.keep, "drop": about.drop, "invalid": about.invalid}
+            known = {word: kind for kind, words in kinds.items() for word in words}
+            words = table.words(column).tolist()
+            found = np.array([known.get(word, known.get(ANY, "")) for word in words], dtype=object)
+            table.refuse(found == "", f"one of the words {listed(sorted(known))}", column)
+            is_kept = found != "drop"
+            is_lost = (is_lost | (found == "invalid"))[is_kept]
+            table = table.take(is_kept)
+        return table, is_lost
 
     def channel(self, table: Table, channel: Channel) -> Floats:
         """Return the samples of a channel in its unit, shape (n,)."""
@@ -137,36 +108,22 @@ class Reader:
             raise UnreadableError(str(error), line, column) from error
         return values * (factor * channel.factor)
 
-    def name(self, recording: Recording, place: Place) -> None:
-        """Set the part, the label and the word for the order of a recording.
-
-        Raises UnreadableError if one is missing, or the sources of its label disagree. A part of a
-        long recording has the key of its window, if no number is stated.
-        """
-        recording.part = part_of(self.description.part, place)
-        if not recording.part and windows.KEY in place.table.columns:
-            recording.part = place.table.one_word(windows.KEY)
-        recording.label = self.label.label(place, recording.part)
-        for other in self.checks:
-            label = other.label(place, recording.part)
-            if label != recording.label:
-                message = f"Expected labels that agree, {title_of(self.label.source)} says "
-                message += f"{WORDS[recording.label]}, {title_of(other.source)} {WORDS[label]}"
-                raise UnreadableError(message, column=other.source.column)
-        if self.description.order not in ("name", "time"):
-            recording.order = place.table.one_word(self.description.order, "first")
-
-
-def title_of(source: LabelSource) -> str:
-    """Return what a source of labels is called in messages."""
-    kind = next((kind for kind in KINDS if getattr(source, kind)), "column")
-    return f"the {kind} {shortened(getattr(source, kind))}"
+    def label_of(self, place: Place, part: str) -> int | None:
+        """Return the label of a part; UnreadableError if there is none, or a check disagrees."""
+        label = self.label.label(place, part)
+        for i, check in enumerate(self.checks, 1):
+            other = check.label(place, part)
+            if other != label:
+                message = f"Expected labels that agree, [label] says {WORDS[label]}"
+                message = f"{message}, [[check]] {i} says {WORDS[other]}"
+                raise UnreadableError(message, column=check.source.column)
+        return label
 
 
 def read_recordings(
-    source: Any, description: Description, progress: Progress | None = None
+    source: Any, description: Description, progress: Callable[[int], None] | None = None
 ) -> Dataset:
-    """Read recordings exactly as a description says.
+    """Read the recordings that a description describes.
 
     Parameters
     ----------
@@ -187,49 +144,63 @@ def read_recordings(
         If a key is still open, no file is found, a listing cannot be read, or no recording is left.
     """
     check_description(description)
-    is_path = isinstance(source, Path)
-    base = (source if source.is_dir() else source.parent) if is_path else Path()
+    name, base = FRAME, Path()
+    files: list[tuple[Any, str]] = [(source, FRAME)]
+    if isinstance(source, Path):
+        name, base = (source.name, source) if source.is_dir() else (source.stem, source.parent)
+        files = find_files(source, description)
+    notes: list[str] = []
+    faults: list[Fault] = []
+    if description.layout == "mcap":
+        title = files[0][1] if len(files) == 1 else name
+        files = [(read_bag(files, description, notes, faults), title)]
     sources = (description.label, *description.check)
     labels = [read_labels(base, one, description.text) for one in sources]
-    reader = Reader(description, labels[0], labels[1:], base)
-    files = find_files(source, description) if is_path else []
-    notes: list[str] = []
-    found: list[Recording | Fault] = []
-    if description.layout == "mcap":
-        faults: list[Fault] = []
-        found += reader.parts(bags.split_bag(files, description, base, notes, faults))
-        found += faults
-    elif not is_path:
-        found += reader.recordings([frames.read_frame(source, FRAME)], FRAME)
+    reader = Reader(description, labels[0], labels[1:])
+    fitted: list[Fitted] = []
+    n_unlabelled = 0
+    for file, title in files:
+        with caught(faults, title):
+            for part in _parts_of(file, title, description, base, faults):
+                with caught(faults, part[0]):
+                    recording = reader.recording(*part)
+                    if recording.label is None:
+                        n_unlabelled += 1
+                    else:
+                        fitted.append((recording, fit(recording, description)))
+        if progress is not None:
+            progress(1)
+    notes += [label.unused_note() for label in labels if label.unused_note()]
+    return _joined(fitted, description, name, faults, notes, n_unlabelled)
+
+
+def _parts_of(
+    source: Any, name: str, description: Description, base: Path, faults: list[Fault]
+) -> Parts:
+    """Yield the parts of a file, a DataFrame or the table of a bag."""
+    if isinstance(source, Path):
+        tables = tables_of(read_file(source), name, description)
     else:
-        for path, name in files:
-            found += reader.file(path, name)
-            if progress is not None:
-                progress(1)
-    notes += [note for label in labels if (note := label.unused_note())]
-    name = FRAME if not is_path else source.name if source.is_dir() else source.stem
-    return to_dataset(found, description, name, notes)
+        tables = [source if isinstance(source, Table) else frames.read_frame(source, name)]
+    if description.windows.trigger or description.windows.listing:
+        return cut(tables[0], name, description, base)
+    return split(tables, name, description, faults)
 
 
-def fault_of(error: DataError, source: str) -> Fault:
-    """Return the fault of an error."""
-    line, column = getattr(error, "line", 0), getattr(error, "column", "")
-    return Fault(source, line, str(error).rstrip("."), column)
-
-
-def to_dataset(
-    found: Iterable[Recording | Fault], description: Description, name: str, notes: Sequence[str]
+def _joined(
+    fitted: list[Fitted],
+    description: Description,
+    name: str,
+    faults: list[Fault],
+    notes: list[str],
+    n_unlabelled: int,
 ) -> Dataset:
-    """Return the data set of recordings, in the order in which they were made.
+    """Return the data set of recordings with their traces, in the order in which they were made.
 
     Raises DataError if none is left.
     """
-    fitted, faults, n_unlabelled = _fitted(found, description)
-    orders: Mapping[str, Callable[[Fitted], Any]] = {
-        "time": lambda item: item[0].start,
-        "name": lambda _: 0,  # as they were found
-    }
-    fitted.sort(key=orders.get(description.order, lambda item: natural_key(item[0].order)))
+    is_timed = description.order == "time"
+    fitted.sort(key=lambda item: (item[0].start if is_timed else 0, natural_key(item[0].order)))
     fitted, repeats = without_repeats(fitted)
     faults += repeats
     if not fitted:
@@ -238,63 +209,36 @@ def to_dataset(
         raise DataError(f"Expected recordings in {name}, none is left: {n}.{why}")
     n_found, n_seen = len(fitted) + len(faults) + n_unlabelled, description.seen.recordings
     if n_found < n_seen:
-        seen = f"The description was made for {n_seen} recordings, now there are {n_found}."
-        notes = [*notes, seen]
-    return _joined(
-        fitted, description, name=name, faults=(*faults,), unlabelled=n_unlabelled, notes=notes
-    )
+        notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
+    data = _stacked(fitted, description)
+    notes += finished_notes(data.cube, [recording.source for recording, _ in fitted])
+    return replace(data, name=name, faults=(*faults,), notes=(*notes,), unlabelled=n_unlabelled)
 
 
-def _joined(
-    fitted: Sequence[Fitted], description: Description, notes: Sequence[str], **others: Any
-) -> Dataset:
-    """Return the data set of recordings with their traces."""
-    traces = np.stack([trace for _, trace in fitted])
+def _stacked(fitted: Sequence[Fitted], description: Description) -> Dataset:
+    """Return the data set of the traces, and of what is known of each."""
+    recordings, traces = zip(*fitted, strict=True)
     about = {
-        key: np.array([getattr(recording, key) for recording, _ in fitted])
-        for key in ("source", "part", "label")
+        key: np.array([getattr(recording, key) for recording in recordings])
+        for key in ("label", "part", "source")
     }
+    X, y, part = np.stack(traces), about["label"].astype(np.int8), about["part"]
     channels, clock = description.channels, description.time
-    names, units = zip(*((channel.column, channel.unit) for channel in channels), strict=True)
     lengths = description.traces.lengths.removesuffix("-all")
     is_grid = lengths == "resample" and clock.column and clock.rate_hz
     return Dataset(
-        traces[:, 0] if len(channels) == 1 else traces,
-        about["label"].astype(np.int8),
+        X[:, 0] if len(channels) == 1 else X,
+        y,
         rate_hz=clock.rate_hz or None,
-        unit=", ".join(units).strip(", "),
+        unit=", ".join(channel.unit for channel in channels).strip(", "),
         limit=channels[0].limit or None,
-        part=about["part"] if (about["part"] != "").any() else None,
-        channels=names,
+        part=part if part.any() else None,
+        channels=tuple(channel.column for channel in channels),
         source=about["source"],
         fit="strict" if is_grid else lengths,
-        lengths=np.array([recording.samples.shape[1] for recording, _ in fitted]),
-        notes=(*notes, *finished_notes(traces, about["source"].tolist())),
-        ordered=np.count_nonzero(np.diff(about["label"])) != 1,
-        **others,
+        lengths=np.array([recording.samples.shape[1] for recording in recordings]),
+        ordered=np.count_nonzero(np.diff(y)) != 1,
     )
-
-
-def _fitted(
-    found: Iterable[Recording | Fault], description: Description
-) -> tuple[list[Fitted], list[Fault], int]:
-    """Return the labelled recordings with their traces, the faults, and the number of others."""
-    fitted: list[Fitted] = []
-    faults: list[Fault] = []
-    n_unlabelled = 0
-    for item in found:
-        if isinstance(item, Fault):
-            faults.append(item)
-            continue
-        try:
-            check_steps(item, description.time)
-            if item.label is None:
-                n_unlabelled += 1
-            else:
-                fitted.append((item, fit(item, description)))
-        except UnreadableError as error:
-            faults.append(fault_of(error, item.source))
-    return fitted, faults, n_unlabelled
 
 
 def fit(recording: Recording, description: Description) -> NDArray[np.float32]:
@@ -309,21 +253,18 @@ def fit(recording: Recording, description: Description) -> NDArray[np.float32]:
         If the recording is too short, or too long, to be fitted without making up data.
     """
     samples, lengths = description.traces.samples, description.traces.lengths
-    n = recording.samples.shape[1]
-    seconds, rate = recording.seconds, description.time.rate_hz
-    if lengths == "resample" and seconds is not None and n > 1:
-        step = 1 / rate if rate else float(seconds[-1]) / max(samples - 1, 1)
-        times = np.arange(samples) * step
-        if times[-1] > seconds[-1] + step:
-            message = f"Expected {times[-1]:.6g} s, got {seconds[-1]:.6g} s"
-            raise UnreadableError(f"{message}; traces.samples or time.rate_hz is too large")
-        rows = [np.interp(times, seconds, row) for row in recording.samples]
-        return np.stack(rows).astype(np.float32)
-    kind = FITS.index(lengths.removesuffix("-all"))
-    if not (can_fit_length(n, samples, kind) or (lengths == "pad-all" and n)):
+    x, rate = recording.samples, description.time.rate_hz
+    n = x.shape[1]
+    kind = lengths.removesuffix("-all")
+    can_fit = can_fit_length(n, samples, FITS.index(kind)) or (lengths == "pad-all" and n > 0)
+    seconds = np.arange(n, dtype=float) if recording.seconds is None else recording.seconds
+    step = float(seconds[-1:].sum()) / max(samples - 1, 1)
+    if kind == "resample" and recording.seconds is not None and rate:
+        step = 1 / rate
+        can_fit = (samples - 2) * step <= seconds[-1]
+    if not can_fit:
         message = f"Expected {samples} samples, got {n}"
         raise UnreadableError(f"{message}; see traces.lengths, which is {lengths}")
-    x = recording.samples.astype(np.float32)
-    if lengths == "resample":
-        return np.asarray(fit_length(torch.from_numpy(x), samples, kind))
-    return np.asarray(x[:, np.minimum(np.arange(samples), n - 1)])
+    if kind == "resample":
+        x = np.stack([np.interp(np.arange(samples) * step, seconds, row) for row in x])
+    return x[:, np.minimum(np.arange(samples), x.shape[1] - 1)].astype(np.float32)
