@@ -419,7 +419,8 @@ class DataChoice:
 
         if not self.stated and not self.description and own_reader(self.data) is not None:
             return None
-        return description_of(self.data, self.description, self.stated, propose)
+        with progress_bar(f"describing {self.data}", None):
+            return description_of(self.data, self.description, self.stated, propose)
 
     def load(self, description: Description | None = None) -> Dataset:
         """Load the data set and return it.
