@@ -273,7 +273,7 @@ class HttpApi:
         Settings that are left out stay as they are. Many changes start the decision rule anew.
         """
         return await self._change(
-            author, lambda engine, by: engine.set_policy(replace(engine.policy, **changes), by)
+            author, lambda engine, by: engine.set_policy(engine.policy.changed(**changes), by)
         )
 
     async def retrain(self, author: Author = "") -> Json:
