@@ -337,8 +337,9 @@ class Certificate:
                 f"{math.ceil(escapes):,} on average: {result}."
             )
         return (
-            f"{claim} Accepting pauses whenever the parts that the model would accept have, by what "
-            f"is known of them, cost {self.prices[1]:,g}, one bad part, more than their checks."
+            f"{claim} Accepting pauses whenever the parts that the model would accept have, by "
+            f"what is known of them, cost {self.prices[1]:,g}, the price of one bad "
+            f"part, more than their checks."
         )
 
     @property

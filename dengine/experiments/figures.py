@@ -27,7 +27,7 @@ from ..history.sentences import Bound
 from ..records import Action, TraceArray, TraceSpec
 from ..reducers import has_own_unit
 from ..traces import as_traces
-from .costs import CostCurve, PolicyCost
+from .costs import CostCurve, policy_name
 from .replay import Floats, Replay
 from .survey import channel_means
 
@@ -505,10 +505,11 @@ def _draw_rate(axes: Axes, run: Replay, clock_s: Floats, window: int) -> None:
 
 
 def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
-    """Draw a cost curve, with a ring around the chosen policy.
+    """Draw what a part costs under each policy, the cheapest at the top.
 
-    Above: the cost per part with its interval, and the cost of verifying everything. Below: the
-    share of parts that the model accepted or rejected.
+    A line marks the cost of checking everything, and a ring the chosen policy. Policies that were
+    left behind are hollow: their costs are of other shuffles. An interval that leaves the axes ends
+    in an arrow with its value. On the right stands the share of parts decided without a check.
 
     Parameters
     ----------
@@ -522,68 +523,36 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     """
     costs = curve.costs
     title = (
-        f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape "
-        f"{costs.escape:g} {unit}, false reject {costs.false_reject:g} "
-        f"{unit}\n{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the "
-        "ends of their 95 % intervals"
+        f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape {costs.escape:g} "
+        f"{unit}, false reject {costs.false_reject:g} {unit}\n{curve.shuffles} shuffles of "
+        f"{curve.cycles} parts, with 95 % intervals"
     )
-    figure = blank(9.0, 7.2, title)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    by_bound = [row for row in curve.rows if row.policy.guarantee != "cost"]
-    by_cost = [row for row in curve.rows if row.policy.guarantee == "cost"]
-    bounds = sorted({row.policy.lower_bound for row in by_bound})
-    groups: dict[str, list[PolicyCost]] = {}
-    for row in by_bound:
-        groups.setdefault(f"alpha {row.policy.alpha:g}", []).append(row)
-    if by_cost:
-        groups["by cost"] = by_cost
-    top.axhline(curve.costs.check, label="verify everything", **LIMIT)
-    for i, (label, rows) in enumerate(groups.items()):
-        ticks = [
-            len(bounds) if rows is by_cost else bounds.index(row.policy.lower_bound) for row in rows
-        ]
-        # Moved a little, so that the bars of the alphas stand side by side.
-        x = np.array(ticks) + 0.08 * (i - (len(groups) - 1) / 2)
-        style: Style = {
-            "color": RECIPES[i % len(RECIPES)],
-            "marker": "osD^vP"[i % 6],
-            "markersize": 6,
-            "label": label,
-        }
-        _draw_policies(top, bottom, curve, rows, x, style)
-    n_columns = len(groups) + 2
-    means = [row.cost for row in curve.rows]
-    limits = (min(0.0, *means), 1.25 * max(curve.costs.check, *means))
-    finish(top, n_columns, ylim=limits, ylabel=f"cost a part [{unit}]")
-    highest = max(10.0, 110 * max(row.certain for row in curve.rows))
-    y_label = "decided without a check\n[% of parts]"
-    finish(bottom, n_columns, ylim=(0, highest), ylabel=y_label)
-    names = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * len(by_cost)
-    bottom.set_xticks(range(len(names)), names)
-    bottom.set_xlabel("LB [% of accepted parts that are to be good]")
+    rows = [*curve.rows, *curve.left_behind]
+    figure = blank(9.0, 2.2 + 0.34 * len(rows), title)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+    end = 1.3 * max(costs.check, *(row.cost for row in rows))
+    left.axvline(costs.check, label="check everything", **LIMIT)
+    groups = ((curve.rows, BLUE, "played last"), (curve.left_behind, "none", "left behind"))
+    y = 0
+    for group, colour, label in groups:
+        style: Style = {"color": BLUE, "markerfacecolor": colour, "capsize": 3, "fmt": "o"}
+        for i, row in enumerate(group):
+            upper = min(row.upper, end)
+            errors = [[row.cost - max(row.lower, 0.0)], [upper - row.cost]]
+            left.errorbar(row.cost, y, xerr=errors, label="_" if i else label, **style)
+            if row.upper > end:
+                left.text(end, y, f"to {row.upper:.3g} \u2192", ha="right", va="bottom", size=SMALL)
+            right.barh(y, 100 * (row.accepted + row.rejected), color=BLUE, fill=group is curve.rows)
+            y += 1
+    if curve.policy is not None:
+        ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
+        where = curve.rows.index(curve.marked)
+        left.scatter(curve.marked.cost, where, s=200, label=f"choice: {curve.verdict}", **ring)
+    left.set_yticks(range(len(rows)), [policy_name(row.policy) for row in rows])
+    left.invert_yaxis()
+    finish(left, 4, xlim=(0.0, end), xlabel=f"cost a part [{unit}]")
+    finish(right, 0, xlim=(0, 100), xlabel="decided without\na check [% of parts]")
     return figure
-
-
-def _draw_policies(
-    top: Axes,
-    bottom: Axes,
-    curve: CostCurve,
-    rows: Sequence[PolicyCost],
-    x: Floats,
-    style: Style,
-) -> None:
-    """Draw the costs and certain shares of policies at x (n,), and a ring around the chosen one."""
-    cost = np.array([row.cost for row in rows])
-    lower = np.array([row.lower for row in rows])
-    upper = np.array([row.upper for row in rows])
-    # A replay's mean lies within what its errors' intervals allow, but for rounding.
-    errors = np.maximum([cost - lower, upper - cost], 0.0)
-    top.errorbar(x, cost, yerr=errors, capsize=3, elinewidth=1.0, **style)
-    bottom.plot(x, [100 * row.certain for row in rows], **style)
-    ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
-    for tick, row in zip(x, rows, strict=True):
-        if row.policy == curve.policy:
-            top.scatter(tick, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
 
 
 def _axis_labels(spec: TraceSpec) -> list[str]:
