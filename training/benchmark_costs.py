@@ -37,8 +37,8 @@ PRICES = {"dear": (0.5, 200.0, 5.0), "paper": (5.0, 120.0, 47.5), "cheap": (1.0,
 COLUMNS = (
     "set", "prices", "run", "verdict", "chosen", "cost", "best", "best_cost", "check", "n_candidates",
 )  # fmt: skip
-# By name: how steeply the failure probability rises with the defect, at which size of the defect it
-# is one half, and the noise that hides the defect.
+# By name: how steeply the failure probability rises with the defect, the size of the defect at
+# which it is one half, and the noise that hides the defect.
 SETS = {"clear": (12.0, 1.5, 0.05), "graded": (3.0, 1.8, 0.05), "hidden": (6.0, 1.2, 0.6)}
 
 
