@@ -35,7 +35,8 @@ SAMPLES = 200
 N_RECORDINGS = 600
 PRICES = {"dear": (0.5, 200.0, 5.0), "paper": (5.0, 120.0, 47.5), "cheap": (1.0, 20.0, 10.0)}
 COLUMNS = (
-    "set", "prices", "run", "verdict", "chosen", "cost", "best", "best_cost", "check", "n_candidates",
+    "set", "prices", "run", "verdict", "chosen", "cost", "best", "best_cost", "check",
+    "n_candidates",
 )  # fmt: skip
 # By name: how steeply the failure probability rises with the defect, the size of the defect at
 # which it is one half, and the noise that hides the defect.
@@ -64,7 +65,9 @@ def make_set(name: str, n: int, seed: int) -> tuple[Dataset, NDArray[np.float64]
 def from_part(scores: Replay, first: int) -> Replay:
     """Return a replay without its first cycles."""
     values = {field.name: getattr(scores, field.name) for field in fields(scores)}
-    later = {name: v[first:] for name, v in values.items() if isinstance(v, np.ndarray)}
+    later: dict[str, Any] = {
+        name: v[first:] for name, v in values.items() if isinstance(v, np.ndarray)
+    }
     return replace(scores, **later)
 
 
