@@ -58,7 +58,7 @@ def make_set(name: str, n: int, seed: int) -> tuple[Dataset, NDArray[np.float64]
     gain = 1.0 + 0.05 * rng.standard_normal((n, 1))
     seen = defect[:, None] + noise * rng.standard_normal((n, 1))
     X = 10.0 * gain * time + seen * hump + 0.2 * rng.standard_normal((n, SAMPLES))
-    y = (rng.random(n) >= failure).astype(np.int64)
+    y = (rng.random(n) >= failure).astype(np.int8)
     return Dataset(X=X.astype(np.float32), y=y, name=name), failure
 
 
