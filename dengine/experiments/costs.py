@@ -456,7 +456,8 @@ def candidates(
         tolerances = [factor * costs.worst_accept for factor in factors]
         allowed = [share for share in tolerances if share <= LARGEST_TOLERANCE]
         shares = allowed or [LARGEST_TOLERANCE]
-        return sorted(lower_bounds or [round(1.0 - share, 5) for share in shares])
+        # Two digits of the tolerance are enough, and make a level that can be typed.
+        return sorted(lower_bounds or [round(1.0 - float(f"{share:.2g}"), 9) for share in shares])
 
     is_own = policy.guarantee not in RULES
     first = policy.guarantee if is_own else "local"
