@@ -65,8 +65,8 @@ class PolicyCost:
     ----------
     policy : Policy
     expected_cost : float
-        Per part, with half an error a shuffle added to each count of wrong decisions: no error
-        among 25 accepted parts does not mean that there is never one.
+        Per part, with half an error added to each share of wrong decisions, counted in different
+        parts: no error among 25 accepted parts does not mean that there is never one.
     cost : float
         Mean per part.
     lower, upper : float
@@ -222,7 +222,7 @@ class CostCurve:
         if self.policy is None:
             text = (
                 f"Nothing pays: {verify_all}; the cheapest policy, {policy_name(row.policy)}, "
-                f"costs {cost}, or {row.expected_cost:.3g} with half an error more a shuffle."
+                f"costs {cost}, or {row.expected_cost:.3g} with half an error more."
             )
         elif cheapest != row:
             text += (
@@ -390,8 +390,8 @@ class PolicySearch:
         while len(self.remaining) > N_LAST:
             if not self._play(play, islice(seeds, N_SCREENING), self._screened, self._scores):
                 return
-            self.remaining.sort(key=self._screening_cost)
-            del self.remaining[max(N_LAST, math.ceil(len(self.remaining) / 2)) :]
+            self.remaining.sort(key=self._screening_key)
+            del self.remaining[max(N_LAST, len(self.remaining) // 2) :]
         self._play(play, islice(seeds, self._repeats), self._reported, None)
 
     def _play(
@@ -414,10 +414,11 @@ class PolicySearch:
                 into[policy][replay.seed] = replay_policy(replay, policy) if scores else replay
         return len(replays) == len(tasks)
 
-    def _screening_cost(self, contender: Contender) -> float:
-        """Return a candidate's expected cost over the shuffles that choose."""
+    def _screening_key(self, contender: Contender) -> tuple[bool, float]:
+        """Return what candidates are sorted by: whether all was verified, and the expected cost."""
         policy = contender.recipe.policy
-        return _policy_cost(policy, list(self._screened[policy].values()), self.costs).expected_cost
+        row = _policy_cost(policy, list(self._screened[policy].values()), self.costs)
+        return row.accepted + row.rejected == 0.0, row.expected_cost
 
     def curve(self) -> CostCurve | None:
         """Return the cost curve of what was played.
@@ -621,7 +622,7 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
     luck = float(student.ppf(1.0 - ERROR_LEVEL / 2, max(1, n - 1))) * _order_error(each.mean(1))
     return PolicyCost(
         policy=policy,
-        expected_cost=cost_at(*((e.wrong + 0.5 * n) / (e.decided + n) for e in (bad, good))),
+        expected_cost=cost_at(*(_expected_rate(error) for error in (bad, good))),
         cost=cost,
         lower=cost - math.hypot(cost - cost_at(bad.lower, good.lower), luck),
         upper=cost + math.hypot(cost - cost_at(bad.upper, good.upper), luck),
@@ -633,6 +634,12 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
         good=good,
         shuffles=n,
     )
+
+
+def _expected_rate(error: ErrorRate) -> float:
+    """Return the Jeffreys mean of a share of errors, whose unit is the part."""
+    n_wrong = error.traces * error.wrong / max(1, error.decided)
+    return (n_wrong + 0.5) / (error.traces + 1)
 
 
 def _order_error(each: Floats) -> float:
