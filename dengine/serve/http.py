@@ -333,7 +333,8 @@ class HttpApi:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm."""
         status = await self.service.status(last, watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
-        return response_fields("Status", status, alarm=status.alarm, **line)
+        texts = {"alarm": status.alarm, "claim": status.certificate.sentence}
+        return response_fields("Status", status, **texts, **line)
 
     async def decision(
         self,
