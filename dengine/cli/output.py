@@ -361,28 +361,22 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
 @contextmanager
 def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Write a line to stderr every `LINE_SECONDS` while the block runs, as `progress_bar` does."""
-    done = 0
+    steps: list[int] = []
     ended = Event()
-    begin = time.monotonic()
-
-    def advance(n: int) -> None:
-        nonlocal done
-        done += n
 
     def write_lines() -> None:
         """Write until the block ends."""
+        begin = time.monotonic()
         while not ended.wait(LINE_SECONDS):
-            of = "" if total is None else f" of {total:,}"
             seconds = format_duration(time.monotonic() - begin)
-            click.echo(without_password(f"{label}: {done:,}{of} in {seconds}"), err=True)
+            text = f"{label}: {sum(steps):,} of {total or '?'} in {seconds}"
+            click.echo(without_password(text), err=True)
 
-    writer = Thread(target=write_lines, daemon=True)
-    writer.start()
+    Thread(target=write_lines, daemon=True).start()
     try:
-        yield advance
+        yield steps.append
     finally:
         ended.set()
-        writer.join()
 
 
 class StepInterruptedError(Exception):

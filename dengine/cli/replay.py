@@ -490,27 +490,14 @@ CURVE_FIELDS = (
 )
 
 
-class Price(click.ParamType[float]):
-    """A price, a plain number; its unit is that of `--cost-unit`."""
-
-    name = "number"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: Any) -> float:
-        """Return the number; a usage error for anything else."""
-        try:
-            return float(value)
-        except ValueError:
-            self.fail(f"Expected a number, got {value!r}; name its unit by --cost-unit", param, ctx)
-
-
 _ESCAPE = "Cost of a bad part that is accepted: a line stop, or worse."
 _FALSE_REJECT = "Cost of a good part that is rejected."
 PRICES = {
     "check": click.option(
-        "--check", type=Price(), default=5.0, show_default=True, help="Cost of one verification."
+        "--check", type=float, default=5.0, show_default=True, help="Cost of one verification."
     ),
-    "escape": click.option("--escape", type=Price(), required=True, help=_ESCAPE),
-    "false_reject": click.option("--false-reject", type=Price(), required=True, help=_FALSE_REJECT),
+    "escape": click.option("--escape", type=float, required=True, help=_ESCAPE),
+    "false_reject": click.option("--false-reject", type=float, required=True, help=_FALSE_REJECT),
 }
 _FRESH = "Number of shuffles that the last two policies play; earlier ones choose these."
 
@@ -590,7 +577,8 @@ def costs(
     if curve.policy is not None:
         settings = settings_of(curve.policy)
         record["python"] = f"Policy({', '.join(f'{k}={v!r}' for k, v in settings.items())})"
-        record["command"] = f"dengine policy {_store_name(source.data)} {_as_flags(settings)}"
+        store = source.data if source.data.endswith(".db") else "cell.db"
+        record["command"] = f"dengine policy {store} {_as_flags(settings)}"
         lines.append(f"Set it by\n  {record['command']}\n  {record['python']}")
     frame = curve.to_frame()
     print_result(
@@ -608,11 +596,6 @@ def costs(
         },
     )
     _end(error, "Interrupted: what was finished is shown.")
-
-
-def _store_name(data: str) -> str:
-    """Return the address of a store, or the name of a new one for other data."""
-    return data if data.endswith(".db") or "://" in data else "cell.db"
 
 
 def _as_flags(settings: Options) -> str:

@@ -212,14 +212,11 @@ class CostCurve:
         cheapest = self.rows[0]
         missing = self.missing
         verify_all = f"verifying everything costs {self.costs.check:g} a part"
-        if not any(item.accepted + item.rejected for item in self.rows):
-            return (
-                f"Nothing pays yet: {verify_all}, and under each policy that was tried everything "
-                "was verified. Record more."
-            )
         cost = f"{row.cost:.3g} a part, with a 95 % interval of {row.lower:.3g} to {row.upper:.3g}"
         text = f"{policy_name(row.policy)} {self.verdict}: {cost}; {verify_all}."
-        if self.policy is None:
+        if row.verified == 1.0:
+            text = f"Nothing pays: {verify_all}, and everything was verified. Record more."
+        elif self.policy is None:
             text = (
                 f"Nothing pays: {verify_all}; the cheapest policy, {policy_name(row.policy)}, "
                 f"costs {cost}, or {row.expected_cost:.3g} with half an error more."
