@@ -33,7 +33,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from ..datasets import load_dataset
-from ..decision.intervals import normal_quantile
+from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import AUDIT_RATE, RULES, Policy
 from ..errors import SettingError, expect, percent
 from ..files import FilePath
@@ -52,8 +52,10 @@ N_SCREENING = 2  # shuffles of each round of the halving
 N_LAST = 2  # policies that play the fresh shuffles
 REPEATS = 4  # fresh shuffles
 ERROR_LEVEL = 0.05  # of the intervals
-Z = normal_quantile(ERROR_LEVEL / 2)  # each of two shares of errors has half of it
+ALPHA_EACH = ERROR_LEVEL / 2  # of the shares of wrong accepts and of wrong rejects
+Z = normal_quantile(ALPHA_EACH)
 MOST_NEIGHBOURS = 10**7
+MOST_MORE = 10_000  # times the recordings: what needs more is never shown
 Groups = Mapping[Policy, Sequence[Replay]]
 
 
@@ -71,7 +73,7 @@ class PolicyCost:
         Mean per part.
     lower, upper : float
         Interval of the cost: both shares of wrong decisions at the ends of their intervals, which
-        hold together at 95 %, and the luck of the order, added in squares.
+        hold together at 95 %, and `luck`, added in squares.
     late : float
         Mean cost per part over the last third of each shuffle, when something has been learned.
     verified, accepted, rejected : float
@@ -79,6 +81,8 @@ class PolicyCost:
         those that an operator's limits rejected.
     bad, good : ErrorRate
         Bad parts among the accepted ones, good parts among the rejected ones.
+    luck : float
+        Of the order: half the width of the 95 % interval of the mean over the shuffles.
     shuffles : int
     """
 
@@ -93,6 +97,7 @@ class PolicyCost:
     rejected: float
     bad: ErrorRate
     good: ErrorRate
+    luck: float
     shuffles: int
 
     @property
@@ -103,13 +108,13 @@ class PolicyCost:
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """What would turn "may pay" into "pays".
+    """What would turn "may pay" into "pays", with the shares of wrong decisions that were seen.
 
     Attributes
     ----------
     accepted, seen : int
-        Different accepted parts, with the share of bad ones that was seen, that would show it, and
-        as how many independent ones those of the recordings count.
+        Different accepted parts that would show it, and as how many independent ones those of the
+        recordings count.
     recordings, production : int
         Further recordings, or parts of production, that bring them.
     audit_rate : float
@@ -173,34 +178,39 @@ class CostCurve:
         return None if self.verdict == "does not pay" else self.marked.policy
 
     @property
-    def worst_share(self) -> float:
-        """Share of bad parts among the accepted ones up to which the marked policy pays.
-
-        Its false rejects are at the end of their interval. 0 if it accepts nothing.
-        """
-        row = self.marked
-        certain = row.accepted + row.rejected
-        spared = self.costs.saved(certain, 0.0, row.rejected * row.good.upper)
-        return max(0.0, spared / (self.costs.escape * row.accepted)) if row.accepted else 0.0
-
-    @property
     def missing(self) -> Missing | None:
         """What is missing to a policy that may pay; None if it pays, or nothing would show it."""
         row = self.marked
-        rate = row.bad.rate if row.bad.decided else 0.0
-        worst = min(self.worst_share, 0.5)
-        if self.verdict == "pays" or worst <= rate:
+        if self.verdict != "may pay":
             return None
+        errors = (row.bad, row.good)
+        rates = [error.wrong / max(1, error.decided) for error in errors]
+        # Wilson's upper end u of a share r of n parts: n = z^2 u (1 - u) / (u - r)^2.
+        sizes = [
+            Z**2 * error.upper * (1.0 - error.upper) / (error.upper - rate) ** 2
+            for error, rate in zip(errors, rates, strict=True)
+        ]
 
-        def n_parts(upper: float) -> float:
-            """Return how many parts, with this rate, have this upper end of Wilson's interval."""
-            return Z**2 * upper * (1.0 - upper) / (upper - rate) ** 2
+        def surplus(n_recordings: int) -> float:
+            """Return how far so many recordings like these bring the interval below the check."""
+            more = n_recordings / self.cycles
+            bad, good = (
+                float(
+                    wilson_interval(more * size * rate, more * size * (1.0 - rate), ALPHA_EACH)[1]
+                )
+                for size, rate in zip(sizes, rates, strict=True)
+            )
+            wrong = row.accepted * bad, row.rejected * good
+            worst = self.costs.check - self.costs.saved(row.accepted + row.rejected, *wrong)
+            upper = row.cost + math.hypot(worst - row.cost, row.luck / math.sqrt(more))
+            return self.costs.check - upper
 
-        needed = math.ceil(n_parts(worst))
-        seen = min(math.floor(n_parts(row.bad.upper) + 1e-6), needed)
+        most = MOST_MORE * self.cycles
+        n = bisect_left(range(most), 0.0, lo=self.cycles, key=surplus)
         known = 1.0 if row.policy.stops == "all" else row.policy.audited_share or AUDIT_RATE
-        more = math.ceil((needed - seen) / row.accepted)
-        return Missing(needed, seen, more, math.ceil(needed / (row.accepted * known)), known)
+        needed = math.ceil(sizes[0] * n / self.cycles)
+        parts = n - self.cycles, math.ceil(n / known)
+        return None if n == most else Missing(needed, round(sizes[0]), *parts, known)
 
     @property
     def sentence(self) -> str:
@@ -232,11 +242,13 @@ class CostCurve:
             if missing.audit_rate < 1.0:
                 how = f"at an audit rate of {percent(missing.audit_rate, 'g')}"
             kind = "this share of bad ones" if row.bad.wrong else "no bad one"
+            kind = "this share of bad ones" if row.bad.wrong else "no bad one"
+            worst = percent(self.costs.worst_accept, ".3g")
             text += (
                 f" Not certainly: of the accepted parts up to {percent(row.bad.upper, '.3g')} may "
-                f"be bad, and it pays up to {percent(self.worst_share, '.3g')}. To show that takes "
+                f"be bad, and accepting pays up to {worst}. To show that it pays takes about "
                 f"{missing.accepted:,} different accepted parts with {kind}, and these recordings "
-                f"count as {missing.seen:,}: about {missing.recordings:,} more recordings, or "
+                f"count as {missing.seen:,}: {missing.recordings:,} more recordings, or "
                 f"{missing.production:,} parts of production {how}."
             )
         if not self.fresh:
@@ -605,9 +617,8 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
         float(np.mean([getattr(replay, name) for replay in replays]))
         for name in ("verified", "accepted", "rejected")
     )
-    # Each at half the error level: together they hold at ERROR_LEVEL.
-    bad = pooled_error(replays, "accepted", ERROR_LEVEL / 2)
-    good = pooled_error(replays, "rejected", ERROR_LEVEL / 2)
+    bad = pooled_error(replays, "accepted", ALPHA_EACH)
+    good = pooled_error(replays, "rejected", ALPHA_EACH)
 
     def cost_at(bad_rate: float, good_rate: float) -> float:
         """Return the cost per part at these rates of wrong decisions."""
@@ -629,6 +640,7 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
         rejected=rejected,
         bad=bad,
         good=good,
+        luck=luck,
         shuffles=n,
     )
 

@@ -121,25 +121,35 @@ def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everythi
     assert curve_of(clear, COSTS).missing is None
     doubtful = curve(lax=[(50, 0)] * 4)
     assert (doubtful.verdict, doubtful.policy) == ("may pay", LAX)
-    assert "may be bad, and it pays up to 5 %" in doubtful.sentence
+    assert "may be bad, and accepting pays up to 5 %" in doubtful.sentence
 
 
-def alone(accepted: int, verified: int = 50, stops: str = "all", bad: int = 0) -> CostCurve:
+def alone(
+    accepted: int, verified: int = 50, stops: str = "all", bad: int = 0, rejected: int = 0
+) -> CostCurve:
     """The curve of one policy, whose accepted parts are the same in each of two shuffles."""
     policy = replace(LAX, stops=stops)
-    replays = [played(policy, seed, verified, accepted, bad) for seed in range(2)]
+    replays = [played(policy, seed, verified, accepted, bad, rejected) for seed in range(2)]
     return curve_of({policy: replays}, COSTS)
 
 
-@pytest.mark.parametrize("bad", [0, 1])
-def test_as_many_accepted_parts_as_are_missing_turn_may_pay_into_pays(bad: int) -> None:
-    missing = alone(50, bad=bad).missing
+@pytest.mark.parametrize(
+    "kinds",
+    [{"accepted": 50}, {"accepted": 50, "bad": 1}, {"accepted": 5, "rejected": 20}],
+    ids=["no error", "an error", "rejects"],
+)
+def test_as_many_parts_as_are_missing_turn_may_pay_into_pays(kinds: dict[str, int]) -> None:
+    result = alone(**kinds)
+    missing = result.missing
     assert missing is not None
-    scale = 1 if not bad else round(missing.accepted / 50)  # the same share of bad ones
-    enough = missing.accepted if not bad else 50 * (scale + 1)
-    assert alone(enough, bad=bad * (scale + 1 if bad else 0)).verdict == "pays"
-    fewer = missing.accepted - 2 if not bad else 50 * max(1, scale - 2)
-    assert alone(fewer, bad=bad * max(1, scale - 2) if bad else 0).verdict == "may pay"
+    scale = 1 + missing.recordings / result.cycles
+
+    def times(n: int) -> CostCurve:
+        return alone(verified=50 * n, **{kind: n * count for kind, count in kinds.items()})
+
+    assert times(math.ceil(scale)).verdict == "pays"
+    assert times(math.ceil(scale) - 1).verdict == "may pay"
+    assert missing.accepted == pytest.approx(kinds["accepted"] * scale, rel=0.03, abs=1)
 
 
 def test_what_is_missing_is_stated_in_parts_recordings_and_production() -> None:
@@ -148,15 +158,16 @@ def test_what_is_missing_is_stated_in_parts_recordings_and_production() -> None:
     assert missing is not None
     # Wilson's end z^2 / (n + z^2) of no bad one among n parts is 5 % at n = 19 z^2, z = 2.2414.
     assert (missing.accepted, missing.seen) == (math.ceil(19 * 2.241403**2), 50)
-    assert missing.recordings == math.ceil((missing.accepted - 50) / 0.5)
-    assert (missing.production, missing.audit_rate) == (math.ceil(missing.accepted / 0.5), 1.0)
+    assert (missing.recordings, missing.production, missing.audit_rate) == (91, 191, 1.0)
     assert (
-        "To show that takes 96 different accepted parts with no bad one, and these recordings "
-        "count as 50: about 92 more recordings, or 192 parts of production where every bad "
-        "accepted part stops the line."
+        "of the accepted parts up to 9.13 % may be bad, and accepting pays up to 5 %. To show that "
+        "it pays takes about 96 different accepted parts with no bad one, and these recordings "
+        "count as 50: 91 more recordings, or 191 parts of production where every bad accepted part "
+        "stops the line."
     ) in result.sentence
     by_audits = alone(50, stops="some").missing
-    assert (by_audits.production, by_audits.audit_rate) == (math.ceil(96 / 0.5 / 0.05), 0.05)
+    assert by_audits is not None
+    assert (by_audits.production, by_audits.audit_rate) == (191 * 20, 0.05)
     assert "parts of production at an audit rate of 5 %" in alone(50, stops="some").sentence
 
 
