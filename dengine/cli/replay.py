@@ -536,6 +536,7 @@ def costs(
     from ..experiments.costs import PolicySearch, policy_name, settings_of
     from ..experiments.figures import cost_picture
     from ..experiments.metrics import Costs
+    from ..experiments.survey import survey_dataset
     from ..experiments.tables import table_of_numbers
 
     dataset = source.load()
@@ -567,6 +568,9 @@ def costs(
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
     title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
     lines = [curve.sentence, curve.price_sentence]
+    repeats = survey_dataset(dataset).duplicates
+    if repeats:
+        lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
     by_shuffles = [f"{policy_name(row.policy)} {row.cost:.3g}" for row in curve.left_behind]
     if by_shuffles:
         lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")

@@ -469,6 +469,13 @@ def test_the_verb_names_a_price_that_is_no_number(recordings: Path) -> None:
     assert "but a list is tried here: use --alphas" in refused
 
 
+def test_the_verb_says_that_recordings_come_twice(recordings: Path, data: Dataset) -> None:
+    twice = np.r_[0:60, 0:30]
+    np.savez(recordings / "mine.npz", X=data.X[twice], y=data.y[twice])
+    text = " ".join(succeed(*WORDS).split())
+    assert "Of the recordings 30 repeat another: the interval is too narrow." in text
+
+
 def test_after_an_error_in_one_replay_the_verb_shows_what_was_finished(
     recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
