@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..datasets import Dataset
-    from ..experiments.costs import PolicyCost
+    from ..experiments.costs import CostCurve, PolicyCost
     from ..experiments.grid import Task
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
@@ -533,10 +533,9 @@ def costs(
     seconds of production or money. Ctrl-C shows what was finished.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
-    from ..experiments.costs import PolicySearch, policy_name, settings_of
+    from ..experiments.costs import PolicySearch, settings_of
     from ..experiments.figures import cost_picture
     from ..experiments.metrics import Costs
-    from ..experiments.survey import survey_dataset
     from ..experiments.tables import table_of_numbers
 
     dataset = source.load()
@@ -567,15 +566,7 @@ def costs(
     verify_all = ("" if curve.policy else ">", "check all", "-", check, check, "100 %", "-", "-")
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
     title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
-    lines = [curve.sentence, curve.price_sentence]
-    repeats = survey_dataset(dataset).duplicates
-    if repeats:
-        lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
-    by_shuffles = [f"{policy_name(row.policy)} {row.cost:.3g}" for row in curve.left_behind]
-    if by_shuffles:
-        lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")
-    if curve.out_of_reach:
-        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
+    lines = _curve_lines(curve, dataset)
     record = {"data": curve.dataset, "unit": cost_unit, "interrupted": error is not None}
     record |= {name: getattr(curve, name) for name in CURVE_FIELDS}
     if curve.policy is not None:
@@ -600,6 +591,23 @@ def costs(
         },
     )
     _end(error, "Interrupted: what was finished is shown.")
+
+
+def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
+    """Return the sentences below the table of a cost curve."""
+    from ..experiments.costs import policy_name
+    from ..experiments.survey import survey_dataset
+
+    lines = [curve.sentence, curve.price_sentence]
+    repeats = survey_dataset(dataset).duplicates
+    if repeats:
+        lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
+    by_shuffles = [f"{policy_name(row.policy)} {row.cost:.3g}" for row in curve.left_behind]
+    if by_shuffles:
+        lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")
+    if curve.out_of_reach:
+        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
+    return lines
 
 
 def _as_flags(settings: Options) -> str:
