@@ -191,11 +191,11 @@ class Policy:
     def changed(self, **settings: Any) -> Self:
         """Return a copy with these settings changed.
 
-        Prices without a guarantee imply what they imply in a new policy: the guarantee "cost", and
-        an audit rate of 0.05 in the place of 0.
+        Prices without a guarantee imply what they imply in a new policy: "cost" in the place of
+        "local" and "pooled", which have no prices, and an audit rate of 0.05 in the place of 0.
         """
         implied: dict[str, Any] = {}
-        if "prices" in settings and self.guarantee != "cost":
+        if "prices" in settings and self.guarantee in ("local", "pooled"):
             implied = {"guarantee": "cost", "audit_rate": self.audit_rate or AUDIT_RATE}
         return replace(self, **(implied | settings))
 

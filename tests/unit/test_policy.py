@@ -183,6 +183,8 @@ def test_prices_change_a_policy_as_they_make_one_and_keep_an_audit_rate() -> Non
     again = Policy(prices=(0.5, 200, 5), audit_rate=0.0, stops="all").changed(prices=(1, 200, 5))
     assert (again.guarantee, again.audit_rate) == ("cost", 0.0)
     assert Policy().changed(prices=(1, 200, 5), guarantee="local").guarantee == "local"
+    own = Policy(guarantee="my_rules:Rule").changed(prices=(1, 200, 5))
+    assert (own.guarantee, own.audit_rate) == ("my_rules:Rule", 0.0)
 
 
 @pytest.mark.parametrize(
