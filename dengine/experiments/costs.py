@@ -242,7 +242,6 @@ class CostCurve:
             if missing.audit_rate < 1.0:
                 how = f"at an audit rate of {percent(missing.audit_rate, 'g')}"
             kind = "this share of bad ones" if row.bad.wrong else "no bad one"
-            kind = "this share of bad ones" if row.bad.wrong else "no bad one"
             worst = percent(self.costs.worst_accept, ".3g")
             text += (
                 f" Not certainly: of the accepted parts up to {percent(row.bad.upper, '.3g')} may "
