@@ -268,8 +268,8 @@ class Recipe:
         return replace(self, **changes)
 
     def with_policy(self, **changes: Any) -> Recipe:
-        """Return a copy whose policy has these settings changed."""
-        return replace(self, policy=replace(self.policy, **changes))
+        """Return a copy whose policy has these settings changed, as `Policy.changed` does."""
+        return replace(self, policy=self.policy.changed(**changes))
 
     def make_reducer(self, seed: int) -> Any:
         """Return the reducer: the object that was given, uncopied, or a new one of the name.

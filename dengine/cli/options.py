@@ -312,8 +312,8 @@ _GUARANTEE = (
     "check, by --prices. Or a rule of your own."
 )
 _PRICES = (
-    "Under cost, in one unit: of a check, of a bad part accepted and of a good part rejected.  "
-    "[default: 5,120,47.5]"
+    "Of a check, of a bad part accepted and of a good part rejected, in one unit, as in 0.5,200,5. "
+    "Alone they imply --guarantee cost and --audit-rate 0.05.  [default: 5,120,47.5]"
 )
 _STOPS = (
     "Which bad accepted parts stop the system: some, or all. With all, an accepted part that no "

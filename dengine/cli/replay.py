@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..datasets import Dataset
-    from ..experiments.costs import PolicyCost
+    from ..experiments.costs import CostCurve, PolicyCost
     from ..experiments.grid import Task
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
@@ -89,47 +88,68 @@ class PlayedTasks(NamedTuple):
     replays : list of Replay
         In the order of their tasks.
     interrupted : str
-        A sentence that says how many were finished, if Ctrl-C left some out; else "".
+        A sentence that says how many were finished, if something left some out; else "".
     costs : dict of str to float
         seconds : wall time. core_seconds : of one core, over all replays. kept : how many replays
         had been kept by an earlier run.
+    error : BaseException or None
+        What left some out, Ctrl-C among others.
     """
 
     replays: list[Replay]
     interrupted: str
     costs: dict[str, float]
+    error: BaseException | None
 
 
 def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
     """Play the tasks with a progress bar; return the finished replays and the time they took.
 
-    Ctrl-C ends the work and raises nothing: those that were finished until then are returned.
+    Ctrl-C or an error ends the work and raises nothing: those that were finished until then are
+    returned.
     """
     from ..experiments.grid import iterate_replays
 
     replays: dict[int, Replay] = {}
     n_kept = 0
     begin = time.perf_counter()
+    interruption: BaseException | None = None
     n_cycles = len(tasks) * (stream.cycles or len(dataset))
     with progress_bar(f"replaying {dataset.name}", n_cycles) as advance:
         # A callback cannot travel to other processes: there the bar moves by whole replays.
         on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
-        with suppress(KeyboardInterrupt):
+        try:
             for i, replay, kept in iterate_replays(
                 dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
             ):
                 replays[i] = replay
                 n_kept += kept
                 advance(len(replay) if on_cycle is None or kept else 0)
+        except (KeyboardInterrupt, Exception) as error:  # what was finished is shown first
+            interruption = error
     interrupted = ""
-    if len(replays) < len(tasks):
+    if interruption is not None:
         interrupted = f"Interrupted: {len(replays)} of {len(tasks)} replays were finished"
     costs = {
         "seconds": time.perf_counter() - begin,
         "core_seconds": sum(replay.seconds for replay in replays.values()),
         "kept": n_kept,
     }
-    return PlayedTasks([replays[i] for i in sorted(replays)], interrupted, costs)
+    finished = [replays[i] for i in sorted(replays)]
+    return PlayedTasks(finished, interrupted, costs, interruption)
+
+
+def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
+    """End the process if an error or Ctrl-C interrupted it; the text says what is shown.
+
+    Raises the error, without the text if nothing is shown; after Ctrl-C the exit code is 130.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        exit_interrupted(text)
+    if error is not None:
+        if is_shown:
+            click.echo(text, err=True)
+        raise error
 
 
 _CYCLES = "Only this many parts of each stream.  [default: all]"
@@ -323,9 +343,9 @@ def _replay_and_print(
     tasks = grid_tasks(
         contenders, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid
     )
-    replays, interrupted, costs = _play_tasks(dataset, tasks, stream)
+    replays, interrupted, costs, error = _play_tasks(dataset, tasks, stream)
     if not replays:
-        exit_interrupted(f"{interrupted}; there is nothing to show.")
+        _end(error, f"{interrupted}; there is nothing to show.", False)
     frame = tables.frame_of(replays, check_seconds)
     rows = tables.pool(frame, replays)
     by_name = _group_replays(replays, lambda replay: replay.name)
@@ -352,8 +372,7 @@ def _replay_and_print(
     print_result(
         record, *parts, out=out, make_files=lambda: dict(_replay_files(frame, replays, title))
     )
-    if interrupted:
-        exit_interrupted(f"{interrupted}; the table shows those.")
+    _end(error, f"{interrupted}; the table shows those.")
 
 
 def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
@@ -447,35 +466,40 @@ def _row_name(replay: Replay, frame: pd.DataFrame, *always: str) -> str:
 
 
 CAPTION = (
-    "cost: of a part, the mean over shuffles of {cycles} parts, {reporting} of them; below it the "
-    "cost with the errors at the ends of their 95 % intervals. LB all: everything is verified. "
-    "late: over the last third of a shuffle, when something has been learned. verified: share of "
-    "the parts that were checked. bad of accepted, good of rejected: over these shuffles, with "
-    "their intervals below. The choice, >, was the cheapest in the other half of the shuffles, so "
-    "its figures here are not those that it was picked for. All shuffles play the same parts: only "
-    "parts that are recorded later are a clean test."
+    "cost: of a part, the mean over {shuffles} shuffles of {cycles} parts that chose nothing; "
+    "below it a 95 % interval, with the luck of the recordings and of the order. late: over the "
+    "last third of a shuffle, when something has been learned. verified: share of the parts that "
+    "were checked. bad of accepted, good of rejected: over these shuffles, with their intervals "
+    "below. The choice, >, is the cheapest, or one that lets fewer bad parts through and is not "
+    "dearer beyond chance. All shuffles play the same parts: only parts that are recorded later "
+    "are a clean test."
 )
-COLUMNS = ("", "alpha", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
+COLUMNS = ("", "rule", "LB", "cost", "late", "verified", "bad of\naccepted", "good of\nrejected")
 CURVE_FIELDS = (
     "recipe",
     "verdict",
     "policy",
     "sentence",
+    "missing",
+    "price_changes",
+    "out_of_reach",
     "costs",
     "cycles",
-    "choosing",
-    "reporting",
+    "shuffles",
+    "fresh",
 )
-_COST = click.FloatRange(0.0)
+
+
 _ESCAPE = "Cost of a bad part that is accepted: a line stop, or worse."
 _FALSE_REJECT = "Cost of a good part that is rejected."
 PRICES = {
     "check": click.option(
-        "--check", type=_COST, default=5.0, show_default=True, help="Cost of one verification."
+        "--check", type=float, default=5.0, show_default=True, help="Cost of one verification."
     ),
-    "escape": click.option("--escape", type=_COST, required=True, help=_ESCAPE),
-    "false_reject": click.option("--false-reject", type=_COST, required=True, help=_FALSE_REJECT),
+    "escape": click.option("--escape", type=float, required=True, help=_ESCAPE),
+    "false_reject": click.option("--false-reject", type=float, required=True, help=_FALSE_REJECT),
 }
+_FRESH = "Number of shuffles that the last two policies play; earlier ones choose these."
 
 
 @verb(
@@ -489,7 +513,7 @@ PRICES = {
 )
 @options.recipe_options
 @options.bundle_options("lists", options.drop_none, GRID_LISTS)
-@stream_options(10, 2, -1, "Number of shuffles of each policy; half of them choose.")
+@stream_options(4, 2, -1, _FRESH)
 @explain_option
 @options.out_option
 def costs(
@@ -501,76 +525,109 @@ def costs(
     stream: Stream,
     out: Out | None,
 ) -> None:
-    """Find the alpha and LB that pay.
+    """Find the policy that pays by three prices.
 
-    Shows what a part of your recordings costs under each alpha and LB, where everything is
-    verified, and, with --stops all or audits, where parts pass by these costs (--guarantee cost).
-    All costs are in one unit, such as seconds of production or money. Ctrl-C shows the curve of the
-    shuffles that every policy has finished.
+    Shows what a part of your recordings costs under the policies that pay most, and where
+    everything is verified; and says how certain that is, and how to set the policy. It tries levels
+    of LB around break-even, and the guarantees pooled and cost. All costs are in one unit, such as
+    seconds of production or money. Ctrl-C shows what was finished.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
-    from ..experiments.costs import ALPHAS, LOWER_BOUNDS, curve_of, priced_tasks
+    from ..experiments.costs import PolicySearch, settings_of
     from ..experiments.figures import cost_picture
     from ..experiments.metrics import Costs
     from ..experiments.tables import table_of_numbers
 
-    part_costs = Costs(**part_prices)
-    grid = {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS} | dict(lists)
-    contender = choice.make_contender()
-    tasks = priced_tasks(contender, part_costs, **grid, seeds=stream.seeds, cycles=stream.cycles)
-    replays, interrupted, _ = _play_tasks(source.load(), tasks, stream)
-    if interrupted and _n_complete(replays, len(tasks) // len(stream.seeds)) < 2:
-        exit_interrupted(
-            "Interrupted: fewer than two shuffles were finished under every policy; there is "
-            "nothing to show."
-        )
-    curve = curve_of(replays, part_costs)
-    frame = curve.to_frame()
-    check = f"{part_costs.check:.3g}"
-    verify_all = ("" if curve.policy else ">", "-", "all", check, check, "100 %", "-", "-")
-    cells = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
-    record = {"data": curve.dataset, "unit": cost_unit, "interrupted": bool(interrupted)}
+    dataset = source.load()
+    search = PolicySearch(
+        dataset,
+        choice.make_contender(),
+        Costs(**part_prices),
+        repeats=len(stream.seeds),
+        seed=stream.seeds[0],
+        cycles=stream.cycles,
+        **lists,
+    )
+    error: BaseException | None = None
+
+    def play(tasks: Sequence[Task]) -> list[Replay]:
+        """Play tasks with a progress bar; return those that were finished."""
+        nonlocal error
+        played = _play_tasks(dataset, tasks, stream)
+        error = played.error
+        return played.replays
+
+    search.run(play)
+    curve = search.curve()
+    if curve is None:
+        _end(error, "Interrupted: too little was finished; there is nothing to show.", False)
+        return
+    check = f"{curve.costs.check:.3g}"
+    verify_all = ("" if curve.policy else ">", "check all", "-", check, check, "100 %", "-", "-")
+    rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
+    title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
+    lines = _curve_lines(curve, dataset)
+    record = {"data": curve.dataset, "unit": cost_unit, "interrupted": error is not None}
     record |= {name: getattr(curve, name) for name in CURVE_FIELDS}
+    if curve.policy is not None:
+        settings = settings_of(curve.policy)
+        record["python"] = f"Policy({', '.join(f'{k}={v!r}' for k, v in settings.items())})"
+        store = source.data if source.data.endswith(".db") else "cell.db"
+        record["command"] = f"dengine policy {store} {_as_flags(settings)}"
+        lines.append(f"Set it by\n  {record['command']}\n  {record['python']}")
+    frame = curve.to_frame()
     print_result(
         record | {"rows": frame.to_dict("records")},
         table_of_numbers(
-            f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}, by alpha and "
-            "LB",
-            [dict(zip(COLUMNS, row, strict=True)) for row in cells],
-            legend_or_hint(CAPTION.format(reporting=curve.reporting, cycles=curve.cycles)),
+            title,
+            [dict(zip(COLUMNS, row, strict=True)) for row in rows],
+            legend_or_hint(CAPTION.format(shuffles=curve.shuffles, cycles=curve.cycles)),
         ),
-        curve.sentence,
+        *lines,
         out=out,
         make_files=lambda: {
             "costs.csv": frame,
             "costs.png": cost_picture(curve, unit=cost_unit),
         },
     )
-    if interrupted:
-        exit_interrupted(f"{interrupted}; the shuffles that all policies finished are shown.")
+    _end(error, "Interrupted: what was finished is shown.")
 
 
-def _n_complete(replays: Sequence[Replay], n_policies: int) -> int:
-    """Return the number of shuffles, by their seeds, that all `n_policies` policies have played."""
-    seeds = [replay.seed for replay in replays]
-    return sum(seeds.count(seed) == n_policies for seed in set(seeds))
+def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
+    """Return the sentences below the table of a cost curve."""
+    from ..experiments.costs import policy_name
+    from ..experiments.survey import survey_dataset
+
+    lines = [curve.sentence, curve.price_sentence]
+    repeats = survey_dataset(dataset).duplicates
+    if repeats:
+        lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
+    by_shuffles = [f"{policy_name(row.policy)} {row.cost:.3g}" for row in curve.left_behind]
+    if by_shuffles:
+        lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")
+    if curve.out_of_reach:
+        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
+    return lines
+
+
+def _as_flags(settings: Options) -> str:
+    """Return settings of a policy as options of the command line."""
+    texts = {
+        name: ",".join(f"{price:g}" for price in value) if name == "prices" else str(value)
+        for name, value in settings.items()
+    }
+    return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in texts.items())
 
 
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
     """Return the cells of a policy's row under the titles in `COLUMNS`, ">" for the chosen one."""
-    alpha = f"{row.policy.alpha:g}"
-    bound = percent(row.policy.lower_bound, "g")
-    if row.policy.guarantee == "cost":
-        alpha = "by cost"
-        bound = "-"
-    cost = f"{row.cost:.3g}"
-    if row.certain:
-        cost += f"\n{row.lower:.3g} to {row.upper:.3g}"
+    policy = row.policy
+    is_local = policy.guarantee == "local"
     return (
         ">" if is_chosen else "",
-        alpha,
-        bound,
-        cost,
+        f"alpha {policy.alpha:g}" if is_local else policy.guarantee,
+        "-" if policy.guarantee == "cost" else percent(policy.lower_bound, "g"),
+        f"{row.cost:.3g}\n{row.lower:.3g} to {row.upper:.3g}",
         f"{row.late:.3g}",
         percent(row.verified, ".0f"),
         _error_cell(row.bad),

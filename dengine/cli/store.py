@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import getpass
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -196,7 +196,7 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
             store,
             author,
             allow_import,
-            lambda engine: engine.set_policy(replace(engine.policy, **settings), author),
+            lambda engine: engine.set_policy(engine.policy.changed(**settings), author),
         )
         return
     from ..engine.engine import DataEngine

@@ -288,12 +288,18 @@ class Certificate:
         and it cannot escape. It may be negative: then not checking may have cost money. None
         without prices.
         """
+        ledger = self._ledger
+        return None if ledger is None else ledger[0] - ledger[1]
+
+    @property
+    def _ledger(self) -> tuple[float, float] | None:
+        """What the checks that were left out would have cost, and what bad parts cost at most."""
         if self.prices is None:
             return None
         check, escape, _ = self.prices
         n_unchecked = self.accepted.n_unchecked
         n_escaped = min(n_unchecked, self.accepted.n * self.accepted.upper)
-        return n_unchecked * check - escape * n_escaped
+        return n_unchecked * check, escape * n_escaped
 
     @property
     def kept(self) -> bool:
@@ -305,8 +311,10 @@ class Certificate:
         """The claim about accepted parts in English: "Of 1,203 parts ..., at most 3.5 % were bad".
 
         It names the confidence and the tolerance. Where nothing can be claimed it says so, and why.
-        With prices, and a bound below 1, a second sentence says what the parts without a check
-        saved at least, rounded down, or "nothing for certain"; there is none if all were checked.
+        With prices it also says what the checks that were left out would have cost, what bad parts
+        cost at most, rounded up, and what is left of it, rounded down: saved for certain, or lost
+        at most. That is missing if the bound is 1 or all were checked. The last sentence says when
+        accepting pauses.
         """
         unknown = (
             "silence is no success: set audit_rate, or stops='all' where every bad part stops the "
@@ -314,14 +322,25 @@ class Certificate:
         )
         which = "that went on without a check"
         claim = self._claim(self.accepted, which, "accept", "bad", unknown)
-        n_unchecked = self.accepted.n_unchecked
-        if self.saved is None or self.accepted.upper >= 1.0 or n_unchecked == 0:
+        if self.prices is None or self._ledger is None:
             return claim
-        saved = "nothing for certain"
-        if self.saved > 0.0:
-            saved = f"at least {math.floor(self.saved):,}"
-        which = "them" if n_unchecked == self.accepted.n else f"{n_unchecked:,} of them"
-        return f"{claim} By the prices not checking {which} saved {saved}."
+        n_unchecked = self.accepted.n_unchecked
+        if self.accepted.upper < 1.0 and n_unchecked:
+            checks, escapes = self._ledger
+            balance = math.floor(checks - escapes)
+            result = f"at least {balance:,} was saved"
+            if balance <= 0:
+                result = f"nothing was saved for certain, and at most {-balance:,} was lost"
+            which = "them" if n_unchecked == self.accepted.n else f"{n_unchecked:,} of them"
+            claim += (
+                f" Not checking {which} spared {checks:,.6g} of checks, and bad parts cost at most "
+                f"{math.ceil(escapes):,} on average: {result}."
+            )
+        return (
+            f"{claim} Accepting pauses whenever the parts that the model would accept have, by "
+            f"what is known of them, cost {self.prices[1]:,g}, the price of one bad "
+            f"part, more than their checks."
+        )
 
     @property
     def sentence_on_rejects(self) -> str:
@@ -335,11 +354,12 @@ class Certificate:
     def _claim(self, group: OutcomeBound, which: str, verb: str, wrong: str, unknown: str) -> str:
         """Return the claim about a group of parts as one sentence.
 
-        It gives the number of parts, the bound in per cent, rounded up, the confidence and the
-        tolerance. `which` describes parts without a check; if the claim rests on audits, their
-        number and `verb`, what the model would do, stand instead. `wrong` is what a part was that
-        was decided wrongly. The sentence says that nothing can be said if the group is empty, no
-        outcome was asked for (`unknown` is the reason), or the bound is 1.
+        It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
+        tolerance or, with prices, the share up to which the decision pays. `which` describes parts
+        without a check; if the claim rests on audits, their number and `verb`, what the model would
+        do, stand instead. `wrong` is what a part was that was decided wrongly. The sentence says
+        that nothing can be said if the group is empty, no outcome was asked for (`unknown` is the
+        reason), or the bound is 1.
         """
         parts = f"{group.n:,} part{'s' if group.n != 1 else ''}"
         but = " beyond the known stops" if verb == "accept" else ""
@@ -353,10 +373,13 @@ class Certificate:
             which = f"that the model would {verb}, of which {group.n_with_outcome:,} were audited"
         if group.upper >= 1.0:
             return f"Of {parts} {which}, nothing can be said yet: too few were looked at."
+        limit = f"the tolerance is {percent(self.tolerance, '.6g')}"
+        if self.prices is not None:
+            check, *errors = self.prices
+            limit = f"it pays up to {percent(check / errors[verb == 'reject'], '.3g')}"
         return (
             f"Of {parts} {which}, at most {_round_up(group.upper)} were {wrong} on average, with "
-            f"{percent(1.0 - self.alpha, '.6g')} confidence, however often one looks; the "
-            f"tolerance is {percent(self.tolerance, '.6g')}."
+            f"{percent(1.0 - self.alpha, '.6g')} confidence, however often one looks; {limit}."
         )
 
 

@@ -34,6 +34,10 @@ NO_WINDOWS = "none"
 LARGEST_RADIUS = 1e18
 
 
+PRICES = (5.0, 120.0, 47.5)  # seconds: the paper's check, a line stop, and the paper's cycle
+AUDIT_RATE = 0.05  # that prices without a guarantee imply
+
+
 @dataclass(frozen=True, slots=True)
 class Policy:
     """How certain the model must be before it may decide.
@@ -46,14 +50,16 @@ class Policy:
         The paper's LB, between 0.5 and 1: accept where lower >= LB, reject where upper <= 1 - LB.
     interval : str, default "wilson"
         A name in `INTERVALS`.
-    audit_rate : float, default 0.0
+    audit_rate : float, optional
         Share of certain decisions that are verified all the same, from 0 to 1. A guarantee on
-        rejects needs it, and so does "pooled" where not all line stops are known.
-    guarantee : str, default "local"
+        rejects needs it, and so do "pooled" and "cost" where not all line stops are known. None: 0,
+        or 0.05 if `prices` are given without a guarantee.
+    guarantee : str, optional
         The rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a
         subclass of `DecisionRule`. "local", the paper's, is about the neighbourhood of one trace;
         "pooled" about all parts together; "cost" about what they cost by `prices`: then
-        `lower_bound` has no effect, and `alpha` only on the safe mode.
+        `lower_bound` has no effect, and `alpha` only on the safe mode. None: "local", or "cost" if
+        `prices` are given.
     stops : {"some", "all"}, default "some"
         "all": every bad accepted part stops the line and is reported before the next decision, so
         that silence until then confirms the part. "some": silence says nothing.
@@ -66,30 +72,46 @@ class Policy:
     windows : tuple of ForceLimits or str, default ()
         The operator's limits beside the model. A trace that leaves one is verified or rejected
         whatever the model says (`Reason.OUTSIDE`), and no claim counts it.
-    prices : three floats, default (5.0, 120.0, 47.5)
+    prices : three floats, optional
         Of a check, of a bad part that is accepted, and of a good part that is rejected, in one
         unit; "cost" decides by them. It accepts what fails with a probability below check / escape,
         and rejects what succeeds with one below check / false reject. An error costs more than two
-        checks.
+        checks. None: `PRICES`, 5, 120 and 47.5.
 
     Raises
     ------
     SettingError
         For a value out of its range.
+
+    Examples
+    --------
+    >>> policy = Policy(prices=(0.5, 200, 5))
+    >>> policy.guarantee, policy.audit_rate
+    ('cost', 0.05)
     """
 
     alpha: float = 0.05
     lower_bound: float = 0.95
     interval: str = "wilson"
-    audit_rate: float = 0.0
-    guarantee: str = "local"
+    # None is replaced when the policy is made: what prices imply depends on all three.
+    audit_rate: float = None  # type: ignore[assignment]
+    guarantee: str = None  # type: ignore[assignment]
     stops: Stops = "some"
     shadow: bool = False
     label_within: int = 1000
     windows: tuple[ForceLimits, ...] = ()
-    prices: tuple[float, float, float] = (5.0, 120.0, 47.5)
+    prices: tuple[float, float, float] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
+        by_prices = self.prices is not None and self.guarantee is None
+        defaults = {
+            "audit_rate": AUDIT_RATE if by_prices else 0.0,
+            "guarantee": "cost" if by_prices else "local",
+            "prices": PRICES,
+        }
+        for name, default in defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, default)
         for name in ("alpha", "lower_bound", "audit_rate"):
             expect(is_number(getattr(self, name)), f"a number as {name}", getattr(self, name))
         is_text = isinstance(self.guarantee, str)
@@ -165,6 +187,17 @@ class Policy:
         windows = settings.get("windows", NO_WINDOWS)
         settings["windows"] = () if windows == NO_WINDOWS else tuple(windows.split())
         return cls(**settings)
+
+    def changed(self, **settings: Any) -> Self:
+        """Return a copy with these settings changed.
+
+        Prices without a guarantee imply what they imply in a new policy: "cost" in the place of
+        "local" and "pooled", which have no prices, and an audit rate of 0.05 in the place of 0.
+        """
+        implied: dict[str, Any] = {}
+        if "prices" in settings and self.guarantee in ("local", "pooled"):
+            implied = {"guarantee": "cost", "audit_rate": self.audit_rate or AUDIT_RATE}
+        return replace(self, **(implied | settings))
 
     @property
     def summary(self) -> str:

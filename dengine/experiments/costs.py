@@ -1,5 +1,5 @@
-"""Which alpha and LB pay: what a part costs under each, in replays of the user's own recordings.
-The verb `costs` prints it.
+"""From three prices to a policy: what a part costs under each that may pay, in replays of the
+user's own recordings. The verb `costs` prints it.
 
     curve = cost_curve("insertion", check=5, escape=600, false_reject=30, recipe="pca", n_jobs=2)
     print(curve.sentence)
@@ -10,59 +10,80 @@ good), in one unit of the user's, over all parts of a replay, its beginning incl
 everything costs `check` per part. A part that an operator's limits reject costs `check`, too, so
 that no policy pays by the limits, which are the same under each.
 
-The cheapest of many candidates is partly the luckiest. So the policy is chosen on one half of the
-shuffles, with half an error added to each count of errors, and reported on the other half. That
-takes the luck of the order out, not that of the recordings: every shuffle plays the same parts. The
-interval is a little too narrow for a policy picked among many; only parts recorded later are a
-clean test.
+The candidates are levels of LB around break-even, 1 - check / escape, and the guarantees "pooled"
+and "cost". `PolicySearch` halves them: all play two shuffles, the cheaper half plays two more, and
+so on. The last two play fresh shuffles, which are all that is reported, so that no figure was
+picked for being small. With `stops="all"` the early rounds replay one engine that checks every
+part, and play each candidate's rule on its scores (`replay_policy`): only labels of rejected parts
+tell it apart from replays of their own, which the last two have.
+
+The interval has the luck of the recordings and of the order: the shares of wrong decisions at the
+ends of their intervals, whose unit is the part, and the spread over the shuffles.
 """
 
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import asdict, astuple, dataclass
+import math
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, fields, replace
+from itertools import count, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import t as student
 
-from ..decision.policy import Policy
+from ..datasets import load_dataset
+from ..decision.intervals import normal_quantile, wilson_interval
+from ..decision.policy import AUDIT_RATE, RULES, Policy
 from ..errors import SettingError, expect, percent
 from ..files import FilePath
-from .grid import Task, grid_tasks, play_tasks
+from .grid import Task, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
-from .replay import Contender, Replay
+from .replay import Contender, Floats, Replay, replay_policy
 
 if TYPE_CHECKING:
     import pandas as pd
 
-
-ALPHAS = (0.2, 0.1, 0.05)
-LOWER_BOUNDS = (0.8, 0.9, 0.95, 0.98, 0.99)
-REPEATS = 10  # shuffles, half of them to choose by
+FACTORS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)  # tolerances to try, in units of check / escape
+POOLED_FACTORS = (1.0, 2.0, 4.0)
+LARGEST_TOLERANCE = 0.2
+ALPHA = 0.1  # of the guarantee "local": LB alone moves how many neighbours are asked for
+N_SCREENING = 2  # shuffles of each round of the halving
+N_LAST = 2  # policies that play the fresh shuffles
+REPEATS = 4  # fresh shuffles
 ERROR_LEVEL = 0.05  # of the intervals
+ALPHA_EACH = ERROR_LEVEL / 2  # of the shares of wrong accepts and of wrong rejects
+Z = normal_quantile(ALPHA_EACH)
+MOST_NEIGHBOURS = 10**7
+MOST_MORE = 10_000  # times the recordings: what needs more is never shown
+Groups = Mapping[Policy, Sequence[Replay]]
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyCost:
-    """What a part costs under one policy, over the shuffles that report.
+    """What a part costs under one policy, over some shuffles.
 
     Attributes
     ----------
     policy : Policy
     expected_cost : float
-        Per part over the shuffles that choose, with half an error added to each share of wrong
-        decisions. The cheapest policy is chosen by it.
+        Per part, with half an error added to each share of wrong decisions, counted in different
+        parts: no error among 25 accepted parts does not mean that there is never one.
     cost : float
         Mean per part.
     lower, upper : float
-        The cost with both shares of wrong decisions at the ends of their intervals, which hold
-        together at 95 %.
+        Interval of the cost: both shares of wrong decisions at the ends of their intervals, which
+        hold together at 95 %, and `luck`, added in squares.
     late : float
         Mean cost per part over the last third of each shuffle, when something has been learned.
-    verified, certain : float
+    verified, accepted, rejected : float
         Shares of the parts that were checked, and that the model accepted or rejected. The rest are
         those that an operator's limits rejected.
     bad, good : ErrorRate
         Bad parts among the accepted ones, good parts among the rejected ones.
+    luck : float
+        Of the order: half the width of the 95 % interval of the mean over the shuffles.
+    shuffles : int
     """
 
     policy: Policy
@@ -72,120 +93,411 @@ class PolicyCost:
     upper: float
     late: float
     verified: float
-    certain: float
+    accepted: float
+    rejected: float
     bad: ErrorRate
     good: ErrorRate
+    luck: float
+    shuffles: int
+
+    @property
+    def escaped(self) -> float:
+        """Share of all parts that were accepted and bad."""
+        return self.accepted * self.bad.rate if self.bad.decided else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """What would turn "may pay" into "pays", with the shares of wrong decisions that were seen.
+
+    Attributes
+    ----------
+    accepted, seen : int
+        Different accepted parts that would show it, and as how many independent ones those of the
+        recordings count.
+    recordings, production : int
+        Further recordings, or parts of production, that bring them.
+    audit_rate : float
+        At which audit rate of production; 1 where every bad accepted part stops the line.
+    """
+
+    accepted: int
+    seen: int
+    recordings: int
+    production: int
+    audit_rate: float
 
 
 @dataclass(frozen=True, slots=True)
 class CostCurve:
-    """What a part costs under each policy that was tried.
+    """What a part costs under the policies that played last, and which one is chosen.
 
     Attributes
     ----------
     costs : Costs
     rows : tuple of PolicyCost
-        By alpha, from the largest, then by LB; last the guarantee of costs, if it was tried.
+        The policies that played the shuffles that are reported, the cheapest first.
+    marked : PolicyCost
+        The cheapest of `rows`, or one that let fewer bad parts through and is not dearer beyond
+        chance.
+    verdict : str
+        "pays" if the whole interval of the marked policy is below the cost of verifying
+        everything, "does not pay" if its mean or its expected cost is not, else "may pay".
+    price_changes : tuple of str
+        What would be chosen of `rows` if one price were half or twice as large, where that is
+        something else. Under the guarantee "cost", too, the decisions are those that were played.
+    left_behind : tuple of PolicyCost
+        Those that were dearer in earlier shuffles. Their costs are of those shuffles, and not
+        comparable with those of `rows`.
+    out_of_reach : tuple of str
+        Policies that were not played, each with the reason.
     dataset, recipe : str
         Their names.
-    cycles : int
-        Parts of each shuffle.
-    choosing, reporting : int
-        Number of shuffles that chose, and that report.
+    cycles, shuffles : int
+        Parts of each shuffle, and number of shuffles that are reported.
+    fresh : bool
+        Whether they chose nothing; False if the search was interrupted before.
     """
 
     costs: Costs
     rows: tuple[PolicyCost, ...]
+    marked: PolicyCost
+    verdict: str
+    price_changes: tuple[str, ...]
+    left_behind: tuple[PolicyCost, ...]
+    out_of_reach: tuple[str, ...]
     dataset: str
     recipe: str
     cycles: int
-    choosing: int
-    reporting: int
-
-    @property
-    def cheapest(self) -> PolicyCost:
-        """The policy with the lowest expected cost among those that decided anything.
-
-        Of equal ones that with the highest LB, then the lowest alpha. If none decided anything, all
-        are compared.
-        """
-        deciding = [row for row in self.rows if row.certain] or self.rows
-
-        def key(row: PolicyCost) -> tuple[float, float, float]:
-            return row.expected_cost, -row.policy.lower_bound, row.policy.alpha
-
-        return min(deciding, key=key)
-
-    @property
-    def verdict(self) -> str:
-        """Whether the cheapest policy costs less than verifying everything: one of three texts.
-
-        "does not pay" if its expected cost or its mean cost is not below that, "pays" if its whole
-        interval is, else "may pay".
-        """
-        row = self.cheapest
-        if max(row.expected_cost, row.cost) >= self.costs.check:
-            return "does not pay"
-        return "pays" if row.upper < self.costs.check else "may pay"
+    shuffles: int
+    fresh: bool
 
     @property
     def policy(self) -> Policy | None:
-        """The policy that pays, or may pay; None if none does.
+        """The policy that pays or may pay; None if none does. Try it in shadow mode first."""
+        return None if self.verdict == "does not pay" else self.marked.policy
 
-        Try it in shadow mode first.
-        """
-        return None if self.verdict == "does not pay" else self.cheapest.policy
+    @property
+    def missing(self) -> Missing | None:
+        """What is missing to a policy that may pay; None if it pays, or nothing would show it."""
+        row = self.marked
+        if self.verdict != "may pay":
+            return None
+        errors = (row.bad, row.good)
+        rates = [error.wrong / max(1, error.decided) for error in errors]
+        # Wilson's upper end u of a share r of n parts: n = z^2 u (1 - u) / (u - r)^2.
+        sizes = [
+            Z**2 * error.upper * (1.0 - error.upper) / (error.upper - rate) ** 2
+            for error, rate in zip(errors, rates, strict=True)
+        ]
+
+        def surplus(n_recordings: int) -> float:
+            """Return how far so many recordings like these bring the interval below the check."""
+            more = n_recordings / self.cycles
+            bad, good = (
+                float(
+                    wilson_interval(more * size * rate, more * size * (1.0 - rate), ALPHA_EACH)[1]
+                )
+                for size, rate in zip(sizes, rates, strict=True)
+            )
+            wrong = row.accepted * bad, row.rejected * good
+            worst = self.costs.check - self.costs.saved(row.accepted + row.rejected, *wrong)
+            upper = row.cost + math.hypot(worst - row.cost, row.luck / math.sqrt(more))
+            return self.costs.check - upper
+
+        most = MOST_MORE * self.cycles
+        n = bisect_left(range(most), 0.0, lo=self.cycles, key=surplus)
+        known = 1.0 if row.policy.stops == "all" else row.policy.audited_share or AUDIT_RATE
+        needed = math.ceil(sizes[0] * n / self.cycles)
+        parts = n - self.cycles, math.ceil(n / known)
+        return None if n == most else Missing(needed, round(sizes[0]), *parts, known)
 
     @property
     def sentence(self) -> str:
-        """The verdict for people, in one to three sentences.
+        """The verdict for people: the marked policy, its cost with the interval, what is missing.
 
-        It names the cheapest policy, its cost per part with the interval, and what verifying
-        everything costs; if it only may pay, also which share of bad parts among the accepted would
-        still pay. If no policy decided anything, it says only that and what verifying costs.
+        If another policy is cheaper, but not beyond chance, it says so.
         """
-        row = self.cheapest
+        row = self.marked
+        cheapest = self.rows[0]
+        missing = self.missing
         verify_all = f"verifying everything costs {self.costs.check:g} a part"
-        if not any(item.certain for item in self.rows):
-            return (
-                f"Nothing pays yet: {verify_all}, and under each policy that was tried everything "
-                f"was verified. Record more."
+        cost = f"{row.cost:.3g} a part, with a 95 % interval of {row.lower:.3g} to {row.upper:.3g}"
+        text = f"{policy_name(row.policy)} {self.verdict}: {cost}; {verify_all}."
+        if row.verified == 1.0:
+            text = f"Nothing pays: {verify_all}, and everything was verified. Record more."
+        elif self.policy is None:
+            text = (
+                f"Nothing pays: {verify_all}; the cheapest policy, {policy_name(row.policy)}, "
+                f"costs {cost}, or {row.expected_cost:.3g} with half an error more."
             )
-        name = f"alpha {row.policy.alpha:g}, LB {100 * row.policy.lower_bound:g} %"
-        if row.policy.guarantee == "cost":
-            name = "the cost guarantee"
-        ends = f"{row.lower:.3g} to {row.upper:.3g}"
-        interval = f"with the errors at the ends of their 95 % intervals {ends}"
-        if self.policy is None:
-            return (
-                f"Nothing pays: {verify_all}; the cheapest policy, {name}, is expected to cost "
-                f"{row.expected_cost:.3g} and cost {row.cost:.3g} in other shuffles, {interval}. "
-                "Go on verifying, or record more."
+        elif cheapest != row:
+            text += (
+                f" {policy_name(cheapest.policy)} costs {cheapest.cost:.3g}, which is not cheaper "
+                f"beyond chance, and lets more bad parts through: of 1,000 parts "
+                f"{1000 * cheapest.escaped:.2g}, not {1000 * row.escaped:.2g}."
             )
-        result = f"{name} {self.verdict}: {row.cost:.3g} a part, {interval}; {verify_all}."
-        if self.verdict == "pays":
-            return result
-        bad = percent(row.bad.upper, ".3g")
-        worst = percent(self.costs.worst_accept, ".3g")
-        return (
-            f"{result} Not certainly: of the accepted parts up to {bad} may be bad, and accepting "
-            f"pays up to {worst}. More recordings narrow that; in production audits and stops do."
-        )
+        if missing is not None:
+            how = "where every bad accepted part stops the line"
+            if missing.audit_rate < 1.0:
+                how = f"at an audit rate of {percent(missing.audit_rate, 'g')}"
+            kind = "this share of bad ones" if row.bad.wrong else "no bad one"
+            worst = percent(self.costs.worst_accept, ".3g")
+            text += (
+                f" Not certainly: of the accepted parts up to {percent(row.bad.upper, '.3g')} may "
+                f"be bad, and accepting pays up to {worst}. To show that it pays takes about "
+                f"{missing.accepted:,} different accepted parts with {kind}, and these recordings "
+                f"count as {missing.seen:,}: {missing.recordings:,} more recordings, or "
+                f"{missing.production:,} parts of production {how}."
+            )
+        if not self.fresh:
+            text += " The search was not finished: these shuffles also chose the policy."
+        return text[0].upper() + text[1:]
+
+    @property
+    def price_sentence(self) -> str:
+        """Whether another policy would be chosen if one price were half or twice as large."""
+        if not self.price_changes:
+            return "If one price is half or twice as large, the choice stays."
+        return f"The choice depends on the prices: {'; '.join(self.price_changes)}."
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return a DataFrame with a row for each policy, its costs, shares and error rates.
+        """Return a DataFrame with a row for each policy that was played.
 
-        The column `chosen` is True in the row of the policy that pays or may pay, False in all rows
-        if none does. Shares are from 0 to 1, costs in the user's unit.
+        It has costs, shares and error rates, `chosen`, True for the policy that pays or may pay,
+        and `reported`, False for those that were left behind. Shares are from 0 to 1, costs in the
+        user's unit.
         """
         import pandas as pd
 
         # Its columns are policy_alpha, bad_rate and so on.
-        frame = pd.json_normalize([asdict(row) for row in self.rows], sep="_")
+        rows = [*self.rows, *self.left_behind]
+        frame = pd.json_normalize([asdict(row) for row in rows], sep="_")
         names = {f"policy_{name}": name for name in ("guarantee", "alpha", "lower_bound")}
         others = [name for name in frame if not name.startswith("policy_")]
         frame = frame[[*names, *others]].rename(columns=names)
-        return frame.assign(chosen=[row.policy == self.policy for row in self.rows])
+        chosen = [row.policy == self.policy for row in rows]
+        return frame.assign(chosen=chosen, reported=[row in self.rows for row in rows])
+
+
+def policy_name(policy: Policy) -> str:
+    """Return how a policy is named among others: its LB, and alpha or the guarantee."""
+    if policy.guarantee == "cost":
+        return "the cost guarantee"
+    kind = f"alpha {policy.alpha:g}" if policy.guarantee == "local" else policy.guarantee
+    return f"{kind}, LB {percent(policy.lower_bound, 'g')}"
+
+
+def settings_of(policy: Policy) -> dict[str, Any]:
+    """Return the settings that make a policy, without its interval and windows.
+
+    What has its default is left out, and what prices imply.
+    """
+    names = ["alpha", "lower_bound", "guarantee"]
+    if policy.guarantee == "cost":
+        names = ["prices"]
+    settings = {name: getattr(policy, name) for name in names}
+    default = Policy(**settings, stops="all")
+    if policy.audit_rate != default.audit_rate:
+        settings["audit_rate"] = policy.audit_rate
+    return settings | ({"stops": "all"} if policy.stops == "all" else {})
+
+
+class PolicySearch:
+    """Finds the policy that pays, by halving.
+
+    Parameters
+    ----------
+    dataset, recipe, alphas, lower_bounds, repeats, seed, cycles
+        As of `cost_curve`.
+    costs : Costs
+
+    Attributes
+    ----------
+    remaining : list of Contender
+        The candidates that were not left behind, each with its policy.
+    out_of_reach : list of str
+        Policies that are not tried, each with the reason.
+
+    Raises
+    ------
+    SettingError
+        A price, a policy, or a number of repeats or cycles out of range; recordings of one label,
+        or too few for any policy.
+    """
+
+    def __init__(
+        self,
+        dataset: Any,
+        recipe: Any,
+        costs: Costs,
+        *,
+        alphas: Sequence[float] = (),
+        lower_bounds: Sequence[float] = (),
+        repeats: int = REPEATS,
+        seed: int = 0,
+        cycles: int | None = None,
+    ) -> None:
+        data = load_dataset(dataset)
+        contender = Contender.load(recipe)
+        expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
+        do = "where a bad part costs no more than its check, accept every part unchecked"
+        expect(costs.check < costs.escape, "a check below an escape", astuple(costs)[:2], do)
+        do = "where a wrong decision costs nothing, there is nothing to check"
+        expect(costs.false_reject > 0.0, "a false reject that costs something", 0, do)
+        labels = f"{int(data.y.sum()):,} good and {int((1 - data.y).sum()):,} bad ones"
+        do = "record until both have come: one kind does not show what errors cost"
+        expect(0.0 < data.y.mean() < 1.0, "good and bad recordings", labels, do)
+        self.costs = costs
+        self._repeats = repeats
+        self._seed = seed
+        self._cycles = len(data) if cycles is None else cycles
+        self.remaining: list[Contender] = []
+        self.out_of_reach: list[str] = []
+        for changes in candidates(contender, costs, alphas, lower_bounds):
+            self._add(contender, changes, self._cycles * float(data.y.mean()))
+        do = f"this is what they lack: {'; '.join(self.out_of_reach)}"
+        expect(bool(self.remaining), "recordings enough for one policy", len(data), do)
+        # Plays the scores of all candidates; None where they would learn other labels.
+        self._scores: Contender | None = None
+        policy = contender.recipe.policy
+        if contender.baseline is None and policy.stops == "all":
+            shadow = Policy(shadow=True, windows=policy.windows)
+            self._scores = replace(contender, recipe=replace(contender.recipe, policy=shadow))
+        self._screened: dict[Policy, dict[int, Replay]] = defaultdict(dict)
+        self._reported: dict[Policy, dict[int, Replay]] = defaultdict(dict)
+
+    def _add(self, contender: Contender, changes: dict[str, Any], n_good: float) -> None:
+        """Add a candidate, or a note on why it is not tried; `n_good` good parts are played."""
+        try:
+            candidate = contender.with_policy(**changes)
+        except SettingError as error:
+            self.out_of_reach.append(f"guarantee {changes['guarantee']}: {error}".rstrip("."))
+            return
+        policy = candidate.recipe.policy
+        n_needed = needed_parts(policy)
+        if n_needed > n_good:
+            what = "accepted parts without a bad one"
+            if policy.guarantee == "local":
+                what = "good neighbours"
+            has = f"{n_good:,.0f} good parts are played"
+            self.out_of_reach.append(f"{policy_name(policy)} needs {n_needed:,} {what}, {has}")
+        else:
+            self.remaining.append(candidate)
+
+    def run(self, play: Callable[[Sequence[Task]], Sequence[Replay]]) -> None:
+        """Play all rounds.
+
+        Parameters
+        ----------
+        play : callable
+            Returns the replays of tasks. If it returns fewer, as after Ctrl-C, nothing more is
+            played.
+        """
+        seeds = count(self._seed)
+        while len(self.remaining) > N_LAST:
+            if not self._play(play, islice(seeds, N_SCREENING), self._screened, self._scores):
+                return
+            self.remaining.sort(key=self._screening_key)
+            del self.remaining[max(N_LAST, len(self.remaining) // 2) :]
+        self._play(play, islice(seeds, self._repeats), self._reported, None)
+
+    def _play(
+        self,
+        play: Callable[[Sequence[Task]], Sequence[Replay]],
+        seeds: Iterable[int],
+        into: dict[Policy, dict[int, Replay]],
+        scores: Contender | None,
+    ) -> bool:
+        """Play the remaining candidates over some seeds, if given on the scores of one engine.
+
+        Returns whether all was played.
+        """
+        players = [scores] if scores else self.remaining
+        tasks = [Task(player, seed, self._cycles) for seed in seeds for player in players]
+        replays = play(tasks)
+        policies = [candidate.recipe.policy for candidate in self.remaining]
+        for replay in replays:
+            for policy in policies if scores else [replay.recipe.policy]:
+                into[policy][replay.seed] = replay_policy(replay, policy) if scores else replay
+        return len(replays) == len(tasks)
+
+    def _screening_key(self, contender: Contender) -> tuple[bool, float]:
+        """Return what candidates are sorted by: whether all was verified, and the expected cost."""
+        policy = contender.recipe.policy
+        row = _policy_cost(policy, list(self._screened[policy].values()), self.costs)
+        return row.accepted + row.rejected == 0.0, row.expected_cost
+
+    def curve(self) -> CostCurve | None:
+        """Return the cost curve of what was played.
+
+        It is of the shuffles that every policy that is left has finished: those that report, or
+        if there are fewer than two, those that chose; None if there are fewer of these, too.
+        """
+        policies = [candidate.recipe.policy for candidate in self.remaining]
+        behind = [
+            _policy_cost(policy, list(replays.values()), self.costs)
+            for policy, replays in self._screened.items()
+            if policy not in policies
+        ]
+        for played in (self._reported, self._screened):
+            seeds = sorted(set.intersection(*(set(played[policy]) for policy in policies)))
+            if len(seeds) > 1:
+                groups = {policy: [played[policy][seed] for seed in seeds] for policy in policies}
+                notes = tuple(behind), tuple(self.out_of_reach), played is self._reported
+                return curve_of(groups, self.costs, *notes)
+        return None
+
+
+def candidates(
+    contender: Contender, costs: Costs, alphas: Sequence[float], lower_bounds: Sequence[float]
+) -> Iterator[dict[str, Any]]:
+    """Yield the changes of a contender's policy that are to be tried.
+
+    They are an alpha and an LB each, of its own rule if it has one, else of the guarantee "local";
+    then "pooled" and "cost", unless it has its own rule or is a baseline. Without `lower_bounds`
+    the levels of LB are those around break-even.
+    """
+    policy = contender.recipe.policy
+
+    def levels(factors: Sequence[float]) -> Sequence[float]:
+        """Return levels of LB, the laxest first."""
+        tolerances = [factor * costs.worst_accept for factor in factors]
+        allowed = [share for share in tolerances if share <= LARGEST_TOLERANCE]
+        shares = allowed or [LARGEST_TOLERANCE]
+        # Two digits of the tolerance are enough, and make a level that can be typed.
+        return sorted(lower_bounds or [round(1.0 - float(f"{share:.2g}"), 9) for share in shares])
+
+    is_own = policy.guarantee not in RULES
+    first = policy.guarantee if is_own else "local"
+    for alpha in alphas or (ALPHA,):
+        for bound in levels(FACTORS):
+            yield {"guarantee": first, "alpha": alpha, "lower_bound": bound}
+    if is_own or contender.baseline is not None:
+        return
+    audit_rate = policy.audit_rate
+    if policy.stops == "some":
+        audit_rate = audit_rate or AUDIT_RATE  # both need to hear of accepted parts
+    for bound in levels(POOLED_FACTORS):
+        yield {"guarantee": "pooled", "lower_bound": bound, "audit_rate": audit_rate}
+    yield {"guarantee": "cost", "prices": astuple(costs), "audit_rate": audit_rate}
+
+
+def needed_parts(policy: Policy) -> int:
+    """Return how many good parts a policy needs before it can accept one.
+
+    For "local" they are neighbours, z^2 LB / (1 - LB) of them with Wilson's interval; for "pooled"
+    members whose capital reaches 1 / alpha. It is 0 for others.
+    """
+    if policy.guarantee == "local":
+        counts = range(1, MOST_NEIGHBOURS)
+        level = policy.lower_bound
+        return 1 + bisect_left(counts, level, key=lambda n: float(policy.bound(n, 0)[0]))
+    if policy.guarantee == "pooled":
+        evidence: Any = policy.rule().evidence
+        steps: list[float] = evidence.capital_steps[0]
+        return math.ceil(float(evidence.required_log_capital) / steps[0])
+    return 0
 
 
 def cost_curve(
@@ -195,19 +507,11 @@ def cost_curve(
     escape: float,
     false_reject: float,
     recipe: Any = "conv",
-    alphas: Sequence[float] = ALPHAS,
-    lower_bounds: Sequence[float] = LOWER_BOUNDS,
-    repeats: int = REPEATS,
-    seed: int = 0,
-    cycles: int | None = None,
     n_jobs: int = 1,
     keep: FilePath | None = None,
+    **settings: Any,
 ) -> CostCurve:
-    """Compute what a part costs under every alpha and LB, and under ``guarantee="cost"``.
-
-    The data set is replayed `repeats` times under each of these policies. ``guarantee="cost"`` is
-    left out for a baseline, and where `Policy` refuses it with these costs, `stops` and
-    `audit_rate`.
+    """Find the policy that pays by three prices, and what a part costs under it.
 
     Parameters
     ----------
@@ -217,19 +521,17 @@ def cost_curve(
         What a check, a bad part that is accepted and a good part that is rejected cost, in one
         unit.
     recipe : object, default "conv"
-        Anything `Contender.load` takes. Its policy's alpha and lower_bound are replaced.
-    alphas, lower_bounds : sequence of float
-        To try.
-    repeats : int, default 10
-        Shuffles of each policy, 2 or more: the first half chooses, the other half reports.
-    seed : int, default 0
-        Of the first shuffle.
-    cycles : int or None, default None
-        Parts of each shuffle; None plays all.
+        Anything `Contender.load` takes. Guarantee, alpha, lower_bound and prices of its policy are
+        replaced; where "pooled" and "cost" need audits and it has none, they get 5 %.
     n_jobs : int, default 1
         Replays at a time, as joblib counts them.
     keep : path or None, default None
         Folder of finished replays: those in it are not played again, others are added.
+    **settings
+        alphas, lower_bounds : sequences of float to try; by default `ALPHA`, and levels around
+        1 - check / escape that the number of recordings allows. repeats : fresh shuffles that the
+        last policies play, 4, at least 2. seed : of the first shuffle, 0. cycles : parts of each
+        shuffle, by default all.
 
     Returns
     -------
@@ -238,144 +540,142 @@ def cost_curve(
     Raises
     ------
     SettingError
-        A cost, a policy, a number of repeats or a number of cycles out of range.
+        As `PolicySearch`.
     """
-    costs = Costs(check, escape, false_reject)
-    expect(repeats >= 2, "2 or more repeats", repeats, "one half chooses, the other one reports")
-    seeds = range(seed, seed + repeats)
-    tasks = priced_tasks(recipe, costs, alphas, lower_bounds, seeds, cycles)
-    return curve_of(play_tasks(dataset, tasks, n_jobs=n_jobs, keep=keep), costs)
+    data = load_dataset(dataset)
+    search = PolicySearch(data, recipe, Costs(check, escape, false_reject), **settings)
+    search.run(lambda tasks: play_tasks(data, tasks, n_jobs=n_jobs, keep=keep))
+    curve = search.curve()
+    assert curve is not None  # all was played
+    return curve
 
 
-def priced_tasks(
-    recipe: Any,
+def curve_of(
+    groups: Groups,
     costs: Costs,
-    alphas: Sequence[float],
-    lower_bounds: Sequence[float],
-    seeds: Sequence[int],
-    cycles: int | None = None,
-) -> list[Task]:
-    """Return the replays of a cost curve as tasks.
-
-    There is one for every alpha, lower bound and seed, and one for every seed under
-    ``guarantee="cost"``, unless the contender is a baseline, or `Policy` refuses that with these
-    costs, `stops` and `audit_rate`. Raises SettingError for an alpha or a lower bound out of range.
-    """
-    contender = Contender.load(recipe)
-    tasks = grid_tasks([contender], alphas, lower_bounds, seeds=seeds, cycles=cycles)
-    if contender.baseline is None:
-        with suppress(SettingError):
-            priced = contender.with_policy(guarantee="cost", prices=astuple(costs))
-            tasks += grid_tasks([priced], seeds=seeds, cycles=cycles)
-    return tasks
-
-
-def curve_of(replays: Sequence[Replay], costs: Costs) -> CostCurve:
-    """Return the cost curve of finished replays of one recipe.
-
-    Shuffles that not every policy has played are left out. Of the others, by their seeds, the first
-    half chooses and the second half reports.
-
-    Raises
-    ------
-    SettingError
-        Fewer than two shuffles are complete.
-    """
-    policies = list(dict.fromkeys(replay.recipe.policy for replay in replays))
-    policies.sort(
-        key=lambda policy: (policy.guarantee == "cost", -policy.alpha, policy.lower_bound)
-    )
-    by_key = {(replay.recipe.policy, replay.seed): replay for replay in replays}
-    seeds = [
-        seed
-        for seed in sorted({replay.seed for replay in replays})
-        if all((policy, seed) in by_key for policy in policies)
-    ]
-    expect(len(seeds) >= 2, "2 or more shuffles that every policy has played", len(seeds))
-    half = len(seeds) // 2
-    rows = []
-    for policy in policies:
-        complete = [by_key[policy, seed] for seed in seeds]
-        rows.append(_policy_cost(policy, complete[:half], complete[half:], costs))
-    first = replays[0]
+    left_behind: tuple[PolicyCost, ...] = (),
+    out_of_reach: tuple[str, ...] = (),
+    fresh: bool = True,
+) -> CostCurve:
+    """Return the cost curve of each policy's replays of the same shuffles."""
+    rows, marked, verdict = _choose(groups, costs)
+    chosen = _chosen_name(marked, verdict)
+    changes = []
+    for field in fields(costs):
+        for price in (0.5 * getattr(costs, field.name), 2.0 * getattr(costs, field.name)):
+            _, other, found = _choose(groups, replace(costs, **{field.name: price}))
+            name = _chosen_name(other, found)
+            if name != chosen:
+                changes.append(f"with {field.name.replace('_', ' ')} at {price:g}, {name}")
+    replays = groups[marked.policy]
     return CostCurve(
         costs=costs,
         rows=tuple(rows),
-        dataset=first.dataset,
-        recipe=first.name,
-        cycles=len(first),
-        choosing=half,
-        reporting=len(seeds) - half,
+        marked=marked,
+        verdict=verdict,
+        price_changes=tuple(changes),
+        left_behind=left_behind,
+        out_of_reach=out_of_reach,
+        dataset=replays[0].dataset,
+        recipe=replays[0].name,
+        cycles=len(replays[0]),
+        shuffles=len(replays),
+        fresh=fresh,
     )
 
 
-def _policy_cost(
-    policy: Policy, choosing: Sequence[Replay], reporting: Sequence[Replay], costs: Costs
-) -> PolicyCost:
-    """Return one policy's costs, shares and errors over the reporting shuffles.
+def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
+    """Return the rows of a curve, the marked one and its verdict, see `CostCurve`."""
+    rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
+    rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
+    cheapest = rows[0]
+    marked = cheapest
+    for row in rows[1:]:
+        is_safer = row.escaped < marked.escaped and row.expected_cost < costs.check
+        if is_safer:
+            mean, error = _difference(groups[row.policy], groups[cheapest.policy], costs)
+            if mean <= error * normal_quantile(2 * ERROR_LEVEL):  # one-sided
+                marked = row
+    verdict = "may pay"
+    if max(marked.expected_cost, marked.cost) >= costs.check:
+        verdict = "does not pay"
+    elif marked.upper < costs.check:
+        verdict = "pays"
+    return rows, marked, verdict
 
-    Only its expected cost comes from the choosing ones.
-    """
-    accepted = float(np.mean([replay.accepted for replay in reporting]))
-    rejected = float(np.mean([replay.rejected for replay in reporting]))
-    certain = accepted + rejected
-    # Each at half the error level: together they hold at ERROR_LEVEL.
-    bad = pooled_error(reporting, "accepted", ERROR_LEVEL / 2)
-    good = pooled_error(reporting, "rejected", ERROR_LEVEL / 2)
-    late_costs = [
-        cost_per_part(replay, costs, slice(2 * len(replay) // 3, None)) for replay in reporting
-    ]
+
+def _chosen_name(row: PolicyCost, verdict: str) -> str:
+    """Return what is chosen: a policy, or to check everything."""
+    return "check everything" if verdict == "does not pay" else policy_name(row.policy)
+
+
+def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> PolicyCost:
+    """Return one policy's costs, shares and errors over its replays."""
+    n = len(replays)
+    verified, accepted, rejected = (
+        float(np.mean([getattr(replay, name) for replay in replays]))
+        for name in ("verified", "accepted", "rejected")
+    )
+    bad = pooled_error(replays, "accepted", ALPHA_EACH)
+    good = pooled_error(replays, "rejected", ALPHA_EACH)
+
+    def cost_at(bad_rate: float, good_rate: float) -> float:
+        """Return the cost per part at these rates of wrong decisions."""
+        wrong = accepted * bad_rate, rejected * good_rate
+        return costs.check - costs.saved(accepted + rejected, *wrong)
+
+    each = np.array([part_costs(replay, costs) for replay in replays])  # (shuffles, cycles)
+    cost = float(each.mean())
+    luck = float(student.ppf(1.0 - ERROR_LEVEL / 2, max(1, n - 1))) * _order_error(each.mean(1))
     return PolicyCost(
         policy=policy,
-        expected_cost=_expected_cost(choosing, costs),
-        cost=float(np.mean([cost_per_part(replay, costs) for replay in reporting])),
-        lower=costs.check - costs.saved(certain, accepted * bad.lower, rejected * good.lower),
-        upper=costs.check - costs.saved(certain, accepted * bad.upper, rejected * good.upper),
-        late=float(np.mean(late_costs)),
-        verified=float(np.mean([replay.verified for replay in reporting])),
-        certain=certain,
+        expected_cost=cost_at(*(_expected_rate(error) for error in (bad, good))),
+        cost=cost,
+        lower=cost - math.hypot(cost - cost_at(bad.lower, good.lower), luck),
+        upper=cost + math.hypot(cost - cost_at(bad.upper, good.upper), luck),
+        late=float(each[:, 2 * each.shape[1] // 3 :].mean()),
+        verified=verified,
+        accepted=accepted,
+        rejected=rejected,
         bad=bad,
         good=good,
+        luck=luck,
+        shuffles=n,
     )
 
 
-def _expected_cost(replays: Sequence[Replay], costs: Costs) -> float:
-    """Return the mean cost per part, with each share of wrong decisions at its Jeffreys mean.
+def _expected_rate(error: ErrorRate) -> float:
+    """Return the Jeffreys mean of a share of errors, whose unit is the part."""
+    n_wrong = error.traces * error.wrong / max(1, error.decided)
+    return (n_wrong + 0.5) / (error.traces + 1)
 
-    That is (wrong + 1/2) / (decided + 1), with both counts the mean of one shuffle. No error among
-    25 accepted parts does not mean that there is never one: by the plain mean a few decisions would
-    look free at any price.
+
+def _order_error(each: Floats) -> float:
+    """Return the standard error of a mean over shuffles, from its values in each, (shuffles,)."""
+    return float(each.std(ddof=1)) / math.sqrt(len(each)) if len(each) > 1 else 0.0
+
+
+def _difference(
+    first: Sequence[Replay], other: Sequence[Replay], costs: Costs
+) -> tuple[float, float]:
+    """Return how much dearer a part is under one policy than under another, and its error.
+
+    Both have played the same shuffles. The standard error has the variance between parts, each
+    with its sum over the shuffles, and between shuffles.
     """
-    counts = [replay.stretch() for replay in replays]
-    accepted = float(np.mean([count["accepted"] for count in counts]))
-    bad = float(np.mean([count["false_positive"] for count in counts]))
-    rejected = float(np.mean([count["rejected"] for count in counts]))
-    good = float(np.mean([count["false_negative"] for count in counts]))
-    expected_bad = accepted * (bad + 0.5) / (accepted + 1.0)
-    expected_good = rejected * (good + 0.5) / (rejected + 1.0)
-    saved = costs.saved(accepted + rejected, expected_bad, expected_good)
-    return costs.check - saved / len(replays[0])
+    pairs = zip(first, other, strict=True)
+    each = np.array([part_costs(one, costs) - part_costs(two, costs) for one, two in pairs])
+    mean = float(each.mean())
+    parts = np.concatenate([replay.index for replay in first])
+    sums = np.bincount(parts, (each - mean).ravel())
+    return mean, math.hypot(float(np.sqrt((sums**2).sum())) / each.size, _order_error(each.mean(1)))
 
 
-def cost_per_part(replay: Replay, costs: Costs, cycles: slice = slice(None)) -> float:
-    """Return the mean cost per part over some cycles of a replay: checks and wrong decisions.
+def part_costs(replay: Replay, costs: Costs) -> Floats:
+    """Return what each part of a replay cost, (n,): its check, or its wrong decision.
 
     A part that an operator's limits rejected costs as much as a checked one.
-
-    Parameters
-    ----------
-    replay : Replay
-    costs : Costs
-    cycles : slice, default all
-        The cycles by their position, from 0, without a step; at least one.
-
-    Returns
-    -------
-    cost : float
-        In the unit of `costs`.
     """
-    counts = replay.stretch(cycles)
-    n_certain = counts["accepted"] + counts["rejected"]
-    saved = costs.saved(n_certain, counts["false_positive"], counts["false_negative"])
-    n_cycles = counts["last_cycle"] - counts["first_cycle"] + 1
-    return float(costs.check - saved / n_cycles)
+    checked = costs.check * ~(replay.accepted | replay.rejected)
+    wrong = costs.escape * replay.false_positive + costs.false_reject * replay.false_negative
+    return np.asarray(checked + wrong, dtype=np.float64)

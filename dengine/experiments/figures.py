@@ -27,7 +27,7 @@ from ..history.sentences import Bound
 from ..records import Action, TraceArray, TraceSpec
 from ..reducers import has_own_unit
 from ..traces import as_traces
-from .costs import CostCurve, PolicyCost
+from .costs import CostCurve, policy_name
 from .replay import Floats, Replay
 from .survey import channel_means
 
@@ -187,10 +187,10 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
 
     Each part is drawn where it lay when it was decided, though each retrain moves the map; those
     that no model embedded are left out, on the left also those of unknown truth. The first two
-    dimensions are drawn, the mean over the spaces. The circle is the neighbourhood of the newest
-    part drawn, with the recipe's radius. Units are equal on both axes, unless the first dimension
-    is a probability: then the second is only for the eye, and the circle is cut off above and
-    below.
+    dimensions are drawn, the mean over the spaces, in equal units; a circle is the neighbourhood of
+    the newest part drawn, with the recipe's radius. If the first dimension is a probability, the
+    second is small against the radius: then the cycle stands in its place, and two lines bound the
+    neighbourhood.
 
     Parameters
     ----------
@@ -211,8 +211,9 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     x_label = "embedding 1 [root mean square radius = 1]"
     y_label = "embedding 2 [root mean square radius = 1]"
     if is_probability:
+        z[:, 1] = np.arange(len(z)) + len(replay) - len(z) + 1
         x_label = "predicted probability of success"
-        y_label = "embedding 2 [for the eye, small against the radius]"
+        y_label = "cycle"
     panels = (
         (left, "what the parts were", replay.truth, TRUTH_MARKS),
         (right, "what was decided", replay.action, ACTION_MARKS),
@@ -227,42 +228,39 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
         finish(axes, xlabel=x_label)
         axes.set_title(name, pad=24)
     left.set(ylabel=y_label)
+    if is_probability:
+        left.set_xlim(-0.06, 1.06)
+    elif embedded.any():
+        low = z[embedded].min(axis=0)
+        high = z[embedded].max(axis=0)
+        half = 0.56 * (high - low).max() + 1e-9  # the panel is a square in data units
+        x, y = (low + high) / 2
+        left.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
     if embedded.any():
-        _set_map_limits(left, z[embedded], is_probability)
-        cut = ", cut off above and below" if is_probability else ""
-        radius = replay.recipe.radius
-        label = f"neighbourhood of the newest part, radius {radius:g}{cut}"
-        _draw_neighbourhood(figure, z[embedded][-1], radius, label)
+        _draw_neighbourhood(figure, z[embedded][-1], replay.recipe.radius, is_probability)
     if not is_probability:
         left.set_aspect("equal")
         right.set_aspect("equal")
     return figure
 
 
-def _set_map_limits(axes: Axes, z: Floats, is_probability: bool) -> None:
-    """Set the limits of both axes around points (n, 2), with a margin.
+def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip: bool) -> None:
+    """Draw the neighbourhood of a point (2,), a cross, into all axes, and a legend below.
 
-    The panel is a square in data units; for a probability x goes from 0 to 1, and y fits the
-    points.
+    It is a circle, or a strip between two lines.
     """
-    low = z.min(axis=0)
-    high = z.max(axis=0)
-    half = 0.56 * (high - low) + 1e-9
-    if not is_probability:
-        half = np.full(2, half.max())
-    x_low, y_low = (low + high) / 2 - half
-    x_high, y_high = (low + high) / 2 + half
-    axes.set(xlim=(-0.06, 1.06) if is_probability else (x_low, x_high), ylim=(y_low, y_high))
-
-
-def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, label: str) -> None:
-    """Draw a circle and its centre (2,), a cross, into all axes, and a legend below the figure."""
     from matplotlib.patches import Circle
 
+    style: Style = {"edgecolor": BLACK, "linewidth": 1.4}
+    x, y = centre
     for axes in figure.axes:
-        circle = Circle((centre[0], centre[1]), radius, fill=False, edgecolor=BLACK, linewidth=1.4)
-        axes.add_patch(circle)
-        (mark,) = axes.plot(*centre, "+", color=BLACK, markersize=9, label=label)
+        if is_strip:
+            for end in (x - radius, x + radius):
+                axes.axvline(end, color=BLACK, linewidth=1.4)
+        else:
+            axes.add_patch(Circle((x, y), radius, fill=False, **style))
+        label = f"newest part; its neighbourhood ends at the black line, radius {radius:g}"
+        (mark,) = axes.plot(x, y, "+", color=BLACK, markersize=9, label=label)
     figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=SMALL)
 
 
@@ -314,10 +312,11 @@ def window_curves(
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
     """Draw the paper's curve, with a colour for each recipe.
 
-    Above: the share of certain decisions, those without a check, the precision of the accepted ones
-    and LB. Below: the errors, bad parts as a share of the accepted ones and good parts as a share
-    of the rejected ones, and the tolerance 100 - LB. Shares of fewer than `FEWEST` parts are not
-    drawn. The window is `WINDOW` cycles, or a third of the longest replay.
+    From the top: the share of certain decisions, those without a check; the precision of the
+    accepted ones, and LB; the errors, bad parts as a share of the accepted ones (solid) and good
+    parts as a share of the rejected ones (dashed), and the tolerance 100 - LB. The legend below has
+    the counts. Shares of fewer than `FEWEST` parts are not drawn. The window is `WINDOW` cycles, or
+    a third of the longest replay.
 
     Parameters
     ----------
@@ -329,55 +328,61 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     -------
     figure : Figure
     """
-    # In the legends recipes stand side by side: a column for each, and one for the bound.
-    n_columns = max(2, min(len(by_recipe), 4))
-    figure = blank(3.6 + 2.7 * n_columns, 7.4, title)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(4, 3))
+    from matplotlib import colormaps
+
+    n = len(by_recipe)
+    figure = blank(9.0, 8.2 + 0.22 * n, title)
+    certain, precision, errors = figure.subplots(3, 1, sharex=True, height_ratios=(4, 3, 3))
     all_replays = [replay for replays in by_recipe.values() for replay in replays]
     window = fit_window(WINDOW, all_replays)
+    colours = RECIPES if n <= len(RECIPES) else colormaps["tab20"].colors  # type: ignore[attr-defined]
+    handles = []
+    for colour, (name, replays) in zip(cycle(colours), by_recipe.items(), strict=False):
+        _draw_replays(certain, precision, errors, replays, window, colour)
+        counts = [replay.stretch() for replay in replays]
+        wrong = [
+            f"{sum(count[kind] for count in counts)} {word} of "
+            f"{sum(count[decided] for count in counts)} {decided}"
+            for kind, decided, word, _ in ERRORS
+        ]
+        handles += certain.plot([], color=colour, label=f"{name}: {', '.join(wrong)}")
     bounds = sorted({replay.recipe.policy.lower_bound for replay in all_replays})
-    for colour, (name, replays) in zip(cycle(RECIPES), by_recipe.items(), strict=False):
-        prefix = f"{name}: " if len(by_recipe) > 1 else ""
-        _draw_replays(top, bottom, replays, window, colour, prefix)
     for bound in bounds:
-        _draw_bounds(top, bottom, bound)
-    finish(top, n_columns + 1, ylim=(0, 102), ylabel="share [%]")
+        _draw_bounds(precision, errors, bound)
+    finish(certain, 0, ylim=(0, 102), ylabel="certain\n[% of cycles]")
+    finish(precision, min(len(bounds), 4), ylabel="precision\n[% of accepted]")
+    precision.set_ylim(max(0.0, min(precision.get_ylim()[0], 100 * bounds[0] - 1)), 100.5)
     # At least half as much again above the tolerance: the panel shows whether errors keep to it.
-    highest = max(bottom.get_ylim()[1], 150 * (1 - bounds[0]))
-    finish(bottom, n_columns + 1, ylim=(0, highest), ylabel="wrong [% of accepted, rejected]")
+    highest = max(errors.get_ylim()[1], 150 * (1 - bounds[0]))
+    y_label = "bad of accepted, good of\nrejected (dashed) [%]"
+    finish(errors, min(len(bounds), 4), ylim=(0, highest), ylabel=y_label)
     windows = f"end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn"
-    bottom.set(xlabel=f"cycle ({windows})")
+    errors.set(xlabel=f"cycle ({windows})")
+    figure.legend(handles=handles, loc="outside lower center", frameon=False, fontsize=SMALL)
     return figure
 
 
 def _draw_replays(
-    top: Axes,
-    bottom: Axes,
+    certain: Axes,
+    precision: Axes,
+    errors: Axes,
     replays: Sequence[Replay],
     window: int,
-    colour: str,
-    prefix: str = "",
+    colour: Any,
 ) -> None:
-    """Draw the curves of replays: the share of certain decisions and precision above, errors below.
+    """Draw the curves of replays: share of certain decisions, precision, and errors.
 
-    A band shows the spread of the certain share over the replays. The legend has the counts of the
-    errors: where too few parts were accepted or rejected for a curve, they still say what went
-    wrong.
+    A band shows the spread of the certain share over the replays.
     """
     lines = window_curves(replays, window, FEWEST)
-    counts = [replay.stretch() for replay in replays]
     x = np.arange(1, len(lines["certain"]) + 1)  # cycles are counted from 1
     low = lines["certain_low"]
     high = lines["certain_high"]
-    top.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
-    top.plot(x, lines["certain"], color=colour, label=f"{prefix}certain, of all cycles")
-    label = f"{prefix}precision, of accepted"
-    top.plot(x, lines["precision"], color=colour, linestyle="--", label=label)
-    for wrong, decided, name, line in ERRORS:
-        n_wrong = sum(count[wrong] for count in counts)
-        n_decided = sum(count[decided] for count in counts)
-        label = f"{prefix}{n_wrong} {name} of {n_decided} {decided}"
-        bottom.plot(x, lines[wrong], line, color=colour, label=label)
+    certain.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
+    certain.plot(x, lines["certain"], color=colour)
+    precision.plot(x, lines["precision"], "--" if precision is certain else "-", color=colour)
+    for wrong, _, _, line in ERRORS:
+        errors.plot(x, lines[wrong], line, color=colour)
 
 
 def _draw_bounds(top: Axes, bottom: Axes, bound: float) -> None:
@@ -428,7 +433,7 @@ def grid_figure(replays: Sequence[Replay], title: str = "") -> Figure:
         top, bottom = axes[2 * i : 2 * i + 2, j]
         top.set_title(f"alpha {alpha:g}, LB {100 * bound:g} %", fontsize=SMALL + 1)
         if (alpha, bound) in cells:
-            _draw_replays(top, bottom, cells[alpha, bound], window, GREEN)
+            _draw_replays(top, top, bottom, cells[alpha, bound], window, GREEN)
             _draw_bounds(top, bottom, bound)
     for i, row in enumerate(axes):
         if i % 2:
@@ -505,10 +510,11 @@ def _draw_rate(axes: Axes, run: Replay, clock_s: Floats, window: int) -> None:
 
 
 def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
-    """Draw a cost curve, with a ring around the chosen policy.
+    """Draw what a part costs under each policy, the cheapest at the top.
 
-    Above: the cost per part with its interval, and the cost of verifying everything. Below: the
-    share of parts that the model accepted or rejected.
+    A line marks the cost of checking everything, and a ring the chosen policy. Policies that were
+    left behind are hollow: their costs are of other shuffles. An interval that leaves the axes ends
+    in an arrow with its value. On the right stands the share of parts decided without a check.
 
     Parameters
     ----------
@@ -522,68 +528,36 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     """
     costs = curve.costs
     title = (
-        f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape "
-        f"{costs.escape:g} {unit}, false reject {costs.false_reject:g} "
-        f"{unit}\n{curve.reporting} shuffles of {curve.cycles} parts; bars: errors at the "
-        "ends of their 95 % intervals"
+        f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape {costs.escape:g} "
+        f"{unit}, false reject {costs.false_reject:g} {unit}\n{curve.shuffles} shuffles of "
+        f"{curve.cycles} parts, with 95 % intervals"
     )
-    figure = blank(9.0, 7.2, title)
-    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
-    by_bound = [row for row in curve.rows if row.policy.guarantee != "cost"]
-    by_cost = [row for row in curve.rows if row.policy.guarantee == "cost"]
-    bounds = sorted({row.policy.lower_bound for row in by_bound})
-    groups: dict[str, list[PolicyCost]] = {}
-    for row in by_bound:
-        groups.setdefault(f"alpha {row.policy.alpha:g}", []).append(row)
-    if by_cost:
-        groups["by cost"] = by_cost
-    top.axhline(curve.costs.check, label="verify everything", **LIMIT)
-    for i, (label, rows) in enumerate(groups.items()):
-        ticks = [
-            len(bounds) if rows is by_cost else bounds.index(row.policy.lower_bound) for row in rows
-        ]
-        # Moved a little, so that the bars of the alphas stand side by side.
-        x = np.array(ticks) + 0.08 * (i - (len(groups) - 1) / 2)
-        style: Style = {
-            "color": RECIPES[i % len(RECIPES)],
-            "marker": "osD^vP"[i % 6],
-            "markersize": 6,
-            "label": label,
-        }
-        _draw_policies(top, bottom, curve, rows, x, style)
-    n_columns = len(groups) + 2
-    means = [row.cost for row in curve.rows]
-    limits = (min(0.0, *means), 1.25 * max(curve.costs.check, *means))
-    finish(top, n_columns, ylim=limits, ylabel=f"cost a part [{unit}]")
-    highest = max(10.0, 110 * max(row.certain for row in curve.rows))
-    y_label = "decided without a check\n[% of parts]"
-    finish(bottom, n_columns, ylim=(0, highest), ylabel=y_label)
-    names = [f"{100 * bound:g}" for bound in bounds] + ["by cost"] * len(by_cost)
-    bottom.set_xticks(range(len(names)), names)
-    bottom.set_xlabel("LB [% of accepted parts that are to be good]")
+    rows = [*curve.rows, *curve.left_behind]
+    figure = blank(9.0, 2.2 + 0.34 * len(rows), title)
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
+    end = 1.3 * max(costs.check, *(row.cost for row in rows))
+    left.axvline(costs.check, label="check everything", **LIMIT)
+    groups = ((curve.rows, BLUE, "played last"), (curve.left_behind, "none", "left behind"))
+    y = 0
+    for group, colour, label in groups:
+        style: Style = {"color": BLUE, "markerfacecolor": colour, "capsize": 3, "fmt": "o"}
+        for i, row in enumerate(group):
+            upper = min(row.upper, end)
+            errors = [[row.cost - max(row.lower, 0.0)], [upper - row.cost]]
+            left.errorbar(row.cost, y, xerr=errors, label="_" if i else label, **style)
+            if row.upper > end:
+                left.text(end, y, f"to {row.upper:.3g} \u2192", ha="right", va="bottom", size=SMALL)
+            right.barh(y, 100 * (row.accepted + row.rejected), color=BLUE, fill=group is curve.rows)
+            y += 1
+    if curve.policy is not None:
+        ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
+        where = curve.rows.index(curve.marked)
+        left.scatter(curve.marked.cost, where, s=200, label=f"choice: {curve.verdict}", **ring)
+    left.set_yticks(range(len(rows)), [policy_name(row.policy) for row in rows])
+    left.invert_yaxis()
+    finish(left, 4, xlim=(0.0, end), xlabel=f"cost a part [{unit}]")
+    finish(right, 0, xlim=(0, 100), xlabel="decided without\na check [% of parts]")
     return figure
-
-
-def _draw_policies(
-    top: Axes,
-    bottom: Axes,
-    curve: CostCurve,
-    rows: Sequence[PolicyCost],
-    x: Floats,
-    style: Style,
-) -> None:
-    """Draw the costs and certain shares of policies at x (n,), and a ring around the chosen one."""
-    cost = np.array([row.cost for row in rows])
-    lower = np.array([row.lower for row in rows])
-    upper = np.array([row.upper for row in rows])
-    # A replay's mean lies within what its errors' intervals allow, but for rounding.
-    errors = np.maximum([cost - lower, upper - cost], 0.0)
-    top.errorbar(x, cost, yerr=errors, capsize=3, elinewidth=1.0, **style)
-    bottom.plot(x, [100 * row.certain for row in rows], **style)
-    ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
-    for tick, row in zip(x, rows, strict=True):
-        if row.policy == curve.policy:
-            top.scatter(tick, row.cost, s=260, label=f"the choice: {curve.verdict}", **ring)
 
 
 def _axis_labels(spec: TraceSpec) -> list[str]:

@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 from ..cells.base import Cell
 from ..cells.replay import ReplayCell
 from ..datasets import load_dataset
+from ..decision.policy import Policy
 from ..engine.engine import DataEngine
 from ..errors import SettingError, expect
 from ..recipe import RECIPES, Recipe
-from ..records import Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec
+from ..records import ACTIONS, Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec
+from ..reducers import has_own_unit
 from ..reducers.base import Reducer
 from ..representation import to_html
 from .baselines import BASELINES, make_baseline
@@ -46,6 +48,8 @@ DECISION_FIELDS: dict[str, Any] = {
     "n_success": np.int64,
     "n_failure": np.int64,
 }
+# Reasons of decisions for which the model was asked.
+ASKED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
 # Fields of a replay that mark cycles, and are counted in its stretches.
 COUNTED = (
     "verified",
@@ -568,3 +572,50 @@ def replay(
         seed=seed,
         seconds=time.perf_counter() - begin,
     )
+
+
+def replay_policy(scores: Replay, policy: Policy) -> Replay:
+    """Play a policy on the scores of a replay in shadow mode, without its model.
+
+    The decisions are those of a replay under the policy if every label becomes known there. So the
+    policy must have `stops="all"`, and the labels of parts that it rejects are what its model would
+    not have learned. Audits are drawn anew; what an operator's limits reject is verified.
+
+    Parameters
+    ----------
+    scores : Replay
+        With `Policy(shadow=True)`.
+    policy : Policy
+
+    Returns
+    -------
+    replay : Replay
+        With the actions of the policy.
+    """
+    import torch
+
+    rule = policy.rule()
+    # A rule that only sorts takes the mean probability of the heads, if there is one.
+    is_scored = rule.sorts and has_own_unit(scores.recipe.reducer)
+    audited = np.random.default_rng(scores.seed).random(len(scores)) < policy.audited_share
+    asked = np.isin(scores.reason, ASKED)
+    novel = scores.novel
+    actions = np.zeros(len(scores), dtype=np.int64)
+    with torch.inference_mode():
+        for i, success in enumerate(scores.truth.tolist()):
+            predicted = 0
+            lower = 0.0
+            upper = 1.0
+            if asked[i] and is_scored:
+                lower = upper = float(scores.position[i, 0])
+                predicted = rule.action(lower, upper)
+            elif asked[i]:
+                counts = int(scores.n_success[i]), int(scores.n_failure[i])
+                predicted, lower, upper = rule(*counts)
+            actions[i] = 0 if audited[i] else predicted
+            if actions[i] != 2:  # nobody learns whether a rejected part was good
+                asked_with = policy.audited_share if predicted else 1.0
+                rule.observe(0, bool(novel[i]))
+                rule.update(lower, upper, success, predicted, 0.0 if actions[i] else asked_with)
+    recipe = replace(scores.recipe, policy=policy)
+    return replace(scores, action=np.array(ACTIONS)[actions].astype(np.str_), recipe=recipe)

@@ -404,6 +404,7 @@ RESPONSES = {
             without=("settings", "retrains"),  # `ever.retrains` counts them
             **LINE,
             alarm=_described(str, "What somebody should look at, or empty."),
+            claim=_described(str, "What the certificate says of accepted parts, as a sentence."),
         ),
         _response_type("Course", "", Course),
         _response_type("PartMap", "", PartMap),

@@ -273,7 +273,7 @@ class HttpApi:
         Settings that are left out stay as they are. Many changes start the decision rule anew.
         """
         return await self._change(
-            author, lambda engine, by: engine.set_policy(replace(engine.policy, **changes), by)
+            author, lambda engine, by: engine.set_policy(engine.policy.changed(**changes), by)
         )
 
     async def retrain(self, author: Author = "") -> Json:
@@ -333,7 +333,8 @@ class HttpApi:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm."""
         status = await self.service.status(last, watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
-        return response_fields("Status", status, alarm=status.alarm, **line)
+        texts = {"alarm": status.alarm, "claim": status.certificate.sentence}
+        return response_fields("Status", status, **texts, **line)
 
     async def decision(
         self,

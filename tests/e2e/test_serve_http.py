@@ -120,6 +120,7 @@ def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset
                 )
                 assert response.json()["success"] is bool(stream.y[i])
         assert engine.version == client.get("/status").json()["version"] == 1
+        assert client.get("/status").json()["claim"] == engine.certificate().sentence
 
 
 def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:

@@ -162,9 +162,16 @@ def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not
         5 / 120,
         pytest.approx(1203 * 5 - 120 * 1203 * upper),
     )
-    assert result.sentence.endswith(f"not checking them saved at least {int(result.saved):,}.")
-    outcomes = Outcomes(accepted=60, confirmed=58, false_accepts=2)
-    assert policy.certificate(outcomes).sentence.endswith("saved nothing for certain.")
+    assert (
+        f"Not checking them spared 6,015 of checks, and bad parts cost at most "
+        f"{math.ceil(120 * 1203 * upper):,} on average: at least {int(result.saved):,} was saved."
+    ) in result.sentence
+    assert result.sentence.endswith(
+        "have, by what is known of them, cost 120, the price of one bad part, more than their checks."
+    )
+    lost = policy.certificate(Outcomes(accepted=60, confirmed=58, false_accepts=2))
+    most = math.ceil(-lost.saved)
+    assert f"nothing was saved for certain, and at most {most:,} was lost." in lost.sentence
     assert certificate("all", accepted=1203, false_accepts=24).saved is None
 
 
@@ -172,7 +179,7 @@ def test_a_part_that_was_audited_saves_no_check() -> None:
     shadow = Policy(0.05, guarantee="cost", prices=(5, 120, 47.5), shadow=True)
     result = shadow.certificate(Outcomes(audited_accepts=5000))
     assert (result.accepted.n, result.accepted.n_unchecked, result.saved) == (5000, 0, 0.0)
-    assert result.sentence.endswith("the tolerance is 4.16667 %.")
+    assert "however often one looks; it pays up to 4.17 %. Accepting pauses" in result.sentence
     audited = Policy(0.05, guarantee="cost", prices=(5, 120, 47.5), audit_rate=0.4)
     result = audited.certificate(Outcomes(accepted=3000, audited_accepts=2000))
     n_escaped = 5000 * result.accepted.upper
@@ -180,7 +187,8 @@ def test_a_part_that_was_audited_saves_no_check() -> None:
         5000,
         pytest.approx(3000 * 5 - 120 * n_escaped),
     )
-    assert "By the prices not checking 3,000 of them saved at least " in result.sentence
+    assert "Not checking 3,000 of them spared 15,000 of checks" in result.sentence
+    assert f"at least {math.floor(result.saved):,} was saved." in result.sentence
     # What is saved is never less than if every unchecked part had escaped.
     lost = audited.certificate(Outcomes(accepted=10, audited_accepts=900, audited_accepts_bad=450))
     assert lost.saved == pytest.approx(10 * 5 - 10 * 120)

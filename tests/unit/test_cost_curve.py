@@ -1,27 +1,41 @@
-"""What a part costs under each policy: sums by hand, the choice, what it says, its picture and its
-verb.
+"""What a part costs under each policy: sums by hand, candidates, halving, the choice, what it says,
+its picture and its verb.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from dengine import Dataset, Policy, Recipe
+from dengine.cli.replay import _as_flags
 from dengine.errors import SettingError
-from dengine.experiments.costs import CostCurve, cost_curve, cost_per_part, curve_of
+from dengine.experiments.costs import (
+    CostCurve,
+    PolicySearch,
+    candidates,
+    cost_curve,
+    curve_of,
+    needed_parts,
+    part_costs,
+    policy_name,
+    settings_of,
+)
 from dengine.experiments.figures import cost_picture
+from dengine.experiments.grid import Task
 from dengine.experiments.metrics import Costs
-from dengine.experiments.replay import Replay, replay
+from dengine.experiments.replay import Contender, Replay, replay, replay_policy
 from tests.support.command_line import dengine, document, succeed
 from tests.support.replays import replay_of
 
 COSTS = Costs(check=5, escape=100, false_reject=20)
 STRICT, LAX = Policy(0.05, 0.95), Policy(0.5, 0.8)
 RECIPE = Recipe.load("pca").with_policy(stops="all")
-HOW = {"recipe": RECIPE, "alphas": (0.5,), "lower_bounds": (0.8, 0.95), "repeats": 4, "cycles": 120}
+PRICES = {"check": 5, "escape": 20, "false_reject": 11}
 
 
 def played(
@@ -33,13 +47,14 @@ def played(
     rejected: int = 0,
     good: int = 0,
 ) -> Replay:
-    """A replay with so many decisions of each kind, in that order, of which so many are wrong."""
+    """A replay with so many decisions of each kind, of which so many are wrong; the parts of each
+    kind are the same in every shuffle.
+    """
     action = ["verify"] * verified + ["accept"] * accepted + ["reject"] * rejected
     truth = np.ones(len(action), dtype=bool)
     truth[verified : verified + bad] = False
     truth[verified + accepted + good :] = False
-    index = np.random.default_rng(seed).permutation(len(action))
-    return replay_of(action, truth, index=index, recipe=Recipe("pca", policy=policy), seed=seed)
+    return replay_of(action, truth, recipe=Recipe("pca", policy=policy), seed=seed)
 
 
 def curve(
@@ -48,147 +63,435 @@ def curve(
     """Of two policies; for each shuffle of 100 parts, how many were verified, and how many of the
     others were bad.
     """
-    replays = [
-        played(policy, seed, verified, 100 - verified, bad)
+    groups = {
+        policy: [
+            played(policy, seed, verified, 100 - verified, bad)
+            for seed, (verified, bad) in enumerate(item)
+        ]
         for policy, item in ((LAX, lax), (STRICT, strict))
-        for seed, (verified, bad) in enumerate(item)
-    ]
-    return curve_of(replays, COSTS)
+    }
+    return curve_of(groups, COSTS)
 
 
-def test_a_parts_cost_is_checks_and_errors_over_all_parts() -> None:
+def test_a_parts_cost_is_its_check_or_its_wrong_decision() -> None:
     first = played(LAX, 0, verified=60, accepted=25, bad=2, rejected=15, good=3)
-    assert cost_per_part(first, COSTS) == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
-    assert cost_per_part(first, COSTS, slice(60, 85)) == pytest.approx(2 * 100 / 25)
+    costs = part_costs(first, COSTS)
+    assert costs.mean() == pytest.approx((60 * 5 + 2 * 100 + 3 * 20) / 100)
+    assert costs[60:85].mean() == pytest.approx(2 * 100 / 25)
 
 
 def test_a_part_that_an_operators_limits_reject_was_not_checked_and_pays_for_no_policy() -> None:
     reason = np.array(["certain"] * 80 + ["outside"] * 20)
-    replays = [
-        replace(played(policy, seed, 60, 15, 0, rejected=25), reason=reason)
+    groups = {
+        policy: [
+            replace(played(policy, seed, 60, 15, 0, rejected=25), reason=reason)
+            for seed in range(4)
+        ]
         for policy in (LAX, STRICT)
-        for seed in range(4)
-    ]
-    for row in curve_of(replays, COSTS).rows:
-        assert (row.verified, row.certain) == pytest.approx((0.6, 0.2))
+    }
+    for row in curve_of(groups, COSTS).rows:
+        assert (row.verified, row.accepted + row.rejected) == pytest.approx((0.6, 0.2))
         assert row.cost == pytest.approx(5 * 0.8)
 
 
-def test_one_half_of_the_shuffles_chooses_and_the_other_reports() -> None:
-    result = curve(
-        lax=[(50, 0), (50, 0), (50, 1), (60, 1)], strict=[(90, 0), (80, 0), (70, 0), (70, 0)]
-    )
-    lax, strict = result.rows
-    assert (result.choosing, result.reporting) == (2, 2)
-    assert (lax.expected_cost, lax.cost) == (pytest.approx(2.5 + 50 * 0.5 / 51), (3.5 + 4.0) / 2)
-    assert curve(lax=[(50, 0)] * 4, strict=[(50, 0)] * 4).policy == STRICT  # of equal ones
-    assert (strict.expected_cost, strict.cost) == (pytest.approx(4.25 + 15 * 0.5 / 16), 3.5)
-    assert result.policy == LAX  # cheaper where it was chosen, though not where it is reported
-    assert f"{lax.cost:.3g} a part" in result.sentence
+def test_no_row_is_cheaper_than_the_marked_one_unless_a_sentence_says_that_this_is_chance() -> None:
+    result = curve(lax=[(40, 0), (50, 0), (50, 0), (60, 0)], strict=[(90, 0), (80, 0)] * 2)
+    assert result.marked is result.rows[0]
+    assert (result.policy, result.rows[0].cost) == (LAX, 2.5)
+    assert "beyond chance" not in result.sentence
+    close = curve(lax=[(20, 1), (20, 0), (20, 3), (20, 0)], strict=[(45, 0)] * 4)
+    assert close.rows[0].cost < close.marked.cost
+    assert close.policy == STRICT
+    assert "alpha 0.5, LB 80 % costs 2, which is not cheaper beyond chance" in close.sentence
+    assert "lets more bad parts through: of 1,000 parts 10, not 0." in close.sentence
 
 
-def test_the_interval_moves_the_errors_to_their_ends_and_is_wider_than_the_luck_of_the_order() -> (
-    None
-):
-    (row, _) = curve(lax=[(50, 0), (50, 0), (50, 1), (50, 0)]).rows
+def test_the_interval_moves_the_errors_to_their_ends_and_adds_the_luck_of_the_order() -> None:
+    row = next(row for row in curve([(50, 0), (50, 0), (50, 1), (50, 0)]).rows if row.accepted)
     assert row.lower < row.cost < row.upper
-    assert row.upper == pytest.approx(5 * 0.5 + 100 * 0.5 * row.bad.upper)
-    assert (row.bad.decided, row.bad.wrong, row.verified, row.certain) == (100, 1, 0.5, 0.5)
+    errors = 5 * 0.5 + 100 * 0.5 * row.bad.upper - row.cost
+    luck = 3.182446 * np.std([2.5, 2.5, 3.5, 2.5], ddof=1) / 2  # Student's t of 3 degrees
+    assert row.upper == pytest.approx(row.cost + math.hypot(errors, luck), rel=1e-5)
+    assert (row.bad.decided, row.bad.wrong, row.verified, row.accepted) == (200, 1, 0.5, 0.5)
 
 
 def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everything() -> None:
-    clear = [played(LAX, seed, 100, 2900, 10) for seed in range(4)]
+    clear = {LAX: [played(LAX, seed, 100, 2900, 10) for seed in range(4)]}
     assert curve_of(clear, COSTS).verdict == "pays"
+    assert curve_of(clear, COSTS).missing is None
     doubtful = curve(lax=[(50, 0)] * 4)
-    assert doubtful.verdict == "may pay"
-    assert doubtful.policy == LAX
+    assert (doubtful.verdict, doubtful.policy) == ("may pay", LAX)
     assert "may be bad, and accepting pays up to 5 %" in doubtful.sentence
 
 
+def alone(
+    accepted: int, verified: int = 50, stops: str = "all", bad: int = 0, rejected: int = 0
+) -> CostCurve:
+    """The curve of one policy, whose accepted parts are the same in each of two shuffles."""
+    policy = replace(LAX, stops=stops)
+    replays = [played(policy, seed, verified, accepted, bad, rejected) for seed in range(2)]
+    return curve_of({policy: replays}, COSTS)
+
+
 @pytest.mark.parametrize(
-    "lax",
-    [[(50, 5)] * 4, [(50, 0), (50, 0), (50, 5), (50, 5)]],
-    ids=["never cheaper", "cheaper only where chosen"],
+    "kinds",
+    [{"accepted": 50}, {"accepted": 50, "bad": 1}, {"accepted": 5, "rejected": 20}],
+    ids=["no error", "an error", "rejects"],
 )
+def test_as_many_parts_as_are_missing_turn_may_pay_into_pays(kinds: dict[str, int]) -> None:
+    result = alone(**kinds)
+    missing = result.missing
+    assert missing is not None
+    scale = 1 + missing.recordings / result.cycles
+
+    def times(n: int) -> CostCurve:
+        return alone(verified=50 * n, **{kind: n * count for kind, count in kinds.items()})
+
+    assert times(math.ceil(scale)).verdict == "pays"
+    assert times(math.ceil(scale) - 1).verdict == "may pay"
+    assert missing.accepted == pytest.approx(kinds["accepted"] * scale, rel=0.03, abs=1)
+
+
+def test_what_is_missing_is_stated_in_parts_recordings_and_production() -> None:
+    result = alone(50)
+    missing = result.missing
+    assert missing is not None
+    # Wilson's end z^2 / (n + z^2) of no bad one among n parts is 5 % at n = 19 z^2, z = 2.2414.
+    assert (missing.accepted, missing.seen) == (math.ceil(19 * 2.241403**2), 50)
+    assert (missing.recordings, missing.production, missing.audit_rate) == (91, 191, 1.0)
+    assert (
+        "of the accepted parts up to 9.13 % may be bad, and accepting pays up to 5 %. To show that "
+        "it pays takes about 96 different accepted parts with no bad one, and these recordings "
+        "count as 50: 91 more recordings, or 191 parts of production where every bad accepted part "
+        "stops the line."
+    ) in result.sentence
+    by_audits = alone(50, stops="some").missing
+    assert by_audits is not None
+    assert (by_audits.production, by_audits.audit_rate) == (191 * 20, 0.05)
+    assert "parts of production at an audit rate of 5 %" in alone(50, stops="some").sentence
+
+
+@pytest.mark.parametrize("lax", [[(50, 5)] * 4, [(50, 3), (50, 2)] * 2])
 def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: list[tuple[int, int]]) -> None:
     result = curve(lax)
     assert (result.verdict, result.policy) == ("does not pay", None)
     assert result.sentence.startswith("Nothing pays: verifying everything costs 5 a part")
     assert not result.to_frame()["chosen"].any()
-    assert "everything was verified. Record more." in curve(lax=[(100, 0)] * 4).sentence
+    nothing = curve(lax=[(100, 0)] * 4)
+    assert nothing.verdict == "does not pay"
+    assert nothing.sentence.endswith("everything was verified. Record more.")
 
 
 def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear() -> None:
-    replays = [played(policy, seed, 99, 1, 0) for policy in (LAX, STRICT) for seed in range(4)]
+    groups = {LAX: [played(LAX, seed, 99, 1, 0) for seed in range(4)]}
     dear, cheap = (
-        curve_of(replays, Costs(check=5, escape=escape, false_reject=20)) for escape in (25, 15)
+        curve_of(groups, Costs(check=5, escape=escape, false_reject=20)) for escape in (25, 15)
     )
-    assert dear.cheapest.cost == cheap.cheapest.cost == 4.95
+    assert dear.marked.cost == cheap.marked.cost == 4.95
     assert (dear.verdict, cheap.verdict) == ("does not pay", "may pay")
-    assert "is expected to cost 5.01 and cost 4.95 in other shuffles" in dear.sentence
+    assert "or 5.01 with half an error more" in dear.sentence
 
 
-def test_a_shuffle_that_not_every_policy_has_played_is_left_out() -> None:
-    result = curve(lax=[(50, 0), (50, 0), (0, 50)], strict=[(100, 0)] * 2)
-    assert (result.choosing, result.reporting, result.rows[0].cost) == (1, 1, 2.5)
-    with pytest.raises(SettingError, match="2 or more shuffles"):
-        curve(lax=[(50, 0)], strict=[(100, 0)])
+def test_it_says_which_price_would_change_the_choice() -> None:
+    groups = {
+        LAX: [played(LAX, seed, 200, 800, 12) for seed in range(4)],
+        STRICT: [played(STRICT, seed, 600, 400, 0) for seed in range(4)],
+    }
+    result = curve_of(groups, COSTS)
+    assert result.policy == LAX  # 2.2, where the stricter one costs 3.0
+    assert "with escape at 200, alpha 0.05, LB 95 %" in result.price_changes
+    assert result.price_sentence.startswith("The choice depends on the prices: with ")
+    assert not any("escape at 50," in change for change in result.price_changes)
+    steady = curve(lax=[(20, 0)] * 4)
+    assert "the choice stays" in steady.price_sentence
 
 
-@pytest.fixture(scope="module")
-def found(make_data: Callable[..., Dataset]) -> CostCurve:
-    return cost_curve(make_data(160), check=5, escape=20, false_reject=11, **HOW)
+def test_needed_neighbours_are_those_of_the_interval_and_needed_members_those_of_the_bet() -> None:
+    assert needed_parts(Policy(0.1, 0.9)) == 25
+    assert needed_parts(Policy(0.05, 0.95)) == 73
+    assert needed_parts(Policy(0.05, 0.95, interval="clopper_pearson")) == 72
+    pooled = Policy(0.05, 0.95, guarantee="pooled", stops="all")
+    rule = pooled.rule()
+    for _ in range(needed_parts(pooled)):
+        assert rule.action(0.99, 0.99) == 0
+        rule.update(0.99, 0.99, True, 0, 1.0)
+    assert rule.action(0.99, 0.99) == 1
+    assert needed_parts(Policy(prices=(5, 120, 47.5))) == 0
 
 
-def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(
-    found: CostCurve, make_data
+def test_candidates_lie_around_break_even_and_have_the_audits_that_they_need() -> None:
+    costs = Costs(0.5, 200, 5)
+    found = list(candidates(Contender.load("pca"), costs, (), ()))
+    by_kind = {kind: [c for c in found if c["guarantee"] == kind] for kind in ("local", "pooled")}
+    levels = [change["lower_bound"] for change in by_kind["local"]]
+    assert levels == [0.96, 0.98, 0.99, 0.995, 0.9975, 0.9987]  # break-even is 99.75 %
+    assert {change["audit_rate"] for change in found if "audit_rate" in change} == {0.05}
+    assert found[-1] == {"guarantee": "cost", "prices": (0.5, 200, 5), "audit_rate": 0.05}
+    silent = list(candidates(Contender.load(RECIPE), costs, (), ()))
+    assert silent[-1]["audit_rate"] == 0.0
+    stated = list(candidates(Contender.load("knn"), costs, (0.2, 0.05), (0.9,)))
+    assert stated == [
+        {"guarantee": "local", "alpha": alpha, "lower_bound": 0.9} for alpha in (0.2, 0.05)
+    ]
+
+
+def test_a_policy_that_the_recordings_cannot_support_is_named_with_what_it_needs(data) -> None:
+    search = PolicySearch(data, "pca", Costs(0.5, 200, 0.9))
+    n_good = int(data.y.sum())
+    needed = needed_parts(Policy(0.1, 0.9975))
+    note = f"alpha 0.1, LB 99.75 % needs {needed:,} good neighbours, {n_good} good parts are played"
+    assert note in search.out_of_reach
+    refused = [text for text in search.out_of_reach if text.startswith("guarantee cost: ")]
+    assert len(refused) == 1
+    assert "errors above two checks" in refused[0]
+    assert all(needed_parts(item.recipe.policy) <= n_good for item in search.remaining)
+
+
+@pytest.mark.parametrize(
+    ("prices", "text"),
+    [
+        ({"check": 5, "escape": 4}, "a check below an escape"),
+        ({"check": 0}, "a check that costs something"),
+        ({"check": -1}, "a finite cost of 0 or more as check"),
+        ({"escape": 0}, "a check below an escape"),
+        ({"false_reject": 0}, "a false reject that costs something"),
+        ({"escape": "200 EUR"}, "a finite cost of 0 or more as escape, got '200 EUR'"),
+        ({"repeats": 1}, "2 or more repeats"),
+        ({"lower_bounds": (0.999,)}, "recordings enough for one policy"),
+    ],
+)
+def test_prices_that_decide_nothing_are_refused_in_one_sentence(
+    prices: dict[str, Any], text: str, make_data: Callable[..., Dataset]
 ) -> None:
-    asked = RECIPE.with_policy(alpha=0.5, lower_bound=0.8)
-    again = [replay(make_data(160), asked, seed, 120) for seed in (2, 3)]
-    assert (found.rows[0].policy, asked.policy.stops) == (asked.policy, "all")
-    assert found.rows[0].cost == pytest.approx(
-        np.mean([cost_per_part(first, found.costs) for first in again])
-    )
-    by_cost = found.rows[-1]
-    assert (by_cost.policy.guarantee, by_cost.policy.prices) == ("cost", (5.0, 20.0, 11.0))
-    assert (found.cycles, found.choosing, found.reporting, found.dataset) == (
-        120,
-        2,
-        2,
-        "insertion-like",
-    )
+    few = {"false_reject": 6} if "lower_bounds" in prices else {}  # no guarantee by cost
+    with pytest.raises(SettingError, match=text) as caught:
+        cost_curve(make_data(30), recipe=RECIPE, **(PRICES | few | prices))
+    assert "\n" not in str(caught.value)
 
 
-def test_the_picture_names_what_it_shows_and_in_which_unit(found: CostCurve) -> None:
-    figure = cost_picture(found, unit="EUR")
-    top, bottom = figure.axes
-    assert top.get_ylabel() == "cost a part [EUR]"
-    assert [text.get_text() for text in bottom.get_xticklabels()] == ["80", "95", "by cost"]
-    labels = [text.get_text() for text in top.get_legend().get_texts()]
-    assert "verify everything" in labels
-    assert "alpha 0.5" in labels
-    assert any(label.startswith("the choice: ") for label in labels) == (found.policy is not None)
-    assert "check 5 EUR, escape 20 EUR, false reject 11 EUR" in figure.get_suptitle()
+@pytest.mark.parametrize("label", [0, 1])
+def test_recordings_of_one_kind_are_refused(label: int, data: Dataset) -> None:
+    one_kind = replace(data, y=np.full(len(data), label))
+    with pytest.raises(SettingError, match=r"good and bad recordings, got .* good and"):
+        cost_curve(one_kind, recipe="pca", **PRICES)
 
 
-def test_the_verb_shows_a_table_and_writes_the_curve(
-    data: Dataset, tmp_path: Path, monkeypatch
+def cheaper_by_level(tasks: Sequence[Task]) -> list[Replay]:
+    """Replays in which a stricter policy accepts less, and none is wrong."""
+    return [
+        played(policy, task.seed, round(100 * policy.lower_bound), 100, 0)
+        for task in tasks
+        for policy in [task.contender.recipe.policy]
+    ]
+
+
+def test_the_cheaper_half_plays_on_and_the_last_two_report_on_shuffles_that_chose_nothing(
+    data: Dataset,
 ) -> None:
+    rounds = []
+
+    def play(tasks: Sequence[Task]) -> list[Replay]:
+        rounds.append(tasks)
+        return cheaper_by_level(tasks)
+
+    bounds = (0.6, 0.7, 0.8, 0.85, 0.88, 0.9)
+    search = PolicySearch(data, "knn", COSTS, lower_bounds=bounds, alphas=(0.2,), repeats=3, seed=7)
+    search.run(play)
+    numbers = [len({task.contender.recipe.policy for task in tasks}) for tasks in rounds]
+    seeds = [sorted({task.seed for task in tasks}) for tasks in rounds]
+    assert (numbers, seeds) == ([6, 3, 2], [[7, 8], [9, 10], [11, 12, 13]])
+    result = search.curve()
+    assert [row.policy.lower_bound for row in result.rows] == [0.6, 0.7]
+    assert sorted(row.policy.lower_bound for row in result.left_behind) == [0.8, 0.85, 0.88, 0.9]
+    assert (result.shuffles, result.fresh) == (3, True)
+    frame = result.to_frame()
+    assert list(frame["reported"]) == [True, True, False, False, False, False]
+    assert frame["chosen"].sum() == 1
+
+
+@pytest.mark.parametrize(("n_rounds", "fresh"), [(1, False), (2, False), (3, True)])
+def test_a_search_that_is_interrupted_shows_what_was_finished(
+    n_rounds: int, fresh: bool, data: Dataset
+) -> None:
+    rounds = []
+
+    def play(tasks: Sequence[Task]) -> list[Replay]:
+        rounds.append(tasks)
+        return cheaper_by_level(tasks if len(rounds) <= n_rounds else tasks[:1])
+
+    search = PolicySearch(data, "knn", COSTS, lower_bounds=(0.6, 0.7, 0.8, 0.85, 0.88, 0.9))
+    search.run(play)
+    result = search.curve()
+    assert (len(rounds), result.fresh) == (min(3, n_rounds + 1), fresh)
+    assert ("these shuffles also chose the policy" in result.sentence) != fresh
+    nothing = PolicySearch(data, "knn", COSTS)
+    nothing.run(lambda tasks: cheaper_by_level(tasks[:1]))
+    assert nothing.curve() is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"guarantee": "local", "alpha": 0.5, "lower_bound": 0.8},
+        {"guarantee": "pooled", "lower_bound": 0.7},
+        {"prices": (5, 20, 11), "audit_rate": 0.0},
+    ],
+    ids=["local", "pooled", "cost"],
+)
+@pytest.mark.parametrize("reducer", ["pca", "rocket"])
+def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejected(
+    changes: dict[str, Any], reducer: str, make_data: Callable[..., Dataset]
+) -> None:
+    data = make_data(160)
+    policy = Policy(stops="all").changed(**changes)
+    scores = replay(data, Recipe(reducer, policy=Policy(shadow=True)), 3)
+    shared = replay_policy(scores, policy)
+    alone_ = replay(data, Recipe(reducer, policy=policy), 3)
+    first = int(np.argmax(np.append(alone_.action == "reject", True)))
+    assert (alone_.action[:first] != "verify").any()
+    np.testing.assert_array_equal(shared.action[: first + 1], alone_.action[: first + 1])
+    assert shared.recipe.policy == policy
+
+
+def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data) -> None:
+    found = cost_curve(
+        make_data(160), recipe=RECIPE, alphas=(0.5,), lower_bounds=(0.8,), cycles=120, repeats=2,
+        **PRICES,
+    )  # fmt: skip
+    seeds = (2, 3)  # the first two shuffles chose
+    for row in found.rows:
+        again = [replay(make_data(160), replace(RECIPE, policy=row.policy), s, 120) for s in seeds]
+        assert row.policy.stops == "all"
+        assert row.cost == pytest.approx(np.mean([part_costs(r, found.costs) for r in again]))
+    assert (found.cycles, found.shuffles, found.dataset) == (120, 2, "insertion-like")
+    kinds = {row.policy.guarantee for row in (*found.rows, *found.left_behind)}
+    assert kinds == {"local", "pooled", "cost"}
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        Policy(0.1, 0.9917),
+        Policy(0.1, 0.98, stops="all", guarantee="pooled", audit_rate=0.02),
+        Policy(prices=(0.5, 200, 5)),
+        Policy(prices=(0.5, 200, 5), audit_rate=0.0, stops="all"),
+    ],
+    ids=policy_name,
+)
+def test_the_lines_that_are_shown_set_the_policy(policy: Policy) -> None:
+    settings = settings_of(policy)
+    assert Policy(**settings) == policy
+    words = _as_flags(settings)
+    assert ("--prices 0.5,200,5" in words) == (policy.guarantee == "cost")
+    assert ("--audit-rate" in words) == ("audit_rate" in settings)
+
+
+def test_the_picture_names_what_it_shows_and_marks_what_leaves_its_axes() -> None:
+    lucky = replace(alone(50).marked, upper=80.0)
+    result = replace(curve(lax=[(50, 0)] * 4), left_behind=(lucky,))
+    figure = cost_picture(result, unit="EUR")
+    left, right = figure.axes
+    assert left.get_xlabel() == "cost a part [EUR]"
+    names = [text.get_text() for text in left.get_yticklabels()]
+    assert names == [policy_name(row.policy) for row in (*result.rows, lucky)]
+    labels = [text.get_text() for text in left.get_legend().get_texts()]
+    assert {"check everything", "choice: may pay", "left behind"} <= set(labels)
+    end = left.get_xlim()[1]
+    drawn = [
+        point[0] for c in left.collections for path in c.get_paths() for point in path.vertices
+    ]
+    assert max(drawn) <= end
+    texts = [text.get_text() for text in left.texts]
+    cut = [row for row in (*result.rows, lucky) if row.upper > end]
+    assert texts == [f"to {row.upper:.3g} \u2192" for row in cut]
+    assert "to 80 \u2192" in texts
+    assert "check 5 EUR, escape 100 EUR, false reject 20 EUR" in figure.get_suptitle()
+    assert len(right.patches) == 3
+
+
+WORDS = [
+    "costs",
+    "--data",
+    "mine.npz",
+    "--reducer",
+    "pca",
+    "--cycles",
+    "90",
+    "--repeats",
+    "2",
+    "--alphas",
+    "0.5,0.1",
+    "--lower-bounds",
+    "0.8",
+    "--n-jobs",
+    "1",
+    "--escape",
+    "20",
+    "--false-reject",
+    "10",
+    "--keep",
+    "kept",
+]
+
+
+@pytest.fixture
+def recordings(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     np.savez(tmp_path / "mine.npz", X=data.X, y=data.y)
     monkeypatch.chdir(tmp_path)
-    words = "costs --data mine.npz --reducer pca --cycles 90 --repeats 2 --alphas 0.5,0.1 --lower-bounds 0.8 --n-jobs 1"
-    words += " --escape 20 --false-reject 10 --keep kept"
-    shown = succeed(*words.split(), "--out", "out")
-    assert "what a part costs, in s, by alpha and LB" in " ".join(shown.split())
+    return tmp_path
+
+
+def test_the_verb_shows_a_table_and_writes_the_curve(recordings: Path) -> None:
+    shown = succeed(*WORDS, "--out", "out")
+    assert "what a part costs, in s" in " ".join(shown.split())
+    assert "check all" in shown
     assert max(map(len, shown.splitlines())) <= 80
-    assert (tmp_path / "out" / "costs.png").stat().st_size > 10_000
-    assert (tmp_path / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") == 3
-    result = document(*words.split())
+    assert (recordings / "out" / "costs.png").stat().st_size > 10_000
+    n_rows = (recordings / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") - 1
+    result = document(*WORDS)
     assert result["verdict"] in ("pays", "may pay", "does not pay")
-    assert [row["alpha"] for row in result["rows"]] == [0.5, 0.1]
-    assert result["sentence"] in " ".join(shown.split())
-    assert len(list((tmp_path / "kept").iterdir())) == 4  # played once
-    assert "by cost" in succeed(*words.replace("reject 10", "reject 11").split(), "--stops", "all")
-    assert "but a list is tried here: use --alphas" in " ".join(
-        dengine(*words.split(), "--alpha", "0.1").output.split()
-    )
+    assert len(result["rows"]) == n_rows
+    text = " ".join(shown.split())
+    assert result["sentence"] in text
+    assert "Not tried: " in text
+    if result["policy"]:
+        assert result["python"] in text
+        assert result["command"].startswith("dengine policy cell.db --")
+    again = document(*WORDS, "--escape", "21")  # other prices, the same replays
+    assert again["costs"]["escape"] == 21
+
+
+def test_the_verb_names_a_price_that_is_no_number(recordings: Path) -> None:
+    result = dengine(*WORDS, "--check", "0.5 EUR")
+    assert result.exit_code == 2
+    assert "'0.5 EUR' is not a valid float" in " ".join(result.output.split())
+    refused = " ".join(dengine(*WORDS, "--alpha", "0.1").output.split())
+    assert "but a list is tried here: use --alphas" in refused
+
+
+def test_the_verb_says_that_recordings_come_twice(recordings: Path, data: Dataset) -> None:
+    twice = np.r_[0:60, 0:30]
+    np.savez(recordings / "mine.npz", X=data.X[twice], y=data.y[twice])
+    text = " ".join(succeed(*WORDS).split())
+    assert "Of the recordings 30 repeat another: the interval is too narrow." in text
+
+
+def test_after_an_error_in_one_replay_the_verb_shows_what_was_finished(
+    recordings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dengine.experiments import grid
+
+    play = grid._play
+
+    def fail_late(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
+        if task.seed == 3:
+            raise SettingError("a sensor is missing")
+        return play(data, i, task, on_cycle)
+
+    monkeypatch.setattr(grid, "_play", fail_late)
+    result = dengine(*WORDS, "--lower-bounds", "0.7,0.8")
+    text = " ".join(result.output.split())
+    assert result.exit_code == 1
+    assert "these shuffles also chose the policy" in text
+    assert "Interrupted: what was finished is shown. " in text
+    assert "a sensor is missing" in text

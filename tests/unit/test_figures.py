@@ -108,20 +108,20 @@ def test_window_curves_are_shares_of_what_was_decided_in_all_replays_where_that_
     ]
 
 
-def test_the_curves_draw_the_lower_bound_and_the_tolerance_and_count_the_errors() -> None:
-    top, bottom = curves({"a": [MANY_RIGHT], "b": [ONE_WRONG]}).axes
-    assert any(
-        np.allclose(line.get_ydata(), 90.0) and line.get_linestyle() == ":" for line in top.lines
-    )
-    assert any(
-        np.allclose(line.get_ydata(), 10.0) and line.get_linestyle() == ":" for line in bottom.lines
-    )
-    assert {"a: certain, of all cycles", "b: certain, of all cycles"} <= {
-        line.get_label() for line in top.lines
-    }
-    assert {"a: 10 bad of 300 accepted", "b: 1 good of 1 rejected"} <= {
-        line.get_label() for line in bottom.lines
-    }
+def test_the_curves_have_precision_and_lb_on_axes_of_their_own_and_count_the_errors() -> None:
+    figure = curves({"a": [MANY_RIGHT], "b": [ONE_WRONG]})
+    certain, precision, errors = figure.axes
+    for axes, level in ((precision, 90.0), (errors, 10.0)):
+        assert any(
+            np.allclose(line.get_ydata(), level) and line.get_linestyle() == ":"
+            for line in axes.lines
+        )
+    assert all(line.get_linestyle() != ":" for line in certain.lines)
+    assert precision.get_ylim()[0] > 0
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "a: 10 bad of 300 accepted, 0 good of 0 rejected",
+        "b: 1 bad of 1 accepted, 1 good of 1 rejected",
+    ]
 
 
 def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_newest_part() -> (
@@ -135,13 +135,16 @@ def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_n
     assert "root mean square radius = 1" in figure.axes[0].get_ylabel()
 
 
-def test_an_axis_that_is_a_probability_says_so_and_the_other_is_for_the_eye() -> None:
+def test_an_axis_that_is_a_probability_says_so_and_the_other_is_the_cycle() -> None:
     left = embedding_map(
         replay_of(["accept"] * 50, [1] * 50, recipe=Recipe("conv", radius=0.05))
     ).axes[0]
     assert left.get_xlabel() == "predicted probability of success"
-    assert "for the eye" in left.get_ylabel()
-    assert [ball.get_radius() for ball in left.patches] == [0.05]
+    assert left.get_ylabel() == "cycle"
+    ends = [line.get_xdata()[0] for line in left.lines if len(set(line.get_xdata())) == 1]
+    assert ends[1] - ends[0] == pytest.approx(0.1)  # twice the radius
+    legend = left.figure.legends[0].get_texts()[0].get_text()
+    assert legend == "newest part; its neighbourhood ends at the black line, radius 0.05"
     asked = (
         "rocket",
         ConvReducer(),

@@ -164,3 +164,35 @@ def test_a_text_behind_an_equals_sign_that_does_not_belong_there_is_refused(text
     with pytest.raises(SettingError) as error:
         ForceLimits.parse(text)
     assert len(str(error.value).splitlines()) == 1
+
+
+def test_prices_alone_are_the_cost_guarantee_with_audits_and_what_is_stated_stays() -> None:
+    alone = Policy(prices=(0.5, 200, 5))
+    assert (alone.guarantee, alone.audit_rate) == ("cost", 0.05)
+    assert Policy(prices=(0.5, 200, 5), stops="all", audit_rate=0.0).audit_rate == 0.0
+    local = Policy(prices=(0.5, 200, 5), guarantee="local")
+    assert (local.guarantee, local.audit_rate) == ("local", 0.0)
+    assert (Policy().guarantee, Policy().audit_rate) == ("local", 0.0)
+    assert Policy().prices == (5.0, 120.0, 47.5)
+
+
+def test_prices_change_a_policy_as_they_make_one_and_keep_an_audit_rate() -> None:
+    changed = Policy(alpha=0.1).changed(prices=(0.5, 200, 5))
+    assert changed == Policy(alpha=0.1, prices=(0.5, 200, 5))
+    assert Policy(audit_rate=0.2).changed(prices=(0.5, 200, 5)).audit_rate == 0.2
+    again = Policy(prices=(0.5, 200, 5), audit_rate=0.0, stops="all").changed(prices=(1, 200, 5))
+    assert (again.guarantee, again.audit_rate) == ("cost", 0.0)
+    assert Policy().changed(prices=(1, 200, 5), guarantee="local").guarantee == "local"
+    own = Policy(guarantee="my_rules:Rule").changed(prices=(1, 200, 5))
+    assert (own.guarantee, own.audit_rate) == ("my_rules:Rule", 0.0)
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [Policy(), Policy(guarantee="local", prices=(0.5, 200, 5)), Policy(prices=(0.5, 200, 5))],
+    ids=["default", "prices without effect", "by prices"],
+)
+def test_a_policy_that_was_written_reads_as_it_was(policy: Policy) -> None:
+    recipe = Recipe(policy=policy)
+    assert Recipe.from_toml(recipe.to_toml()).policy == policy
+    assert Policy.from_values(policy.to_values()) == policy

@@ -75,7 +75,7 @@ function badAccepts(status) {
   return el("section", { class: "card tile wide", id: "bad", "data-part": true }, el("h2", {}, "Bad accepted parts"),
     knownBad(status.ever), verdict(bad, VERDICT[bad.verdict]), judgedChart(bad),
     el("p", {}, `${percent(bad.lower, 1)} to ${percent(bad.upper, 1)}, tolerance ${percent(bad.tolerance, 1)}`),
-    small(BASIS[bad.basis](bad, status.ever.false_accepts)));
+    small(BASIS[bad.basis](bad, status.ever.false_accepts)), el("p", { id: "claim" }, status.claim));
 }
 
 function wouldHave(status) {
