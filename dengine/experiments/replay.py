@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..cells.base import Cell
 from ..cells.replay import ReplayCell
 from ..datasets import load_dataset
+from ..decision.neighbours import fade
 from ..decision.policy import Policy
 from ..engine.engine import DataEngine
 from ..errors import SettingError, expect
@@ -607,7 +608,8 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
             lower = 0.0
             upper = 1.0
             if asked[i] and is_scored:
-                lower = upper = float(scores.position[i, 0])
+                score = float(scores.position[i, 0])
+                lower = upper = fade(score, i, rule.prior_labels)  # with i labels
                 predicted = rule.action(lower, upper)
             elif asked[i]:
                 counts = int(scores.n_success[i]), int(scores.n_failure[i])
