@@ -55,7 +55,7 @@ def all_cases() -> Iterator[Case]:
         endings = {ENDINGS[rule], "bet"} if rule != "local" else set(ENDINGS.values())
         for ending in sorted(endings):
             for stream in ("constant, good", "at the tolerance", "doubling"):
-                yield Case(rule, stream, ending=ending, n_parts=2000)
+                yield Case(rule, stream, ending=ending, n_parts=1500)
 
 
 def wilson(k: float, n: float) -> tuple[float, float]:

@@ -106,11 +106,15 @@ class Side:
     ----------
     threshold, cusum : array of float64, shape (R,)
     target : array of int64, shape (R,)
-    by_level, members, members_since : Counts
-        Parts by level, and members, since the alarm; members of all time.
+    by_level : Counts
+        Parts by level since the alarm, under "cost".
+    level_capital : array of float64, shape (R, L)
+        The log capital of the same, under "pooled".
+    members, members_since : Counts
+        Members of all time, and since the alarm.
     n_reached : array of int64, shape (R, L)
         Parts that ever reached each level.
-    last_wrong : array of int64, shape (R, L, K + 1)
+    last_wrong : array of int64, shape (K + 1, R, L)
         Which parts, in the order of `n_reached`, were the newest wrong ones, oldest first. If the
         first is among the newest `N_NEWEST`, more than K of these were wrong.
     """
@@ -151,10 +155,11 @@ class Side:
         self.target = np.zeros(n_replays, dtype=np.int64)
         n_levels = len(levels)
         self.by_level = Counts(q, n_replays, n_levels)
+        self.level_capital = np.zeros((n_replays, n_levels))
         self.members = Counts(q, n_replays)
         self.members_since = Counts(q, n_replays)
         n_wrong = int(binom.ppf(0.8, N_NEWEST, tolerance)) + 1
-        self.last_wrong = np.full((n_replays, n_levels, n_wrong), -N_NEWEST)
+        self.last_wrong = np.full((n_wrong, n_replays, n_levels), -N_NEWEST)
         self.n_reached = np.zeros((n_replays, n_levels), dtype=np.int64)
 
     def log_capital(self, n: Floats) -> Floats:
@@ -194,15 +199,14 @@ class Side:
             opens = (self.threshold[rows] == OUT_OF_REACH) & self.ends(since)
             self.threshold[rows] = np.where(opens, self.levels[0], self.threshold[rows])
             return
-        by_level = self.by_level.n[:, rows]
         members = self.members.n[:, rows]
         if self.kind == "cost":
-            good = self.balance(by_level) >= -self.overdraft
+            good = self.balance(self.by_level.n[:, rows]) >= -self.overdraft
             members_keep = self.balance(members) >= -self.overdraft
         else:
-            good = self.log_capital(by_level) >= self.needed
+            good = self.level_capital[rows] >= self.needed
             members_keep = self.log_capital(members) >= self.needed
-        good &= self.last_wrong[rows, :, 0] <= self.n_reached[rows] - N_NEWEST
+        good &= self.last_wrong[0, rows] <= self.n_reached[rows] - N_NEWEST
         any_good = good.any(axis=1)
         lowest = good.shape[1] - 1 - good[:, ::-1].argmax(axis=1)
         alarmed = in_safe_mode[rows] | (since != members).any(axis=0)
@@ -229,14 +233,18 @@ class Side:
             return member, counted
         reached = score[rows, None] >= self.levels
         self.n_reached[rows] += reached
-        self.by_level.add(rows, reached, wrong[rows, None], audited[rows, None])
+        if self.kind == "cost":
+            self.by_level.add(rows, reached, wrong[rows, None], audited[rows, None])
+        else:
+            gains = np.array(self.bet)[audited.astype(int), wrong.astype(int)]
+            self.level_capital[rows] += reached * gains[rows, None]
         for counts in (self.members, self.members_since):
             counts.add(rows, member[rows], wrong[rows], audited[rows])
         failing = np.flatnonzero(counted & wrong)
-        last = self.last_wrong[failing]
-        newer = np.concatenate([last[..., 1:], self.n_reached[failing, :, None]], axis=-1)
+        last = self.last_wrong[:, failing]
+        newer = np.concatenate([last[1:], self.n_reached[None, failing]])
         reaches = score[failing, None] >= self.levels
-        self.last_wrong[failing] = np.where(reaches[..., None], newer, last)
+        self.last_wrong[:, failing] = np.where(reaches, newer, last)
         return member, counted
 
     def close(self, replays: Bools) -> None:
@@ -245,6 +253,7 @@ class Side:
         self.target[replays] = 0
         self.threshold[replays] = OUT_OF_REACH
         self.by_level.n[:, replays] = 0.0
+        self.level_capital[replays] = 0.0
         self.members_since.n[:, replays] = 0.0
 
 
