@@ -42,7 +42,6 @@ N_RECENT = 50  # newest outcomes of a level that are tested by themselves
 TAIL_PROBABILITY = 0.2  # at most, of the allowed number of errors among them at the tolerance
 CLOSED = 2.0  # a threshold that no score reaches
 OVERDRAFT = 1.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
-FEWEST_SINCE_ALARM = 25  # members from which on an account since an alarm is evidence
 FALSE_ALARMS = 100.0  # at the tolerance itself one alarm in 100 / alpha parts on average, or fewer
 NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
 FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1 / NOVEL_SHARE - 1
@@ -81,22 +80,6 @@ def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[fl
         wrong = math.log1p(scale * (tolerance - 1.0))
         steps += [good, wrong - good]
     return steps
-
-
-def log_likelihood_steps(tolerance: float) -> list[float]:
-    """Return what outcomes add to the log likelihood ratio of the tolerance to its double.
-
-    If the tolerance is doubled, the ratio of a sequence of parts ever reaches 1 / alpha with a
-    probability of at most alpha, by Ville's inequality.
-
-    Returns
-    -------
-    list of 4 floats
-        As of `log_capital_steps`; all outcomes are known, so an audited part adds as a checked one.
-    """
-    doubled = min(2.0 * tolerance, 0.99)
-    good = math.log((1.0 - tolerance) / (1.0 - doubled))
-    return [good, math.log(tolerance / doubled) - good] * 2
 
 
 def weighted_sum(counts: list[int], weights: list[float]) -> float:
@@ -180,22 +163,25 @@ class MemberEvidence(nn.Module):
         self.max_recent_errors = [max_recent_errors(tolerance) for tolerance in tolerances]
         # What each kind of part adds to the evidence for a level (see `log_capital_steps`), how
         # much is enough, and the same of the evidence for recovery, the members since an alarm.
-        enough = math.log(1.0 / alpha)
+        self.recovery_minimum = math.log(1.0 / alpha)
         self.level_steps = [log_capital_steps(t, inclusion_probability) for t in tolerances]
-        self.level_minimum = [enough, enough]
+        self.level_minimum = [self.recovery_minimum] * 2
         self.recovery_steps = self.level_steps
-        self.recovery_minimum = enough
-        self.fewest_since_alarm = 0
+        self.fewest_since_alarm = 0.0
         if self.is_watched:
-            self.recovery_steps = [log_likelihood_steps(tolerance) for tolerance in tolerances]
+            # Of the log likelihood ratio of the tolerance to its double. If the share of wrong
+            # parts is doubled, it ever reaches log(1 / alpha) with a probability of at most alpha.
+            right_steps = [math.log((1.0 - t) / (1.0 - 2.0 * t)) for t in tolerances]
+            self.recovery_steps = [[step, -math.log(2.0) - step] * 2 for step in right_steps]
         elif kind == "priced":
-            q = inclusion_probability
-            self.level_steps = self.recovery_steps = [
-                [tolerance, -1.0, tolerance / q, -1.0 / q] for tolerance in tolerances
+            self.level_steps = [
+                [t, -1.0, t / inclusion_probability, -1.0 / inclusion_probability]
+                for t in tolerances
             ]
+            self.recovery_steps = self.level_steps
             self.level_minimum = [-OVERDRAFT, 0.0]
             self.recovery_minimum = 0.0
-            self.fewest_since_alarm = FEWEST_SINCE_ALARM
+            self.fewest_since_alarm = 25.0  # an account over fewer says little
         # Of a detector, what a wrong part adds, where a right one takes 1, and the alarm's limit.
         detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (*tolerances, NOVEL_SHARE)]
         self.error_steps = [float(step) for step, _ in detectors]
@@ -365,17 +351,17 @@ class MemberEvidence(nn.Module):
         the strictest level. The threshold is the target's score if such a level was found, the
         members of all time pass, and those since an alarm show recovery; else it is `CLOSED`. The
         watched rule has no target: its threshold stays, and after an alarm is the first level again
-        once the parts since then show recovery.
+        once the members since then show recovery.
         """
-        levels: list[list[int]] = self.level_counts_since_alarm[side].flatten(1).tolist()
+        is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it
-            closed = float(self.thresholds[side].item()) >= self.closed
-            if closed and self.shows_recovery(side, levels[0]):
+            if is_recovered and float(self.thresholds[side].item()) >= self.closed:
                 # Assigned to an element, a float of TorchScript would go through float32.
                 self.thresholds[side].fill_(self.levels[side][0])
             return
         members: list[int] = self.member_counts[side].flatten().tolist()
         since: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
+        levels: list[list[int]] = self.level_counts_since_alarm[side].flatten(1).tolist()
         n_wrong: list[int] = self.recent_errors[side].sum(1).tolist()
         target = len(n_wrong) - 1
         while target >= 0:
@@ -384,9 +370,8 @@ class MemberEvidence(nn.Module):
                 break
             target -= 1
         self.target_level[side].fill_(max(0, target))
-        after_alarm = since != members or int(self.safe_mode.item()) != 0
-        opens = target >= 0 and self.allows_more(side, members)
-        opens = opens and (not after_alarm or self.shows_recovery(side, since))
+        may_open = is_recovered or (since == members and int(self.safe_mode.item()) == 0)
+        opens = target >= 0 and may_open and self.allows_more(side, members)
         self.thresholds[side].fill_(self.levels[side][target] if opens else self.closed)
 
     def allows_more(self, side: int, counts: list[int]) -> bool:
@@ -396,11 +381,14 @@ class MemberEvidence(nn.Module):
         """
         return weighted_sum(counts, self.level_steps[side]) >= self.level_minimum[side]
 
-    def shows_recovery(self, side: int, counts: list[int]) -> bool:
-        """Return whether parts since an alarm are evidence enough to open the side again.
+    def members_to_recovery(self, side: int) -> float:
+        """Return how many more members since the alarm recovery takes, if they go on like now.
 
-        `counts` is as of `allows_more`.
+        It is 0 or less if they show recovery, so that the side may open again, and beyond all
+        bounds if their evidence does not grow.
         """
-        if counts[0] + counts[2] < self.fewest_since_alarm:
-            return False
-        return weighted_sum(counts, self.recovery_steps[side]) >= self.recovery_minimum
+        counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
+        n = counts[0] + counts[2]
+        evidence = weighted_sum(counts, self.recovery_steps[side])
+        missing = (self.recovery_minimum - evidence) * (n + 1)
+        return max(self.fewest_since_alarm - n, missing / max(evidence, 1e-12))

@@ -361,3 +361,21 @@ def test_after_safe_mode_each_side_opens_by_its_own_evidence(first: int) -> None
     assert rule.action(*[(0.95, 1.0), (0.0, 0.02)][1 - first]) == VERIFY
     shown[1 - first](100)
     assert (rule.action(0.95, 1.0), rule.action(0.0, 0.02), rule.safe_mode()) == (ACCEPT, REJECT, 0)
+
+
+@pytest.mark.parametrize("kind", ["watched", "pooled", "priced"])
+def test_what_is_missing_to_the_end_of_a_safe_mode_is_about_what_it_takes(kind: str) -> None:
+    rule = {"watched": WatchedRule(0.1, 0.9), "pooled": pooled(), "priced": priced()}[kind]
+    rule.start_in_safe_mode(1)
+    assert rule.evidence.members_to_recovery(0) > 20
+    tell(rule, 0.99, *[True] * 10)
+    n_missing = rule.evidence.members_to_recovery(0)
+    n = 0
+    while rule.safe_mode() != 0:
+        tell(rule, 0.99, True)
+        n += 1
+    assert n_missing == pytest.approx(n, abs=5)
+    assert rule.evidence.members_to_recovery(0) <= 0.0
+    rule.start_in_safe_mode(1)
+    tell(rule, 0.99, *[False] * 5)
+    assert rule.evidence.members_to_recovery(0) > 1e6  # it does not grow
