@@ -40,7 +40,8 @@ FAULTS = (
     Case("pooled", "sly", "audited", fault="unweighted"),
 )
 N_REPLAYS = 2500  # of a piece
-ADAPTIVE = ("adversary", "sly")  # their parts depend on the rule, so that no bet is the perfect one
+# Streams without a perfect bet: their parts depend on the rule, or are no better than the tolerance.
+WITHOUT_BET = ("adversary", "sly", "at the tolerance")
 MARGIN = 0.01  # of the upper end of the interval
 Z = 1.959964
 
@@ -66,7 +67,7 @@ def wilson(k: float, n: float) -> tuple[float, float]:
     p = k / n
     middle = (p + Z**2 / (2 * n)) / (1 + Z**2 / n)
     half = Z / (1 + Z**2 / n) * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    return round(max(0.0, middle - half), 6), round(min(1.0, middle + half), 6)
 
 
 def verdict(k: float, n: float, allowed: float) -> str:
@@ -102,7 +103,7 @@ def summarize(case: Case, pieces: list[dict[str, float]]) -> dict[str, Any]:
     _, high = wilson(total["certificate_broke"], n)
     row |= {
         "accepted": total["accepted"] / n,
-        "a perfect bet": None if case.stream in ADAPTIVE else total["perfect"] / n,
+        "a perfect bet": None if case.stream in WITHOUT_BET else total["perfect"] / n,
         "account above 1": total["over_account"] / n if case.rule == "cost" else None,
         "certificate broke": total["certificate_broke"] / n,
         "certificate, high": high,
