@@ -19,7 +19,9 @@ them, in units of one false accept, and opens a level while the balance is at le
 
 *Safe mode.* A mean over all members reacts late to drift. So CUSUM detectors (`certificate.cusum`)
 watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm every
-part is verified until the members decided since the alarm show again that the tolerance is kept.
+part is verified until the members since the alarm show recovery: under the pooled rule by the bet,
+under the priced rule by the account, and under the watched rule by the likelihood ratio of the
+detector's two hypotheses, the tolerance and twice the tolerance.
 """
 
 import math
@@ -155,18 +157,31 @@ class MemberEvidence(nn.Module):
         super().__init__()
         self.levels = levels
         self.is_watched = kind == "watched"
-        self.is_priced = kind == "priced"
         self.inclusion_probability = inclusion_probability
         self.n_recent = N_RECENT
         self.closed = CLOSED
         self.max_recent_errors = [max_recent_errors(tolerance) for tolerance in tolerances]
-        # Of the bet and of the account, what each kind of part adds; see `log_capital_steps`.
-        self.required_log_capital = math.log(1.0 / alpha)
-        self.capital_steps = [log_capital_steps(t, inclusion_probability) for t in tolerances]
-        self.required_balance = [-OVERDRAFT, 0.0]
-        self.balance_steps = [
-            [t, -1.0, t / inclusion_probability, -1.0 / inclusion_probability] for t in tolerances
-        ]
+        # What each kind of part adds to the evidence for a level (see `log_capital_steps`), how
+        # much is enough, and the same of the evidence for recovery, the members since an alarm.
+        self.recovery_minimum = math.log(1.0 / alpha)
+        self.level_steps = [log_capital_steps(t, inclusion_probability) for t in tolerances]
+        self.level_minimum = [self.recovery_minimum] * 2
+        self.recovery_steps = self.level_steps
+        self.fewest_since_alarm = 0.0
+        if self.is_watched:
+            # Of the log likelihood ratio of the tolerance to its double. If the share of wrong
+            # parts is doubled, it ever reaches log(1 / alpha) with a probability of at most alpha.
+            right_steps = [math.log((1.0 - t) / (1.0 - 2.0 * t)) for t in tolerances]
+            self.recovery_steps = [[step, -math.log(2.0) - step] * 2 for step in right_steps]
+        elif kind == "priced":
+            self.level_steps = [
+                [t, -1.0, t / inclusion_probability, -1.0 / inclusion_probability]
+                for t in tolerances
+            ]
+            self.recovery_steps = self.level_steps
+            self.level_minimum = [-OVERDRAFT, 0.0]
+            self.recovery_minimum = 0.0
+            self.fewest_since_alarm = 25.0  # an account over fewer says little
         # Of a detector, what a wrong part adds, where a right one takes 1, and the alarm's limit.
         detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (*tolerances, NOVEL_SHARE)]
         self.error_steps = [float(step) for step, _ in detectors]
@@ -315,7 +330,7 @@ class MemberEvidence(nn.Module):
                 self.start_safe_mode(min(safe_mode, detector + 1))
 
     def start_safe_mode(self, safe_mode: int) -> None:
-        """Close both sides until the members from now on show that the tolerance is kept.
+        """Close both sides until the members from now on show recovery.
 
         `safe_mode` is the position of the reason in `SAFE_MODES`. The detectors and the counts
         since the last alarm restart at 0, and the target is the strictest level again. The counts
@@ -334,19 +349,19 @@ class MemberEvidence(nn.Module):
         The target is the lowest level whose parts since the last alarm pass the bet (or, under the
         priced rule, the account) and whose newest parts have few errors; if there is none, it is
         the strictest level. The threshold is the target's score if such a level was found, the
-        members of all time pass, and those since an alarm pass the bet; else it is `CLOSED`. The
+        members of all time pass, and those since an alarm show recovery; else it is `CLOSED`. The
         watched rule has no target: its threshold stays, and after an alarm is the first level again
-        once the parts since then pass the bet.
+        once the members since then show recovery.
         """
-        levels: list[list[int]] = self.level_counts_since_alarm[side].flatten(1).tolist()
+        is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it
-            closed = float(self.thresholds[side].item()) >= self.closed
-            if closed and self.keeps_tolerance(side, levels[0]):
+            if is_recovered and float(self.thresholds[side].item()) >= self.closed:
                 # Assigned to an element, a float of TorchScript would go through float32.
                 self.thresholds[side].fill_(self.levels[side][0])
             return
         members: list[int] = self.member_counts[side].flatten().tolist()
         since: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
+        levels: list[list[int]] = self.level_counts_since_alarm[side].flatten(1).tolist()
         n_wrong: list[int] = self.recent_errors[side].sum(1).tolist()
         target = len(n_wrong) - 1
         while target >= 0:
@@ -355,24 +370,25 @@ class MemberEvidence(nn.Module):
                 break
             target -= 1
         self.target_level[side].fill_(max(0, target))
-        after_alarm = since != members or int(self.safe_mode.item()) != 0
-        opens = target >= 0 and self.allows_more(side, members)
-        opens = opens and (not after_alarm or self.keeps_tolerance(side, since))
+        may_open = is_recovered or (since == members and int(self.safe_mode.item()) == 0)
+        opens = target >= 0 and may_open and self.allows_more(side, members)
         self.thresholds[side].fill_(self.levels[side][target] if opens else self.closed)
 
     def allows_more(self, side: int, counts: list[int]) -> bool:
         """Return whether counts allow more parts of their kind, by the bet or by the account.
 
-        `counts` holds checked parts, wrong ones of these, audited parts, wrong ones of these. The
-        priced rule asks the account, which must not be overdrawn; the others ask the bet.
-        """
-        if self.is_priced:
-            return weighted_sum(counts, self.balance_steps[side]) >= self.required_balance[side]
-        return self.keeps_tolerance(side, counts)
-
-    def keeps_tolerance(self, side: int, counts: list[int]) -> bool:
-        """Return whether the bet shows, at level alpha, that these parts keep the side's tolerance.
-
         `counts` holds checked parts, wrong ones of these, audited parts, wrong ones of these.
         """
-        return weighted_sum(counts, self.capital_steps[side]) >= self.required_log_capital
+        return weighted_sum(counts, self.level_steps[side]) >= self.level_minimum[side]
+
+    def members_to_recovery(self, side: int) -> float:
+        """Return how many more members since the alarm recovery takes, if they go on like now.
+
+        It is 0 or less if they show recovery, so that the side may open again, and beyond all
+        bounds if their evidence does not grow.
+        """
+        counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
+        n = counts[0] + counts[2]
+        evidence = weighted_sum(counts, self.recovery_steps[side])
+        missing = (self.recovery_minimum - evidence) * (n + 1)
+        return max(self.fewest_since_alarm - n, missing / max(evidence, 1e-12))

@@ -495,8 +495,8 @@ def needed_parts(policy: Policy) -> int:
         return 1 + bisect_left(counts, level, key=lambda n: float(policy.bound(n, 0)[0]))
     if policy.guarantee == "pooled":
         evidence: Any = policy.rule().evidence
-        steps: list[float] = evidence.capital_steps[0]
-        return math.ceil(float(evidence.required_log_capital) / steps[0])
+        steps: list[float] = evidence.level_steps[0]
+        return math.ceil(float(evidence.level_minimum[0]) / steps[0])
     return 0
 
 

@@ -57,6 +57,7 @@ MAX_LAST = 10**9  # decisions that can be asked for
 Counts = dict[str, int]  # by name
 NEWEST = 500  # decisions that `Status.newest` counts
 MAX_DROPPED = 3  # dropped retrains in a row that are an alarm: the first may lack labels
+MAX_SINCE_ALARM = 10_000  # decisions that are counted
 N_EVENTS = 5  # newest events that a status shows
 
 
@@ -154,8 +155,19 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """How close each detector of drift is to an alarm, which begins safe mode: from 0 to 1."""
+    """How close each detector of drift is to an alarm, and a safe mode to its end.
 
+    Attributes
+    ----------
+    recovery : str
+        In safe mode, what its evidence for an end is, and about how many parts are missing if
+        everything goes on like since the alarm; "" outside. After too many novel traces it is about
+        accepting.
+    accepts, rejects, novelty : float
+        From 0 to 1, which is the alarm that begins safe mode.
+    """
+
+    recovery: str
     accepts: float
     rejects: float
     novelty: float
@@ -404,7 +416,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         certificate=policy.certificate(in_force.outcomes),
         retrains=tuple(retrains),
         events=tuple(events[-N_EVENTS:]),
-        watch=read_watch(store, recipe) if watching else None,
+        watch=read_watch(store, recipe, mode) if watching else None,
         loss=" ".join(["Data was lost:", *losses, LOSS_REMEDY]) if losses else "",
         **{name: counts[name] for name in COUNTED},
     )
@@ -543,25 +555,39 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     return replace(audited, lower=lower, upper=upper, verdict=_verdict(lower, upper, tolerance))
 
 
-def read_watch(store: SqlStore, recipe: Recipe) -> Watch | None:
+def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | None:
     """Return how close the detectors of drift are to an alarm, by the rule as it is now.
 
-    Each value is from 0 to 1, which is the alarm. The rule is the stored one, updated with all
-    outcomes since. None if the rule has no detectors, as "local" with stops="some", or cannot be
-    restored. In a safe mode that novel traces began, each is 0.
+    The rule is the stored one, updated with all outcomes since. None if the rule has no detectors,
+    as "local" with stops="some", or cannot be restored. In a safe mode that novel traces began,
+    the detectors are at 0. `mode` is the newest event at which a safe mode began or ended.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule
 
-    if recipe.policy.guarantee == "local" and recipe.policy.stops != "all":
+    policy = recipe.policy
+    if (policy.guarantee, policy.stops) == ("local", "some"):
         return None
-    rule = load_rule(store, recipe.policy)
+    rule = load_rule(store, policy)
     if not isinstance(rule, MemberRule):
         return None
-    limits = rule.evidence.alarm_limits
-    mode = rule.safe_mode()
-    sums = [0.0 if mode == 3 else total for total in rule.evidence.detector_sums.tolist()]
-    return Watch(*(max(0.0, total / limit) for total, limit in zip(sums, limits, strict=True)))
+    evidence = rule.evidence
+    safe_mode = rule.safe_mode()
+    recovery = ""
+    if safe_mode and mode is not None:
+        side = (safe_mode - 1) % 2
+        n, n_wrong = evidence.member_counts_since_alarm[side].sum(0).tolist()
+        # With the part that raised the alarm.
+        n_parts = 1 + len(store.decisions(HistoryFilter(since=mode.time), MAX_SINCE_ALARM))
+        n_more = evidence.members_to_recovery(side) * n_parts / (n + 1)
+        end = f"like this it ends after about {n_more:.0f} more"
+        if n_more <= 0.0:
+            end = "enough, it ends when few of the newest are wrong or novel"
+        elif n_more > MAX_SINCE_ALARM:
+            end = "like this it does not end"
+        recovery = f"{n} of {n_parts} parts since the alarm are evidence, {n_wrong} wrong: {end}"
+    sums = zip(evidence.detector_sums.tolist(), evidence.alarm_limits, strict=True)
+    return Watch(recovery, *(max(0.0, total / limit) * (safe_mode != 3) for total, limit in sums))
 
 
 @dataclass(frozen=True, slots=True)

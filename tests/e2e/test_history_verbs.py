@@ -140,7 +140,7 @@ def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
     assert newest["quarantined"] == ever["quarantined"] == 1
     assert newest["retrains"] < ever["retrains"] == len(result["retrains"])
     assert result["last"] == 200
-    assert set(result["watch"]) == {"accepts", "rejects", "novelty"}
+    assert set(result["watch"]) == {"recovery", "accepts", "rejects", "novelty"}
     assert 0 <= result["new_labels"] <= result["recipe"]["retrain_every"] == 50
 
 

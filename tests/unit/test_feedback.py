@@ -2,6 +2,7 @@
 certificate.
 """
 
+import re
 import shutil
 import sqlite3
 import time
@@ -427,12 +428,19 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
     assert sum(c.decision.action is Action.ACCEPT for c in cycles) <= 7
     assert {c.decision.action for c in cycles[first + 1 :]} == {Action.VERIFY}
     assert Reason.SAFE_MODE in {c.decision.reason for c in cycles[first + 1 :]}
+    recovery = engine.status(watching=True).watch.recovery
+    n_parts = len(cycles) - first  # with the part that raised the alarm
+    assert re.fullmatch(
+        rf"\d+ of {n_parts} parts since the alarm are evidence, \d+ wrong: like this it does not end",
+        recovery,
+    )
     play(engine, make_data(1500, samples=60, seed=9))  # more than the bad ones, which are learned
     assert (engine.safe_mode, heard[-1], engine.store.events()[-1].kind) == (
         "",
         "",
         "safe mode ended",
     )
+    assert engine.status(watching=True).watch.recovery == ""
 
 
 def test_traces_of_one_part_share_a_fold_whatever_they_look_like(stream: Dataset) -> None:

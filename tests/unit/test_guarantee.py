@@ -132,7 +132,7 @@ def test_an_adversary_who_sees_the_levels_makes_a_false_claim_no_more_often_than
         choose_threshold(self, side)
         target = int(self.target_level[side])
         counts = self.level_counts_since_alarm[side, target].flatten().tolist()
-        if self.keeps_tolerance(side, counts):
+        if self.allows_more(side, counts):
             self.thresholds[side].fill_(self.levels[side][target])
 
     choose_threshold = MemberEvidence.choose_threshold
@@ -193,18 +193,35 @@ def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_th
     assert rule.action(1.0, 1.0) == VERIFY
 
 
-def test_after_an_alarm_costs_alone_let_nothing_pass_until_fresh_members_show_that_it_pays() -> (
+def test_after_an_alarm_costs_open_when_the_account_since_then_is_even_over_25_members_or_more() -> (
     None
 ):
     rule = priced()
-    tell(rule, 1.0, *[True] * 400, *[False] * 12)
+    tell(rule, 1.0, *[True] * 400)
+    n_bad = 0
+    while rule.safe_mode() == 0:
+        tell(rule, 1.0, False)
+        n_bad += 1
+    assert (400 + n_bad) * 5 > n_bad * 120  # by the account of all members it could go on
+    tell(rule, 1.0, *[True] * 23)
     assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (1, VERIFY)
-    assert (400 + 12) * 5 > 12 * 120  # by the account alone it could go on
-    n = 0
-    while rule.action(1.0, 1.0) == VERIFY:
-        tell(rule, 1.0, True)
-        n += 1
-    assert n >= enough(0.1, 5 / 120)
+    tell(rule, 1.0, *[True] * N_RECENT)  # and the newest of the level hold few bad ones again
+    assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (0, ACCEPT)
+
+
+def test_a_doubled_share_of_bad_parts_ends_a_safe_mode_of_the_local_rule_in_at_most_alpha() -> None:
+    n_ended = {0.1: 0, 0.2: 0}
+    for rate in n_ended:
+        for seed in range(40):
+            rule = WatchedRule(0.1, 0.9)
+            rule.start_in_safe_mode(1)
+            for bad in np.random.default_rng(seed).random(250) < rate:
+                tell(rule, 0.95, not bad)
+                if rule.safe_mode() == 0:
+                    n_ended[rate] += 1
+                    break
+    assert n_ended[0.1] >= 38  # at the tolerance it ends
+    assert stats.binomtest(n_ended[0.2], 40, 0.1, alternative="greater").pvalue > 1e-3
 
 
 @pytest.mark.parametrize(
@@ -244,7 +261,9 @@ def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts_and_verified
         assert rule.action(0.0, 0.0) == VERIFY
         tell(rule, 0.95, True)
         fresh += 1
-    assert fresh >= enough(0.1, 0.1)  # what was known before the alarm does not count
+    likely = math.log(10) / math.log(0.9 / 0.8)  # by the ratio to twice the tolerance
+    # What was known before the alarm does not count.
+    assert fresh >= (likely if kind is WatchedRule else enough(0.1, 0.1))
     assert rule.action(0.95, 1.0) == ACCEPT
 
 
@@ -342,3 +361,21 @@ def test_after_safe_mode_each_side_opens_by_its_own_evidence(first: int) -> None
     assert rule.action(*[(0.95, 1.0), (0.0, 0.02)][1 - first]) == VERIFY
     shown[1 - first](100)
     assert (rule.action(0.95, 1.0), rule.action(0.0, 0.02), rule.safe_mode()) == (ACCEPT, REJECT, 0)
+
+
+@pytest.mark.parametrize("kind", ["watched", "pooled", "priced"])
+def test_what_is_missing_to_the_end_of_a_safe_mode_is_about_what_it_takes(kind: str) -> None:
+    rule = {"watched": WatchedRule(0.1, 0.9), "pooled": pooled(), "priced": priced()}[kind]
+    rule.start_in_safe_mode(1)
+    assert rule.evidence.members_to_recovery(0) > 20
+    tell(rule, 0.99, *[True] * 10)
+    n_missing = rule.evidence.members_to_recovery(0)
+    n = 0
+    while rule.safe_mode() != 0:
+        tell(rule, 0.99, True)
+        n += 1
+    assert n_missing == pytest.approx(n, abs=5)
+    assert rule.evidence.members_to_recovery(0) <= 0.0
+    rule.start_in_safe_mode(1)
+    tell(rule, 0.99, *[False] * 5)
+    assert rule.evidence.members_to_recovery(0) > 1e6  # it does not grow

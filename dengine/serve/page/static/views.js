@@ -218,6 +218,7 @@ async function overview(get, query, status) {
   const drift = status.watch
     ? [["accepts", "bad among the accepted"], ["rejects", "good among the rejected"], ["novelty", "novel parts"]].map(([name, title]) => el("p", { class: "watched" },
       el("label", { for: `watch-${name}` }, title), el("meter", { id: `watch-${name}`, min: 0, max: 1, high: 0.5, value: Math.min(1, status.watch[name]) }), percent(status.watch[name])))
+      .concat(status.watch.recovery ? [small(`Safe mode: ${status.watch.recovery}.`)] : [])
     : [big("–"), small("Not watched under this policy.")];
   const tiles = [
     status.shadow && wouldHave(status), badAccepts(status), verified(status), accepted(status), pace(decisions), saved(status),

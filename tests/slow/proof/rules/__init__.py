@@ -1,0 +1,1 @@
+"""The proof of the rules without a network: a second implementation plays thousands of replays."""

@@ -1,0 +1,164 @@
+"""The proof of the rules: 10,000 replays of each stream, without a network.
+
+    python -m tests.slow.proof.rules --out out/rules
+
+Finished pieces are kept in --out, so that an interrupted run continues. Writes rules_proof.csv, one
+row for each case, into the folder that --docs names, by default --out.
+"""
+
+import argparse
+import hashlib
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from joblib import Memory, Parallel, delayed
+
+from .implementation import ENDINGS
+from .replays import ALPHA, OUTCOMES, Case, play
+
+PLAYED = (
+    "informative",
+    "useless",
+    "overconfident",
+    "drifting",
+    "alternating",
+    "snooped",
+    "adversary",
+    "sly",
+    "tied",
+    "constant",
+    "constant, good",
+)
+MAIN_OUTCOMES = ("all", "audited, late, missing")
+EVERY_OUTCOME = ("informative", "snooped", "adversary", "constant")  # the others have the main ones
+FAULTS = (
+    Case("pooled", "peeking", fault="peeks"),
+    Case("pooled", "overconfident", fault="moves"),
+    Case("pooled", "sly", "audited", fault="unweighted"),
+)
+N_REPLAYS = 2500  # of a piece
+# Streams without a perfect bet: their parts depend on the rule, or are no better than the tolerance.
+WITHOUT_BET = ("adversary", "sly", "at the tolerance")
+MARGIN = 0.01  # of the upper end of the interval
+Z = 1.959964
+
+
+def all_cases() -> Iterator[Case]:
+    """Return every row: the promises, the faults, and the ends of a safe mode."""
+    for rule in ("pooled", "cost", "local"):
+        for stream in PLAYED:
+            for outcomes, (is_audited, _, _) in OUTCOMES.items():
+                is_played = stream in EVERY_OUTCOME or outcomes in MAIN_OUTCOMES
+                if is_played and (rule != "local" or not is_audited):
+                    yield Case(rule, stream, outcomes)
+    yield from FAULTS
+    for rule in ("local", "cost", "pooled"):
+        endings = {ENDINGS[rule], "bet"} if rule != "local" else set(ENDINGS.values())
+        for ending in sorted(endings):
+            for stream in ("constant, good", "at the tolerance", "doubling"):
+                yield Case(rule, stream, ending=ending, n_parts=1500)
+
+
+def wilson(k: float, n: float) -> tuple[float, float]:
+    """Return the 95 % interval of a share."""
+    p = k / n
+    middle = (p + Z**2 / (2 * n)) / (1 + Z**2 / n)
+    half = Z / (1 + Z**2 / n) * math.sqrt(p * (1 - p) / n + Z**2 / (4 * n**2))
+    return round(max(0.0, middle - half), 6), round(min(1.0, middle + half), 6)
+
+
+def verdict(k: float, n: float, allowed: float) -> str:
+    """Return "kept", "BROKEN" or "open", by the whole interval of the share that broke."""
+    low, high = wilson(k, n)
+    if low > allowed and k:
+        return "BROKEN"
+    return "kept" if high <= allowed + MARGIN else "open"
+
+
+def summarize(case: Case, pieces: list[dict[str, float]]) -> dict[str, Any]:
+    """Return the row of a case."""
+    total = {name: sum(piece[name] for piece in pieces) for name in pieces[0]}
+    n = total["replays"]
+    row: dict[str, Any] = {
+        "rule": case.rule,
+        "stream": case.stream,
+        "outcomes": case.outcomes,
+        "fault": case.fault,
+        "safe mode ends by": case.ending or ENDINGS[case.rule],
+        "replays": int(n),
+        "parts": case.n_parts,
+    }
+    if case.allowed is not None:
+        low, high = wilson(total["broke"], n)
+        row |= {
+            "broke": total["broke"] / n,
+            "low": low,
+            "high": high,
+            "allowed": case.allowed,
+            "verdict": verdict(total["broke"], n, case.allowed),
+        }
+    _, high = wilson(total["certificate_broke"], n)
+    row |= {
+        "accepted": total["accepted"] / n,
+        "a perfect bet": None if case.stream in WITHOUT_BET else total["perfect"] / n,
+        "account above 1": total["over_account"] / n if case.rule == "cost" else None,
+        "certificate broke": total["certificate_broke"] / n,
+        "certificate, high": high,
+        "certificate": verdict(total["certificate_broke"], n, ALPHA),
+        "safe modes per 1,000 parts": 1000 * total["safe_modes"] / total["parts"],
+        "parts of a safe mode": total["safe_parts"] / max(1.0, total["safe_modes"]),
+        "replays with more than 300": total["long_safe_modes"] / n,
+    }
+    return row
+
+
+def digest_of_source() -> str:
+    """Return the SHA-256 of this folder's source, without this file."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        if path.name != "__main__.py":
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def play_piece(case: Case, n_replays: int, seed: int, source: str) -> dict[str, float]:
+    """Play one piece of a case; it is kept under all arguments."""
+    return play(case, n_replays, seed)
+
+
+def main() -> None:
+    """Play what is not kept yet, write the table, print its conclusion."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=Path("out/rules"), help="finished pieces")
+    parser.add_argument("--docs", type=Path, help="folder for rules_proof.csv; by default --out")
+    parser.add_argument("--pieces", type=int, default=4, help=f"of {N_REPLAYS:,} replays, per row")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    arguments = parser.parse_args()
+    cases = list(all_cases())
+    seeds = range(arguments.pieces)
+    run = Memory(arguments.out, verbose=0).cache(play_piece)
+    source = digest_of_source()
+    parallel = Parallel(n_jobs=arguments.jobs, return_as="generator", batch_size=1)
+    played = parallel(delayed(run)(case, N_REPLAYS, s, source) for case in cases for s in seeds)
+    rows = []
+    for case in cases:
+        rows.append(summarize(case, [next(played) for _ in seeds]))
+        print(f"[{len(rows)}/{len(cases)}]", *rows[-1].values(), flush=True)
+    table = pd.DataFrame(rows)
+    docs = arguments.docs or arguments.out
+    docs.mkdir(parents=True, exist_ok=True)
+    table.to_csv(docs / "rules_proof.csv", index=False, float_format="%.4g")
+    honest = table[(table["fault"] == "") & table["verdict"].notna()]
+    certificates = table[table["fault"] == ""]
+    print(f"{(honest['verdict'] == 'kept').sum()} of {len(honest)} promises kept;")
+    print(f"{(certificates['certificate'] == 'kept').sum()} of {len(certificates)} certificates.")
+    print("Planted faults:", *table["verdict"][table["fault"] != ""])
+
+
+if __name__ == "__main__":
+    main()
