@@ -30,9 +30,10 @@ import urllib.request
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import blake2b
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,7 @@ def decode_record(blob: bytes) -> Record:
         return from_row(Event, row)
 
 
-@dataclass(slots=True)
+@dataclass
 class Head:
     """What the small file beside a journal says; by default that of an earlier release.
 
@@ -160,6 +161,7 @@ class Journal:
         self.loss = ""
         self.head = read_head(path)
         self.entries: list[tuple[int, str]] = []
+        self._head_file: FileIO | None = None  # opened when it is written first
         # Guards what header and head hold: two threads write them.
         self._describing = threading.RLock()
         self._owning = owning
@@ -281,10 +283,13 @@ class Journal:
 
     def _write_head(self) -> None:
         """Write the head as this journal now is, without a sync; a failure is ignored."""
-        path = head_path(self.path)
-        # An older head is harmless.
-        with suppress(OSError), os.fdopen(open_plain(path, os.O_WRONLY | os.O_CREAT), "wb") as head:
-            head.write(_pack_fields(asdict(self.head)).ljust(HEADER))
+        # An older head is harmless. The file stays open, since each report writes it.
+        with suppress(OSError, ValueError):  # ValueError: closed by another thread meanwhile
+            if self._head_file is None:
+                descriptor = open_plain(head_path(self.path), os.O_WRONLY | os.O_CREAT)
+                self._head_file = os.fdopen(descriptor, "wb", buffering=0)
+            self._head_file.seek(0)
+            self._head_file.write(_pack_fields(vars(self.head)).ljust(HEADER))
 
     def clear(self) -> None:
         """Remove all records, drained or not; the caller has made sure that the store holds them.
@@ -343,6 +348,9 @@ class Journal:
                     self._file.sync()  # the header, or a disk might keep the cut without it
                     self.end = HEADER
                 self._file.truncate(self.end)
+        if self._head_file is not None:
+            self._head_file.close()
+            self._head_file = None
         self._file.close()
 
     def _write_header(self) -> None:
