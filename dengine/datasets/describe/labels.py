@@ -48,11 +48,12 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
+FOLDER = "([^/]+)/[^/]*$"  # of a recording
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
 Places = Mapping[str, Place]
-Words = Mapping[str, str]  # by recording
+Words = Mapping[Any, str]  # by recording
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -152,7 +153,7 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 def words_of(p: Proposal, source: LabelSource, places: Places, parts: Words) -> Words:
     """Return the word of each recording that has one in a source."""
     words = dict[str, str]()
-    with suppress(DataError):
+    with suppress(*([] if source == p.description.label else [DataError])):
         reader = read_labels(p.base, source, p.description.text)
         for name, place in places.items():
             with suppress(UnreadableError):
@@ -178,6 +179,9 @@ def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
     counted = dict[LabelSource, Words]()
     for source in [label] if is_stated else sources_of(p, paths):
         words = words_of(p, source, places, parts)
+        if is_stated and not words:
+            title = title_of(label, {}).removesuffix(" ()")
+            raise DataError(f"Expected the words of labels by {title}, no recording has one.")
         looked_at = places if source.listing or source.path else p.places
         if is_stated or len(words) > len(looked_at) / 2:
             counted[with_meanings(source, words.values())] = words
@@ -210,7 +214,7 @@ def propose_label(p: Proposal) -> None:
     chosen = [] if doubt else chosen
     best = chosen[0] if chosen else replace(p.description.label, column=UNKNOWN)
     checks = [source for source in chosen[1:] if counted[source].keys() >= counted[best].keys()]
-    p.description = replace(p.description, label=best, check=tuple(checks))
+    p.description = replace(p.description, label=best, check=p.description.check or tuple(checks))
     others = [title_of(source, words) for source, words in counted.items() if source != best]
     if chosen:
         counts = counts_of(counted[best].values())
@@ -231,6 +235,10 @@ def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
 
 
 def _few_words(p: Proposal) -> list[str]:
-    """Return the columns of few words that may be labels under other names."""
+    """Return the columns, and the folders, of few words that may be labels under other names."""
     few = [column for column in p.unused if 1 < len({*column.fixed}) <= MOST_WORDS]
-    return [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]
+    folders = [name.split("/")[-2] for name in p.names if "/" in name]
+    texts = [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]
+    if 1 < len({*folders}) <= MOST_WORDS:
+        texts.append(title_of(LabelSource(path=FOLDER), dict(enumerate(folders))))
+    return texts

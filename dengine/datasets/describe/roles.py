@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords
+from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
 from ..read.places import LabelReader
 from ..read.recordings import Reader
@@ -38,6 +38,10 @@ FORCES = (
 def propose_roles(p: Proposal) -> None:
     """Give each column a role, one after the other; what is stated stays."""
     p.columns = columns_of(p.tables, p.description.text)
+    about = p.description
+    channels = [channel.column for channel in about.channels]
+    for name in (*about.time.column, *about.part.column, *about.rows, *channels):
+        expect_one_of([*p.columns, UNKNOWN], name, "the columns")
     qualify_rows(p)
     propose_clock(p)
     if p.description.layout not in ("long", "columns"):

@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...errors import DataError, listed
+from ..dataset import Fault
 from ..description import UNKNOWN
+from ..read.files import caught
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
@@ -97,7 +99,7 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
     for encoding in [stated] if stated else encodings:
-        with suppress(UnicodeDecodeError):
+        with suppress(UnicodeError):
             text = codecs.getincrementaldecoder(encoding)().decode(content[:HEAD_BYTES])
             return encoding, text.removeprefix("\ufeff")
     return "", ""
@@ -142,10 +144,15 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     These have another delimiter, another number of columns, or no column in common with most. If
     several have samples, it is asked why.
     """
-    found = {name: look(content, p.stated) for name, content in contents.items()}
-    looks = {name: form for name, form in found.items() if form is not None}
+    looks = dict[str, Look]()
+    faults: list[Fault] = []
+    for name, content in contents.items():
+        with caught(faults, name):
+            if form := look(content, p.stated):
+                looks[name] = form
     if not looks:
-        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
+        why = f": {faults[0]}" if faults else ""
+        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none{why}.")
     lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
     usual = next(form for form in looks.values() if (form.width, form.line) == lines[0][0])
     odd = {name: form for name, form in looks.items() if not usual.is_like(form)}
@@ -158,7 +165,9 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 
 def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
     """Set the keys of `[text]` for files like one; a header may stand at another line in each."""
-    above = 0 if all(form.header == usual.header for form in same) else usual.header
+    is_text = isinstance(p.description.text.header, str)
+    is_same = all(form.header == usual.header for form in same) and not is_text
+    above = 0 if is_same else usual.header
     values = {
         "encoding": min({form.encoding for form in same} - {"utf-8"}, default="utf-8"),
         "delimiter": usual.delimiter,

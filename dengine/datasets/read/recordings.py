@@ -19,7 +19,7 @@ from ..checks import Fitted, check_description, finished_notes, without_repeats
 from ..dataset import Dataset, Fault
 from ..description import ANY, Channel, Description
 from ..table import Cells, Floats, Recording, Table, UnreadableError
-from ..units import conversion
+from ..units import bare, conversion, quantity_of, unit_in
 from . import frames
 from .bags import read_bag
 from .clock import check_steps, times_of
@@ -101,8 +101,10 @@ class Reader:
         """Return the samples of a channel in its unit, shape (n,)."""
         form, column = self.description.text, channel.column
         values = table.numbers(column, form)
+        own = unit_in(column.rstrip(ANY))
+        is_same = (quantity_of(own) or ("",))[0] == (quantity_of(bare(channel.unit)) or "?")[0]
         try:
-            factor = conversion(table.units.get(column, ""), channel.unit)
+            factor = conversion(table.units.get(column, "") or own * is_same, channel.unit)
         except DataError as error:
             line = form.units + table.header * isinstance(form.header, str)
             raise UnreadableError(str(error), line, column) from error

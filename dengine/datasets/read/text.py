@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...errors import instead
 from ..description import TextForm
 from ..table import Cells, Table, UnreadableError
 
@@ -103,10 +104,14 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of one line; a blank as delimiter stands for any run of blanks."""
+    """Return the cells of one line; a blank as delimiter stands for any run of blanks.
+
+    Raises UnreadableError for a cell that is too long.
+    """
     if delimiter == BLANK:
         return line.split()
-    return next(csv.reader([line], delimiter=delimiter), [])
+    with instead(UnreadableError, "Expected cells of at most 128 KB", csv.Error):
+        return next(csv.reader([line], delimiter=delimiter), [])
 
 
 def header_names(cells: Sequence[str]) -> list[str]:
