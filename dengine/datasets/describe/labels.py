@@ -32,17 +32,25 @@ NAME = re.compile(
     r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
     r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)([^a-z]|$)"
 )
-BAD_NAME = re.compile(
-    r"(?i)(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)"
-)
-GOOD_NAME = re.compile(
-    r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
-)
+BAD_WORDS = r"(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)"
+GOOD_WORDS = r"(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good)([^a-z]|$)"
+BAD_NAME, GOOD_NAME = (re.compile(f"(?i){words}") for words in (BAD_WORDS, GOOD_WORDS))
+BOTH_OR_NOT = re.compile(rf"(?i)(?=.*{BAD_WORDS}).*{GOOD_WORDS}|(^|[^a-z])(not?|nicht)([^a-z]|$)")
 # The words for good and for bad in a column of only YES and NO, by its name.
-MEANINGS = ((BAD_NAME, NO, YES), (GOOD_NAME, YES, NO), (re.compile(""), GOOD, BAD))
+MEANINGS = (
+    (BOTH_OR_NOT, (), ()),
+    (BAD_NAME, NO, YES),
+    (GOOD_NAME, YES, NO),
+    (re.compile(r"(?i)(^|.*\.)(label|y)$"), YES, NO),
+    (re.compile(r"(?i)(^|.*\.)(result|verdict|ergebnis|outcome|quality)$"), GOOD, BAD),
+    (re.compile(""), (), ()),
+)
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
-NEGATED = re.compile(rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})")
+NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
+    rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})"
+    r"|[a-z][-_ .=(/]+(true|false)(?![a-z])"
+)
 PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})/",
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",

@@ -169,12 +169,12 @@ def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
     is_same = all(form.header == usual.header for form in same) and not is_text
     above = 0 if is_same else usual.header
     values = {
-        "encoding": min({form.encoding for form in same} - {"utf-8"}, default="utf-8"),
+        "encoding": LATIN if LATIN in {form.encoding for form in same} else usual.encoding,
         "delimiter": usual.delimiter,
         "header": usual.line if above else usual.header,
         "units": usual.units and usual.units - above,
         "data": usual.data - above,
-        "names": _column_names(usual),
+        "names": [] if p.stated.get("text.header") else _column_names(usual),
     }
     for key, value in values.items():
         p.put(f"text.{key}", value)
