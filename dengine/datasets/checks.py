@@ -44,9 +44,6 @@ def check_description(description: Description) -> None:
             not clock.rate_hz or LEAST_RATE_HZ <= clock.rate_hz <= MOST_RATE_HZ
         ),
         "time.column, since the order is time": n_clocks or description.order != "time",
-        "another mark in text.thousands than in text.decimal": (
-            description.text.thousands != description.text.decimal
-        ),
         "one limit for all channels": len({c.limit for c in description.channels}) == 1,
         f"a format for each of {n_clocks} columns in [time]": (n_clocks in (0, len(clock.format))),
     }
@@ -64,7 +61,6 @@ def check_text(text: TextForm) -> None:
             [*map(len, marks)] == [1, 1]
         ),
         "text.data, the line of the first samples, of 1 or more": text.data > 0,
-        "text.header, a line or its beginning": isinstance(text.header, str) or text.header >= 0,
     }
     expect_all(wanted)
 

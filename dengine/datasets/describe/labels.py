@@ -34,15 +34,15 @@ NAME = re.compile(
 )
 BAD_WORDS = r"(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)"
 GOOD_WORDS = r"(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good)([^a-z]|$)"
-BAD_NAME, GOOD_NAME = (re.compile(f"(?i){words}") for words in (BAD_WORDS, GOOD_WORDS))
+BAD_NAME = re.compile(f"(?i){BAD_WORDS}")
+GOOD_NAME = re.compile(rf"(?i){GOOD_WORDS}|(^|\.)(label|y)$")
 BOTH_OR_NOT = re.compile(rf"(?i)(?=.*{BAD_WORDS}).*{GOOD_WORDS}|(^|[^a-z])(not?|nicht)([^a-z]|$)")
 # The words for good and for bad in a column of only YES and NO, by its name.
 MEANINGS = (
     (BOTH_OR_NOT, (), ()),
     (BAD_NAME, NO, YES),
     (GOOD_NAME, YES, NO),
-    (re.compile(r"(?i)(^|.*\.)(label|y)$"), YES, NO),
-    (re.compile(r"(?i)(^|.*\.)(result|verdict|ergebnis|outcome|quality)$"), GOOD, BAD),
+    (re.compile(r"(?i)(^|\.)(result|verdict|ergebnis|outcome|quality)$"), GOOD, BAD),
     (re.compile(""), (), ()),
 )
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
@@ -61,7 +61,7 @@ NO_LABEL = "none was found that is certain: state label.column, path, line or li
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
 Places = Mapping[str, Place]
-Words = Mapping[Any, str]  # by recording
+Words = Mapping[str, str]  # by recording
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
@@ -188,8 +188,7 @@ def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
     for source in [label] if is_stated else sources_of(p, paths):
         words = words_of(p, source, places, parts)
         if is_stated and not words:
-            title = title_of(label, {}).removesuffix(" ()")
-            raise DataError(f"Expected the words of labels by {title}, no recording has one.")
+            raise DataError("Expected words where [label] says they stand, found none.")
         looked_at = places if source.listing or source.path else p.places
         if is_stated or len(words) > len(looked_at) / 2:
             counted[with_meanings(source, words.values())] = words
@@ -244,9 +243,10 @@ def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
 
 def _few_words(p: Proposal) -> list[str]:
     """Return the columns, and the folders, of few words that may be labels under other names."""
-    few = [column for column in p.unused if 1 < len({*column.fixed}) <= MOST_WORDS]
-    folders = [name.split("/")[-2] for name in p.names if "/" in name]
-    texts = [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]
-    if 1 < len({*folders}) <= MOST_WORDS:
-        texts.append(title_of(LabelSource(path=FOLDER), dict(enumerate(folders))))
-    return texts
+    few = {column.name: column.fixed for column in p.unused}
+    few[f"label.path={FOLDER}"] = [name.split("/")[-2] for name in p.names if "/" in name]
+    return [
+        f"{name} has few words ({counts_of(words)})"
+        for name, words in few.items()
+        if 1 < len({*words}) <= MOST_WORDS
+    ]

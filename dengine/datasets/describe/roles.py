@@ -38,9 +38,8 @@ FORCES = (
 def propose_roles(p: Proposal) -> None:
     """Give each column a role, one after the other; what is stated stays."""
     p.columns = columns_of(p.tables, p.description.text)
-    about = p.description
-    channels = [channel.column for channel in about.channels]
-    for name in (*about.time.column, *about.part.column, *about.rows, *channels):
+    channels = (channel.column for channel in p.description.channels)
+    for name in (*p.description.time.column, *channels):
         expect_one_of([*p.columns, UNKNOWN], name, "the columns")
     qualify_rows(p)
     propose_clock(p)

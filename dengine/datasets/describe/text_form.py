@@ -13,9 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...errors import DataError, listed
-from ..dataset import Fault
 from ..description import UNKNOWN
-from ..read.files import caught
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
@@ -144,15 +142,10 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     These have another delimiter, another number of columns, or no column in common with most. If
     several have samples, it is asked why.
     """
-    looks = dict[str, Look]()
-    faults: list[Fault] = []
-    for name, content in contents.items():
-        with caught(faults, name):
-            if form := look(content, p.stated):
-                looks[name] = form
+    found = {name: look(content, p.stated) for name, content in contents.items()}
+    looks = {name: form for name, form in found.items() if form is not None}
     if not looks:
-        why = f": {faults[0]}" if faults else ""
-        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none{why}.")
+        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
     lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
     usual = next(form for form in looks.values() if (form.width, form.line) == lines[0][0])
     odd = {name: form for name, form in looks.items() if not usual.is_like(form)}

@@ -104,8 +104,7 @@ def in_listing(name: str) -> Iterator[None]:
     try:
         yield
     except UnreadableError as error:
-        where = f"line {error.line} of the listing" if error.line else "the listing"
-        raise DataError(f"{str(error).rstrip('.')}, {where} {name}.") from error
+        raise DataError(f"{error}, line {error.line} of the listing {name}.") from error
 
 
 @dataclass(frozen=True, slots=True)

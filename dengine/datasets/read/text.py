@@ -10,11 +10,11 @@ import io
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from ...errors import instead
 from ..description import TextForm
 from ..table import Cells, Table, UnreadableError
 
@@ -106,12 +106,11 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
 def split_line(line: str, delimiter: str) -> list[str]:
     """Return the cells of one line; a blank as delimiter stands for any run of blanks.
 
-    Raises UnreadableError for a cell that is too long.
+    Quotes mean nothing in a line with a cell that is too long for the `csv` module.
     """
-    if delimiter == BLANK:
-        return line.split()
-    with instead(UnreadableError, "Expected cells of at most 128 KB", csv.Error):
-        return next(csv.reader([line], delimiter=delimiter), [])
+    with suppress(csv.Error):
+        return line.split() if delimiter == BLANK else next(csv.reader([line], delimiter=delimiter))
+    return line.split(delimiter)
 
 
 def header_names(cells: Sequence[str]) -> list[str]:
