@@ -129,7 +129,8 @@ class Channel:
     column
         Column, or a pattern of columns with `*`.
     unit
-        Unit of the traces; samples whose own unit is stated are converted to it.
+        Unit of the traces; samples are converted to it from the unit in the file's row of units or
+        in the column's name.
     factor
         Number by which the samples are multiplied.
     limit
