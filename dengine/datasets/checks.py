@@ -4,7 +4,6 @@ Equal samples under two labels are a fault, and so is each repeat; `tolerance_no
 policy with the share of bad parts.
 """
 
-import codecs
 from collections import defaultdict
 from collections.abc import Sequence
 from zoneinfo import ZoneInfo
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from ..errors import DataError, instead, listed, percent
 from ..folds import content_hash
 from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault, expect_all
-from .description import Description
+from .description import Description, TextForm
 from .table import Recording
 
 __all__ = [
@@ -23,6 +22,7 @@ __all__ = [
     "MOST_RATE_HZ",
     "Fitted",
     "check_description",
+    "check_text",
     "finished_notes",
     "tolerance_note",
     "without_repeats",
@@ -32,14 +32,11 @@ Fitted = tuple[Recording, NDArray[np.float32]]
 
 def check_description(description: Description) -> None:
     """Raise DataError unless recordings can be read by a description."""
-    text, clock = description.text, description.time
+    clock = description.time
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
-    with instead(DataError, "Expected an encoding in text.encoding", LookupError):
-        codecs.lookup(text.encoding)
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")
-    marks = (text.delimiter, text.decimal)
     n_clocks = len(clock.column)
     wanted = {
         "traces.samples, the samples of each trace": description.traces.samples > 0,
@@ -48,11 +45,22 @@ def check_description(description: Description) -> None:
         ),
         "time.column, since the order is time": n_clocks or description.order != "time",
         "one limit for all channels": len({c.limit for c in description.channels}) == 1,
+        f"a format for each of {n_clocks} columns in [time]": (n_clocks in (0, len(clock.format))),
+    }
+    expect_all(wanted)
+    check_text(description.text)
+
+
+def check_text(text: TextForm) -> None:
+    """Raise DataError unless text files can be read by a form."""
+    with instead(DataError, "Expected an encoding in text.encoding", LookupError):
+        "".encode(text.encoding)  # also refuses codecs that are of no text
+    marks = (text.delimiter, text.decimal)
+    wanted = {
         f"one character each in text.delimiter and text.decimal, got {marks}": (
             [*map(len, marks)] == [1, 1]
         ),
         "text.data, the line of the first samples, of 1 or more": text.data > 0,
-        f"a format for each of {n_clocks} columns in [time]": (n_clocks in (0, len(clock.format))),
     }
     expect_all(wanted)
 

@@ -129,7 +129,8 @@ class Channel:
     column
         Column, or a pattern of columns with `*`.
     unit
-        Unit of the traces; samples whose own unit is stated are converted to it.
+        Unit of the traces; samples are converted to it from the unit in the file's row of units or
+        in the column's name.
     factor
         Number by which the samples are multiplied.
     limit
@@ -413,7 +414,7 @@ class Description:
         known = {column: Channel(column, unit) for column, unit in self.ignored.items()}
         known |= {channel.column: channel for channel in self.channels}
         for column in columns:
-            _expect_one_of(known, column, "[channels] and [ignored]")
+            expect_one_of(known, column, "[channels] and [ignored]")
         return replace(self, channels=tuple(known[column] for column in columns))
 
 
@@ -465,7 +466,7 @@ def _made(kind: Any, value: Any, where: str, choices: Words = ()) -> Any:
     known = {about.name: about for about in fields(kind) if about.compare}
     made = {}
     for name, item in value.items():
-        _expect_one_of(known, name, where)
+        expect_one_of(known, name, where)
         about = known[name]
         choices = about.metadata.get("choices", ())
         made[name] = _made(about.type, item, f"{where}, {name}", choices)
@@ -483,11 +484,11 @@ def _as_kind(kind: Any, value: Any, where: str, choices: Words) -> Any:
     is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
     expect_data(is_kind and is_finite, f"{KINDS[kind]} in {where}", value)
     if choices:
-        _expect_one_of(choices, value, where)
+        expect_one_of(choices, value, where)
     return float(value) if kind is float else value
 
 
-def _expect_one_of(known: Iterable[str], name: str, where: str) -> None:
+def expect_one_of(known: Iterable[str], name: str, where: str) -> None:
     """Raise DataError for a name that is not known, with the nearest that is, or all of them."""
     nearest = difflib.get_close_matches(name, known, 1)
     wanted = repr(nearest[0]) if nearest else f"one of {', '.join(known)}"

@@ -538,6 +538,118 @@ def test_a_huge_or_binary_description_is_refused(tmp_path: Path) -> None:
             load_dataset(tmp_path)
 
 
+FORCE = [f"{k * 0.002:.3f},{k * k % 17}.5" for k in range(24)]
+
+
+def in_files(folder: Path, header: str, name: str = "{}_{}.csv", **cells: str) -> Path:
+    """Write five files, with cells behind each row, in which `{}` is the number and the label."""
+    for i in range(5):
+        label = WORDS[i % 2]
+        path = folder / name.format(i, label)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        behind = cells.get(label, "")
+        path.write_text("\n".join([header, *(f"{row}{i}{behind}" for row in FORCE)]))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("channels.forc", "N", "Expected 'force' in the columns"),
+        ("time.column", "tmie", "Expected 'time' in the columns"),
+        ("label.column", "verdict", "where [label] says they stand"),
+        ("label.path", "(", "a regular expression with one group"),
+        ("label.listing", "x.csv", "label.key"),
+        ("label", {"listing": "x.csv", "key": "a", "column": "b"}, "the listing x.csv"),
+        ("text.encoding", "base64", "text.encoding"),
+        ("text.encoding", "utf-99", "text.encoding"),
+        ("text.delimiter", ";;", "text.delimiter"),
+        ("text.header", 9, "none: 0_NOK.csv, line 9: Expected a header"),
+        ("text.data", 500, "line 500: Expected rows of samples"),
+        ("files", "/x/*.csv", "patterns below a folder"),
+    ],
+)
+def test_a_stated_value_that_cannot_be_is_refused(
+    tmp_path: Path, key: str, value: Any, message: str
+) -> None:
+    with pytest.raises(DataError, match=re.escape(message)):
+        describe(in_files(tmp_path, "time,force"), {key: value})
+
+
+def test_a_cell_that_is_too_long_is_a_fault(tmp_path: Path) -> None:
+    in_files(tmp_path, "time,force")
+    (tmp_path / "9_OK.csv").write_text("\n".join(["time,force", *FORCE, f"0.048,{'1' * 200_000}"]))
+    data = load_dataset(tmp_path, describe(tmp_path))
+    assert [fault.source for fault in data.faults] == ["9_OK.csv"]
+    assert (data.faults[0].line, data.faults[0].column) == (26, "force")
+
+
+def test_lines_of_json_under_another_suffix_are_refused_until_that_is_stated(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "all.json"
+    values = [{"ok": i % 2 == 0, "force": [i, 2, 3 * i, 4]} for i in range(4)]
+    path.write_text("\n".join(map(json.dumps, values)))
+    with pytest.raises(DataError, match='state format="jsonl"'):
+        describe(path)
+    assert load_dataset(path, describe(path, {"format": "jsonl"})).y.tolist() == [1, 0, 1, 0]
+
+
+def test_a_unit_in_a_name_is_converted(tmp_path: Path) -> None:
+    folder = in_files(tmp_path, "time,force [kN]")
+    plain, newtons = (
+        load_dataset(folder, describe(folder, {"channels.force [kN]": unit}))
+        for unit in ("kN", "N")
+    )
+    np.testing.assert_allclose(newtons.X, 1000 * plain.X)
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "good", "bad"),
+    [
+        ("time,force,not_ok", "{}.csv", ",0", ",1"),
+        ("time,force,pass_fail", "{}.csv", ",1", ",0"),
+        ("time,force,quality_error", "{}.csv", ",false", ",true"),
+        ("time,force", "{1}/{0}_leak=False.csv", "", ""),
+    ],
+)
+def test_true_and_false_of_a_name_that_may_be_bad_mean_nothing(
+    tmp_path: Path, header: str, name: str, good: str, bad: str
+) -> None:
+    if "leak" in name:
+        for i in range(4):
+            in_files(tmp_path, header, f"{{}}_leak={i % 2 == 0}.csv")
+    else:
+        in_files(tmp_path, header, name, OK=good, NOK=bad)
+    assert {"label.good", "label.column"} & {*describe(tmp_path).open_keys}
+
+
+def test_folders_of_other_words_are_shown_as_labels(tmp_path: Path) -> None:
+    for word in ("Gutteile", "Ausschuss"):
+        in_files(tmp_path, "time,force", f"{word}/{{}}.csv")
+    note = describe(tmp_path).notes["label.column"]
+    assert "label.path=([^/]+)/[^/]*$ has few words (Ausschuss: 5, Gutteile: 5)" in note
+
+
+def test_times_that_repeat_are_asked_about(tmp_path: Path) -> None:
+    for i in range(5):
+        rows = [f"10:00:{k // 10:02},{k * i % 7}" for k in range(60)]
+        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text("\n".join(["time,force", *rows]))
+    proposal = describe(tmp_path)
+    assert "time.column" in proposal.open_keys
+    assert "time.column=[]" in proposal.notes["time.column"]
+    data = load_dataset(tmp_path, describe(tmp_path, {"time.column": [], "time.rate_hz": 10}))
+    assert (data.X.shape, data.rate_hz) == ((5, 60), 10.0)
+
+
+def test_stated_checks_and_headers_are_kept(tmp_path: Path) -> None:
+    folder = in_files(tmp_path, "time,force")
+    check = {"path": "^(.)", "good": ["1", "3", "4"], "bad": ["0", "2"]}
+    data = load_dataset(folder, describe(folder, {"check": [check], "text.header": "tim"}))
+    assert data.X.shape == (4, 24)
+    assert [fault.source for fault in data.faults] == ["4_NOK.csv"]
+
+
 def test_a_listing_names_parts_once_and_is_no_recording(tmp_path: Path) -> None:
     written = write(tmp_path, "files text", *some(), PLAIN)
     rows = ["000,OK", "1,NOK", "2,OK", "2,NOK", "4,NOK", "9,OK"]

@@ -12,9 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...errors import DataError, listed
+from ...errors import DataError, instead, listed
+from ..checks import check_text
+from ..dataset import Fault
 from ..description import UNKNOWN, Description
-from ..read.files import natural_key, read_file
+from ..read.files import BAD, caught, natural_key, read_file
 from ..read.frames import part_tables, read_frame
 from ..read.split import tables_of
 from ..read.text import read_text
@@ -72,6 +74,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         If there is no file, or none that holds samples.
     """
     p = Proposal(stated or {}, Description().with_values(stated or {}))
+    check_text(p.description.text)
     if hasattr(source, "columns"):
         p.put("format", "frame")
         propose_tables(p, [[read_frame(source, "table")]])
@@ -125,7 +128,8 @@ def names_in(root: Path, patterns: Names) -> Names:
     """
     if root.is_file():
         return [root.name]
-    paths = {path for pattern in patterns or ["**/*"] for path in root.glob(pattern)}
+    with instead(DataError, f"Expected patterns below a folder in files, got {patterns}", *BAD):
+        paths = {path for pattern in patterns or ["**/*"] for path in root.glob(pattern)}
     names = [path.relative_to(root).as_posix() for path in paths if path.is_file()]
     names = [name for name in names if patterns or suffix_of(name) in SUFFIXES]
     return sorted((name for name in names if not NO_RECORDING.search(name)), key=natural_key)
@@ -154,10 +158,13 @@ def read_tables(p: Proposal) -> list[Tables]:
                 contents[name] = read_file(p.base / name)
     if p.description.format == "text":
         propose_form(p, contents)
-    files = []
+    files = list[Tables]()
+    faults: list[Fault] = []
     for name in [name for name in p.names if name in contents]:
-        with suppress(*([DataError] if len(contents) > 1 else [])):
+        with caught(faults, name):
             files.append(tables_in(p, contents[name], name))
+    if faults and not files:
+        raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
     heads = Counter(tuple(tables[0].columns) for tables in files if tables).most_common(1)
     return [tables for tables in files if tables and tuple(tables[0].columns) == heads[0][0]]
 

@@ -173,6 +173,12 @@ def is_uneven(steps: Floats, usual: float) -> bool:
 # What is asked about a clock if many recordings have such steps, whose usual one is known.
 QUESTIONS: Sequence[tuple[str, Callable[[Floats, float], bool], str]] = (
     (
+        "time.column",
+        lambda steps, usual: usual > 0 and np.median(steps) == 0,
+        "times that repeat, as whole seconds do: state a finer clock, or none by time.column=[], "
+        "and time.rate_hz",
+    ),
+    (
         "time.wrap",
         lambda steps, _: bool((steps < 0).any()),
         "times that fall: does the counter begin again (state time.wrap), or are rows in another "

@@ -32,22 +32,31 @@ NAME = re.compile(
     r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
     r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)([^a-z]|$)"
 )
-BAD_NAME = re.compile(
-    r"(?i)(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)"
-)
-GOOD_NAME = re.compile(
-    r"(?i)(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good|label|y)([^a-z]|$)"
-)
+BAD_WORDS = r"(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)"
+GOOD_WORDS = r"(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good)([^a-z]|$)"
+BAD_NAME = re.compile(f"(?i){BAD_WORDS}")
+GOOD_NAME = re.compile(rf"(?i){GOOD_WORDS}|(^|\.)(label|y)$")
+BOTH_OR_NOT = re.compile(rf"(?i)(?=.*{BAD_WORDS}).*{GOOD_WORDS}|(^|[^a-z])(not?|nicht)([^a-z]|$)")
 # The words for good and for bad in a column of only YES and NO, by its name.
-MEANINGS = ((BAD_NAME, NO, YES), (GOOD_NAME, YES, NO), (re.compile(""), GOOD, BAD))
+MEANINGS = (
+    (BOTH_OR_NOT, (), ()),
+    (BAD_NAME, NO, YES),
+    (GOOD_NAME, YES, NO),
+    (re.compile(r"(?i)(^|\.)(result|verdict|ergebnis|outcome|quality)$"), GOOD, BAD),
+    (re.compile(""), (), ()),
+)
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
-NEGATED = re.compile(rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})")
+NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
+    rf"(?i)(not.(?!ok)|nicht.|(?-i:[-_ .]n)[-_ .](?!i))({WORD})"
+    r"|[a-z][-_ .=(/]+(true|false)(?![a-z])"
+)
 PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})/",
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
+FOLDER = "([^/]+)/[^/]*$"  # of a recording
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 KINDS = ("listing", "column", "path", "line")
 Names = Iterable[str]
@@ -152,7 +161,7 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 def words_of(p: Proposal, source: LabelSource, places: Places, parts: Words) -> Words:
     """Return the word of each recording that has one in a source."""
     words = dict[str, str]()
-    with suppress(DataError):
+    with suppress(*([] if source == p.description.label else [DataError])):
         reader = read_labels(p.base, source, p.description.text)
         for name, place in places.items():
             with suppress(UnreadableError):
@@ -178,6 +187,8 @@ def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
     counted = dict[LabelSource, Words]()
     for source in [label] if is_stated else sources_of(p, paths):
         words = words_of(p, source, places, parts)
+        if is_stated and not words:
+            raise DataError("Expected words where [label] says they stand, found none.")
         looked_at = places if source.listing or source.path else p.places
         if is_stated or len(words) > len(looked_at) / 2:
             counted[with_meanings(source, words.values())] = words
@@ -210,7 +221,7 @@ def propose_label(p: Proposal) -> None:
     chosen = [] if doubt else chosen
     best = chosen[0] if chosen else replace(p.description.label, column=UNKNOWN)
     checks = [source for source in chosen[1:] if counted[source].keys() >= counted[best].keys()]
-    p.description = replace(p.description, label=best, check=tuple(checks))
+    p.description = replace(p.description, label=best, check=p.description.check or tuple(checks))
     others = [title_of(source, words) for source, words in counted.items() if source != best]
     if chosen:
         counts = counts_of(counted[best].values())
@@ -231,6 +242,11 @@ def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
 
 
 def _few_words(p: Proposal) -> list[str]:
-    """Return the columns of few words that may be labels under other names."""
-    few = [column for column in p.unused if 1 < len({*column.fixed}) <= MOST_WORDS]
-    return [f"{column.name} has few words ({counts_of(column.fixed)})" for column in few]
+    """Return the columns, and the folders, of few words that may be labels under other names."""
+    few = {column.name: column.fixed for column in p.unused}
+    few[f"label.path={FOLDER}"] = [name.split("/")[-2] for name in p.names if "/" in name]
+    return [
+        f"{name} has few words ({counts_of(words)})"
+        for name, words in few.items()
+        if 1 < len({*words}) <= MOST_WORDS
+    ]

@@ -105,7 +105,8 @@ def _refuse_results(columns: Iterable[Column]) -> None:
         if labels.is_plain(source) and source.good and source.bad:
             actual = f"a row for each result, with its verdict in {column.name}, and no curve"
             where = column.tables[0].source
-            raise DataError(f"Expected the samples of each part in {where}, got {actual}.")
+            do = "if the rows of parts are mixed, state part.column and time.sort=true"
+            raise DataError(f"Expected the samples of each part in {where}, got {actual}; {do}.")
 
 
 def places_of(p: Proposal, files: Files) -> dict[str, Place]:

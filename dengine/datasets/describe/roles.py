@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords
+from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
 from ..read.places import LabelReader
 from ..read.recordings import Reader
@@ -38,6 +38,9 @@ FORCES = (
 def propose_roles(p: Proposal) -> None:
     """Give each column a role, one after the other; what is stated stays."""
     p.columns = columns_of(p.tables, p.description.text)
+    channels = (channel.column for channel in p.description.channels)
+    for name in (*p.description.time.column, *channels):
+        expect_one_of([*p.columns, UNKNOWN], name, "the columns")
     qualify_rows(p)
     propose_clock(p)
     if p.description.layout not in ("long", "columns"):

@@ -97,7 +97,7 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
     for encoding in [stated] if stated else encodings:
-        with suppress(UnicodeDecodeError):
+        with suppress(UnicodeError):
             text = codecs.getincrementaldecoder(encoding)().decode(content[:HEAD_BYTES])
             return encoding, text.removeprefix("\ufeff")
     return "", ""
@@ -158,14 +158,16 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 
 def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
     """Set the keys of `[text]` for files like one; a header may stand at another line in each."""
-    above = 0 if all(form.header == usual.header for form in same) else usual.header
+    is_text = isinstance(p.description.text.header, str)
+    is_same = all(form.header == usual.header for form in same) and not is_text
+    above = 0 if is_same else usual.header
     values = {
-        "encoding": min({form.encoding for form in same} - {"utf-8"}, default="utf-8"),
+        "encoding": LATIN if LATIN in {form.encoding for form in same} else usual.encoding,
         "delimiter": usual.delimiter,
         "header": usual.line if above else usual.header,
         "units": usual.units and usual.units - above,
         "data": usual.data - above,
-        "names": _column_names(usual),
+        "names": [] if p.stated.get("text.header") else _column_names(usual),
     }
     for key, value in values.items():
         p.put(f"text.{key}", value)

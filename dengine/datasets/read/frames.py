@@ -32,7 +32,8 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
         try:
             found = json.loads(line.strip() or "[]")
         except (ValueError, RecursionError) as error:
-            raise UnreadableError(f"Expected JSON: {error}", number) from error
+            do = "" if has_lines else '; if each line is an object, state format="jsonl"'
+            raise UnreadableError(f"Expected JSON: {error}{do}", number) from error
         for value in found if isinstance(found, list) else [found]:
             if not isinstance(value, Mapping):
                 message = f"Expected an object of JSON, got {shortened(value)}"

@@ -5,6 +5,7 @@ a `Dataset`. What does not follow the description becomes a `Fault`.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from ..checks import Fitted, check_description, finished_notes, without_repeats
 from ..dataset import Dataset, Fault
 from ..description import ANY, Channel, Description
 from ..table import Cells, Floats, Recording, Table, UnreadableError
-from ..units import conversion
+from ..units import conversion, unit_in
 from . import frames
 from .bags import read_bag
 from .clock import check_steps, times_of
@@ -101,8 +102,12 @@ class Reader:
         """Return the samples of a channel in its unit, shape (n,)."""
         form, column = self.description.text, channel.column
         values = table.numbers(column, form)
+        factor = 1.0
+        with suppress(DataError):  # a name may have another quantity, as `U [V]` of a force
+            factor = conversion(unit_in(column.rstrip(ANY)), channel.unit)
         try:
-            factor = conversion(table.units.get(column, ""), channel.unit)
+            if unit := table.units.get(column):
+                factor = conversion(unit, channel.unit)
         except DataError as error:
             line = form.units + table.header * isinstance(form.header, str)
             raise UnreadableError(str(error), line, column) from error

@@ -10,6 +10,7 @@ import io
 import re
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -103,10 +104,13 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
 
 
 def split_line(line: str, delimiter: str) -> list[str]:
-    """Return the cells of one line; a blank as delimiter stands for any run of blanks."""
-    if delimiter == BLANK:
-        return line.split()
-    return next(csv.reader([line], delimiter=delimiter), [])
+    """Return the cells of one line; a blank as delimiter stands for any run of blanks.
+
+    Quotes mean nothing in a line with a cell that is too long for the `csv` module.
+    """
+    with suppress(csv.Error):
+        return line.split() if delimiter == BLANK else next(csv.reader([line], delimiter=delimiter))
+    return line.split(delimiter)
 
 
 def header_names(cells: Sequence[str]) -> list[str]:
