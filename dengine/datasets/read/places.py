@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
 from ...errors import DataError, instead, listed, shortened
+from ..dataset import Fault
 from ..description import ANY, LabelSource, PartSource, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
@@ -104,7 +105,8 @@ def in_listing(name: str) -> Iterator[None]:
     try:
         yield
     except UnreadableError as error:
-        raise DataError(f"{error}, line {error.line} of the listing {name}.") from error
+        fault = Fault(f"the listing {name}", error.line, str(error).rstrip("."))
+        raise DataError(f"Cannot use {fault}.") from error
 
 
 @dataclass(frozen=True, slots=True)

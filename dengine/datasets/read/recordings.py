@@ -152,7 +152,9 @@ def read_recordings(
     name, base = FRAME, Path()
     files: list[tuple[Any, str]] = [(source, FRAME)]
     if isinstance(source, Path):
-        name, base = (source.name, source) if source.is_dir() else (source.stem, source.parent)
+        name, base = (
+            (source.resolve().name, source) if source.is_dir() else (source.stem, source.parent)
+        )
         files = find_files(source, description)
     notes: list[str] = []
     faults: list[Fault] = []
