@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import DataError, TraceError, expect, listed
+from ..errors import DataError, TraceError, expect, instead, listed
 from ..records import TraceSpec
 from ..representation import to_html
 from ..traces import as_traces
@@ -228,8 +228,9 @@ def make_dataset(
         cube = as_traces(X)
     except TraceError as error:
         raise DataError(str(error)) from error
-    y = np.asarray(y)
-    parts = None if part is None else np.asarray(part)
+    with instead(DataError, "Expected a label and a part for each trace", ValueError):
+        y = np.asarray(y)
+        parts = None if part is None else np.asarray(part)
     n, n_channels, samples = cube.shape
     words = sorted({*map(str, y.ravel().tolist())})
     expect_all(

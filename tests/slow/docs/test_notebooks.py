@@ -26,10 +26,7 @@ SMALLER = {
         "cycles=300": "cycles=100",
     },
     "recordings_to_deployment": {"repeats=2": "repeats=1, cycles=80"},
-    "shadow_and_costs": {
-        '"alphas": (0.5, 0.1, 0.05)': '"alphas": (0.5, 0.1)',
-        '"repeats": 6': '"repeats": 2',
-    },
+    "shadow_and_costs": {'"repeats": 6': '"repeats": 2'},
     "the_guarantee_seen": {
         "n_parts = 400": "n_parts = 160",
         "for seed in range(4)": "for seed in range(1)",
