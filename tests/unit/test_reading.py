@@ -698,6 +698,23 @@ def test_a_label_in_a_column_is_counted_over_the_files_that_were_looked_at(tmp_p
     assert proposal.notes["label.column"] == "NOK: 75, OK: 30, over 105 recordings"
 
 
+@pytest.mark.parametrize("rate", [3.0, 10.0, 300.0, 700.0])
+def test_a_resampled_recording_may_end_one_step_before_the_trace(
+    tmp_path: Path, rate: float
+) -> None:
+    for n in range(3, 60):
+        table = pd.DataFrame({"time": np.arange(n) / rate, "FZ": np.arange(n) ** 2.0, "y": 1})
+        about = {
+            "format": "frame",
+            "time": {"column": "time", "rate_hz": rate},
+            "channels": {"FZ": "N"},
+            "label": {"column": "y", "good": "1", "bad": "0"},
+            "traces": {"lengths": "resample", "samples": n + 1},
+        }
+        data = load_dataset(table, {**about, "layout": "files"})
+        np.testing.assert_allclose(data.X[0, :n], np.arange(n) ** 2.0, rtol=1e-5, atol=1e-3)
+
+
 def test_a_stated_key_replaces_one_and_a_stated_source_the_others() -> None:
     d = Description(channels=(Channel("F.z", "N"), Channel("?")), label=LabelSource("verdict"))
     stated = d.with_values({"channels.F.z.limit": 100.0, "label.path": "(OK)"})

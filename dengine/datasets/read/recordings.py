@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError, instead, listed
 from ...records import FITS
-from ...traces import can_fit_length
+from ...traces import can_fit_length, fit_length
 from ..checks import Fitted, check_description, finished_notes, without_repeats
 from ..dataset import Dataset, Fault
 from ..description import ANY, Channel, Description
@@ -30,6 +31,7 @@ from .split import Parts, split, tables_of
 from .windows import cut
 
 FRAME = "table"  # what a DataFrame is called in messages
+ROUNDING = 1e-6  # of a step: sums of float64 miss a time by less
 WORDS = {1: "good", 0: "bad", None: "not checked"}
 
 
@@ -58,12 +60,14 @@ class Reader:
         about = self.description
         with instead(UnreadableError, "Expected columns of one length", IndexError):
             table, is_lost = self.kept_rows(table)
-        seconds, start = None, np.nan
+        seconds = None
+        start = np.nan
         if about.time.column:
             seconds, start = times_of(table, about.time, about.text)
             if about.time.sort:
                 order = np.argsort(seconds, kind="stable")
-                table, is_lost = table.take(order), is_lost[order]
+                table = table.take(order)
+                is_lost = is_lost[order]
                 seconds, start = times_of(table, about.time, about.text)
             check_steps(seconds, about.time, table)
         rows = [self.channel(table, channel) for channel in about.channels]
@@ -89,18 +93,20 @@ class Reader:
         is_lost: Cells = np.zeros(n, dtype=bool)
         for column, about in self.description.rows.items():
             kinds = {"keep": about.keep, "drop": about.drop, "invalid": about.invalid}
-            known = {word: kind for kind, words in kinds.items() for word in words}
+            kind_of = {word: kind for kind, words in kinds.items() for word in words}
+            other = kind_of.get(ANY, "")
             words = table.words(column).tolist()
-            found = np.array([known.get(word, known.get(ANY, "")) for word in words], dtype=object)
-            table.refuse(found == "", f"one of the words {listed(sorted(known))}", column)
-            is_kept = found != "drop"
-            is_lost = (is_lost | (found == "invalid"))[is_kept]
+            rows = np.array([kind_of.get(word, other) for word in words], dtype=object)
+            table.refuse(rows == "", f"one of the words {listed(sorted(kind_of))}", column)
+            is_kept = rows != "drop"
+            is_lost = (is_lost | (rows == "invalid"))[is_kept]
             table = table.take(is_kept)
         return table, is_lost
 
     def channel(self, table: Table, channel: Channel) -> Floats:
         """Return the samples of a channel in its unit, shape (n,)."""
-        form, column = self.description.text, channel.column
+        form = self.description.text
+        column = channel.column
         values = table.numbers(column, form)
         factor = 1.0
         with suppress(DataError):  # a name may have another quantity, as `U [V]` of a force
@@ -149,12 +155,13 @@ def read_recordings(
         If a key is still open, no file is found, a listing cannot be read, or no recording is left.
     """
     check_description(description)
-    name, base = FRAME, Path()
+    name = FRAME
+    base = Path()
     files: list[tuple[Any, str]] = [(source, FRAME)]
     if isinstance(source, Path):
-        name, base = (
-            (source.resolve().name, source) if source.is_dir() else (source.stem, source.parent)
-        )
+        is_folder = source.is_dir()
+        name = source.resolve().name if is_folder else source.stem
+        base = source if is_folder else source.parent
         files = find_files(source, description)
     notes: list[str] = []
     faults: list[Fault] = []
@@ -162,7 +169,7 @@ def read_recordings(
         title = files[0][1] if len(files) == 1 else name
         files = [(read_bag(files, description, notes, faults), title)]
     sources = (description.label, *description.check)
-    labels = [read_labels(base, one, description.text) for one in sources]
+    labels = [read_labels(base, label, description.text) for label in sources]
     reader = Reader(description, labels[0], labels[1:])
     fitted: list[Fitted] = []
     n_unlabelled = 0
@@ -214,7 +221,8 @@ def _joined(
         n = f"{len(faults)} have faults, {n_unlabelled} no label"
         why = "".join(f" {fault}." for fault in faults[:1])
         raise DataError(f"Expected recordings in {name}, none is left: {n}.{why}")
-    n_found, n_seen = len(fitted) + len(faults) + n_unlabelled, description.seen.recordings
+    n_found = len(fitted) + len(faults) + n_unlabelled
+    n_seen = description.seen.recordings
     if n_found < n_seen:
         notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
     data = _stacked(fitted, description)
@@ -229,8 +237,11 @@ def _stacked(fitted: Sequence[Fitted], description: Description) -> Dataset:
         key: np.array([getattr(recording, key) for recording in recordings])
         for key in ("label", "part", "source")
     }
-    X, y, part = np.stack(traces), about["label"].astype(np.int8), about["part"]
-    channels, clock = description.channels, description.time
+    X = np.stack(traces)
+    y = about["label"].astype(np.int8)
+    part = about["part"]
+    channels = description.channels
+    clock = description.time
     lengths = description.traces.lengths.removesuffix("-all")
     is_grid = lengths == "resample" and clock.column and clock.rate_hz
     return Dataset(
@@ -251,27 +262,33 @@ def _stacked(fitted: Sequence[Fitted], description: Description) -> Dataset:
 def fit(recording: Recording, description: Description) -> NDArray[np.float32]:
     """Return the trace (C, samples) of a recording, as `[traces]` says.
 
-    With `resample`, a clock and a stated rate, the trace begins at the first time, and is
-    interpolated at that rate; without them the whole recording is.
+    With `resample` and a clock it is interpolated in time: at the stated rate from the first time
+    on, up to one step beyond the last, so that the end of a longer recording is left out; without
+    a rate the whole recording, to that number of samples. Otherwise it is fitted like a live trace.
 
     Raises
     ------
     UnreadableError
-        If the recording is too short, or too long, to be fitted without making up data.
+        If the recording is too short, or too long, to be fitted without making up data; with
+        `pad-all` its last sample is repeated all the same.
     """
-    samples, lengths = description.traces.samples, description.traces.lengths
-    x, rate = recording.samples, description.time.rate_hz
+    samples = description.traces.samples
+    lengths = description.traces.lengths
+    rate = description.time.rate_hz
+    x = recording.samples
+    seconds = recording.seconds
     n = x.shape[1]
-    kind = lengths.removesuffix("-all")
-    can_fit = can_fit_length(n, samples, FITS.index(kind)) or (lengths == "pad-all" and n > 0)
-    seconds = np.arange(n, dtype=float) if recording.seconds is None else recording.seconds
-    step = float(seconds[-1:].sum()) / max(samples - 1, 1)
-    if kind == "resample" and recording.seconds is not None and rate:
-        step = 1 / rate
-        can_fit = (samples - 2) * step <= seconds[-1]
+    kind = FITS.index(lengths.removesuffix("-all"))
+    can_fit = can_fit_length(n, samples, kind) or (lengths == "pad-all" and n > 0)
+    times = None
+    if lengths == "resample" and seconds is not None:
+        step = 1 / rate if rate else float(seconds[-1]) / max(samples - 1, 1)
+        times = np.arange(samples) * step
+        if rate:
+            can_fit = bool(times[-1] <= seconds[-1] + (1 + ROUNDING) * step)
     if not can_fit:
         message = f"Expected {samples} samples, got {n}"
         raise UnreadableError(f"{message}; see traces.lengths, which is {lengths}")
-    if kind == "resample":
-        x = np.stack([np.interp(np.arange(samples) * step, seconds, row) for row in x])
-    return x[:, np.minimum(np.arange(samples), x.shape[1] - 1)].astype(np.float32)
+    if times is not None and seconds is not None:
+        return np.stack([np.interp(times, seconds, row) for row in x]).astype(np.float32)
+    return fit_length(torch.from_numpy(x.astype(np.float32)), samples, kind).numpy()
