@@ -179,15 +179,21 @@ class CostCurve:
 
     @property
     def missing(self) -> Missing | None:
-        """What is missing to a policy that may pay; None if it pays, or nothing would show it."""
+        """How many more parts would turn "may pay" into "pays".
+
+        None for another verdict, and if more than `MOST_MORE` times the recordings are needed.
+        """
         row = self.marked
         if self.verdict != "may pay":
             return None
         errors = (row.bad, row.good)
         rates = [error.wrong / max(1, error.decided) for error in errors]
-        # Wilson's upper end u of a share r of n parts: n = z^2 u (1 - u) / (u - r)^2.
+        # Wilson's upper end u of a share r of n parts: n = z^2 u (1 - u) / (u - r)^2. For r = 1 it
+        # is 1 for any n: then each part counts.
         sizes = [
             Z**2 * error.upper * (1.0 - error.upper) / (error.upper - rate) ** 2
+            if rate < 1.0
+            else float(error.traces)
             for error, rate in zip(errors, rates, strict=True)
         ]
 
@@ -207,10 +213,16 @@ class CostCurve:
 
         most = MOST_MORE * self.cycles
         n = bisect_left(range(most), 0.0, lo=self.cycles, key=surplus)
-        known = 1.0 if row.policy.stops == "all" else row.policy.audited_share or AUDIT_RATE
-        needed = math.ceil(sizes[0] * n / self.cycles)
-        parts = n - self.cycles, math.ceil(n / known)
-        return None if n == most else Missing(needed, round(sizes[0]), *parts, known)
+        audit_rate = 1.0 if row.policy.stops == "all" else row.policy.audited_share or AUDIT_RATE
+        if n == most:
+            return None
+        return Missing(
+            accepted=math.ceil(sizes[0] * n / self.cycles),
+            seen=round(sizes[0]),
+            recordings=n - self.cycles,
+            production=math.ceil(n / audit_rate),
+            audit_rate=audit_rate,
+        )
 
     @property
     def sentence(self) -> str:
@@ -377,22 +389,24 @@ class PolicySearch:
         policy = candidate.recipe.policy
         n_needed = needed_parts(policy)
         if n_needed > n_good:
-            what = "accepted parts without a bad one"
+            parts = "accepted parts without a bad one"
             if policy.guarantee == "local":
-                what = "good neighbours"
+                parts = "good neighbours"
             has = f"{n_good:,.0f} good parts are played"
-            self.out_of_reach.append(f"{policy_name(policy)} needs {n_needed:,} {what}, {has}")
+            self.out_of_reach.append(f"{policy_name(policy)} needs {n_needed:,} {parts}, {has}")
         else:
             self.remaining.append(candidate)
 
     def run(self, play: Callable[[Sequence[Task]], Sequence[Replay]]) -> None:
-        """Play all rounds.
+        """Halve the candidates in rounds, and let the last ones play fresh shuffles.
+
+        It shortens `remaining` and keeps the replays, of which `curve` makes the result.
 
         Parameters
         ----------
         play : callable
-            Returns the replays of tasks. If it returns fewer, as after Ctrl-C, nothing more is
-            played.
+            Returns the replays of tasks. If it returns fewer, as after Ctrl-C, these are kept and
+            nothing more is played.
         """
         seeds = count(self._seed)
         while len(self.remaining) > N_LAST:
@@ -452,11 +466,12 @@ class PolicySearch:
 def candidates(
     contender: Contender, costs: Costs, alphas: Sequence[float], lower_bounds: Sequence[float]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the changes of a contender's policy that are to be tried.
+    """Yield the settings of a contender's policy that are to be tried, as keyword arguments.
 
-    They are an alpha and an LB each, of its own rule if it has one, else of the guarantee "local";
-    then "pooled" and "cost", unless it has its own rule or is a baseline. Without `lower_bounds`
-    the levels of LB are those around break-even.
+    First come all pairs of an alpha and an LB, for the contender's own rule or else for the
+    guarantee "local". Then come "pooled" at a few LBs, and "cost" once; both are left out for an
+    own rule and for a baseline, and get audits where they need them. Without `alphas` there is one,
+    `ALPHA`, and without `lower_bounds` there are levels around break-even, 1 - check / escape.
     """
     policy = contender.recipe.policy
 
@@ -563,8 +578,8 @@ def curve_of(
     changes = []
     for field in fields(costs):
         for price in (0.5 * getattr(costs, field.name), 2.0 * getattr(costs, field.name)):
-            _, other, found = _choose(groups, replace(costs, **{field.name: price}))
-            name = _chosen_name(other, found)
+            _, other, other_verdict = _choose(groups, replace(costs, **{field.name: price}))
+            name = _chosen_name(other, other_verdict)
             if name != chosen:
                 changes.append(f"with {field.name.replace('_', ' ')} at {price:g}, {name}")
     replays = groups[marked.policy]
@@ -585,7 +600,10 @@ def curve_of(
 
 
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
-    """Return the rows of a curve, the marked one and its verdict, see `CostCurve`."""
+    """Return the rows of a curve, the marked one and its verdict; see `CostCurve`.
+
+    A row can be marked as the safer one only if its expected cost is below the check's.
+    """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
     cheapest = rows[0]
@@ -624,16 +642,16 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
         wrong = accepted * bad_rate, rejected * good_rate
         return costs.check - costs.saved(accepted + rejected, *wrong)
 
-    each = np.array([part_costs(replay, costs) for replay in replays])  # (shuffles, cycles)
-    cost = float(each.mean())
-    luck = float(student.ppf(1.0 - ERROR_LEVEL / 2, max(1, n - 1))) * _order_error(each.mean(1))
+    of_parts = np.array([part_costs(replay, costs) for replay in replays])  # (shuffles, cycles)
+    cost = float(of_parts.mean())
+    luck = float(student.ppf(1.0 - ERROR_LEVEL / 2, max(1, n - 1))) * _order_error(of_parts.mean(1))
     return PolicyCost(
         policy=policy,
         expected_cost=cost_at(*(_expected_rate(error) for error in (bad, good))),
         cost=cost,
         lower=cost - math.hypot(cost - cost_at(bad.lower, good.lower), luck),
         upper=cost + math.hypot(cost - cost_at(bad.upper, good.upper), luck),
-        late=float(each[:, 2 * each.shape[1] // 3 :].mean()),
+        late=float(of_parts[:, 2 * of_parts.shape[1] // 3 :].mean()),
         verified=verified,
         accepted=accepted,
         rejected=rejected,
@@ -645,14 +663,17 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
 
 
 def _expected_rate(error: ErrorRate) -> float:
-    """Return the Jeffreys mean of a share of errors, whose unit is the part."""
+    """Return (wrong + 1/2) / (n + 1), where n counts different parts; 1/2 without any.
+
+    It is the posterior mean of a share of errors with the Jeffreys prior.
+    """
     n_wrong = error.traces * error.wrong / max(1, error.decided)
     return (n_wrong + 0.5) / (error.traces + 1)
 
 
-def _order_error(each: Floats) -> float:
-    """Return the standard error of a mean over shuffles, from its values in each, (shuffles,)."""
-    return float(each.std(ddof=1)) / math.sqrt(len(each)) if len(each) > 1 else 0.0
+def _order_error(means: Floats) -> float:
+    """Return the standard error of a mean over shuffles, from the mean of each, (shuffles,)."""
+    return float(means.std(ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else 0.0
 
 
 def _difference(
@@ -663,12 +684,17 @@ def _difference(
     Both have played the same shuffles. The standard error has the variance between parts, each
     with its sum over the shuffles, and between shuffles.
     """
-    pairs = zip(first, other, strict=True)
-    each = np.array([part_costs(one, costs) - part_costs(two, costs) for one, two in pairs])
-    mean = float(each.mean())
+    differences = np.array(
+        [
+            part_costs(left, costs) - part_costs(right, costs)
+            for left, right in zip(first, other, strict=True)
+        ]
+    )
+    mean = float(differences.mean())
     parts = np.concatenate([replay.index for replay in first])
-    sums = np.bincount(parts, (each - mean).ravel())
-    return mean, math.hypot(float(np.sqrt((sums**2).sum())) / each.size, _order_error(each.mean(1)))
+    sums = np.bincount(parts, (differences - mean).ravel())
+    part_error = float(np.sqrt((sums**2).sum())) / differences.size
+    return mean, math.hypot(part_error, _order_error(differences.mean(1)))
 
 
 def part_costs(replay: Replay, costs: Costs) -> Floats:

@@ -152,6 +152,14 @@ def test_as_many_parts_as_are_missing_turn_may_pay_into_pays(kinds: dict[str, in
     assert missing.accepted == pytest.approx(kinds["accepted"] * scale, rel=0.03, abs=1)
 
 
+def test_a_policy_whose_every_reject_was_wrong_has_a_verdict_and_a_sentence() -> None:
+    replays = [played(LAX, seed, 74, 75, 0, rejected=1, good=1) for seed in range(4)]
+    result = curve_of({LAX: replays}, Costs(5, 600, 30))
+    assert (result.verdict, result.rows[0].good.upper) == ("may pay", 1.0)
+    assert result.missing is not None
+    assert "Not certainly" in result.sentence
+
+
 def test_what_is_missing_is_stated_in_parts_recordings_and_production() -> None:
     result = alone(50)
     missing = result.missing
