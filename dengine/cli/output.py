@@ -361,20 +361,25 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
 @contextmanager
 def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Write a line to stderr every `LINE_SECONDS` while the block runs, as `progress_bar` does."""
-    steps: list[int] = []
+    n_steps = 0
     ended = Event()
+
+    def advance(n: int) -> None:
+        """Count n more steps."""
+        nonlocal n_steps
+        n_steps += n
 
     def write_lines() -> None:
         """Write until the block ends."""
         begin = time.monotonic()
         while not ended.wait(LINE_SECONDS):
             seconds = format_duration(time.monotonic() - begin)
-            text = f"{label}: {sum(steps):,} of {total or '?'} in {seconds}"
+            text = f"{label}: {n_steps:,} of {total or '?'} in {seconds}"
             click.echo(without_password(text), err=True)
 
     Thread(target=write_lines, daemon=True).start()
     try:
-        yield steps.append
+        yield advance
     finally:
         ended.set()
 

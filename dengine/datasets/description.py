@@ -411,11 +411,11 @@ class Description:
 
         Raises DataError for a column that it does not name.
         """
-        known = {column: Channel(column, unit) for column, unit in self.ignored.items()}
-        known |= {channel.column: channel for channel in self.channels}
+        channels = {column: Channel(column, unit) for column, unit in self.ignored.items()}
+        channels |= {channel.column: channel for channel in self.channels}
         for column in columns:
-            expect_one_of(known, column, "[channels] and [ignored]")
-        return replace(self, channels=tuple(known[column] for column in columns))
+            expect_one_of(channels, column, "[channels] and [ignored]")
+        return replace(self, channels=tuple(channels[column] for column in columns))
 
 
 # The sections, in the order of the file, and what their tables are made of; None: texts.
@@ -449,12 +449,13 @@ KINDS: dict[Any, str] = {
 
 
 def _made(kind: Any, value: Any, where: str, choices: Words = ()) -> Any:
-    """Return what TOML states as a section, or in the type of its key; raise DataError if it is
-    none.
+    """Return what TOML states as a dataclass, or in the type of its key.
 
-    A lone value of several is one of them.
+    Where several values are expected, a single one stands for a list of one. Raises DataError for
+    an unknown key, and for a value of another type.
     """
-    origin, args = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    args = get_args(kind)
     if origin is tuple:
         items = value if isinstance(value, list | tuple) else [value]
         return tuple(_made(args[0], item, where) for item in items)
@@ -463,14 +464,14 @@ def _made(kind: Any, value: Any, where: str, choices: Words = ()) -> Any:
     expect_data(isinstance(value, Mapping), f"{where} to be a table", value)
     if origin is Mapping:
         return {name: _made(args[1], item, f"{where}.{name}") for name, item in value.items()}
-    known = {about.name: about for about in fields(kind) if about.compare}
-    made = {}
+    keys = {about.name: about for about in fields(kind) if about.compare}
+    values = {}
     for name, item in value.items():
-        expect_one_of(known, name, where)
-        about = known[name]
+        expect_one_of(keys, name, where)
+        about = keys[name]
         choices = about.metadata.get("choices", ())
-        made[name] = _made(about.type, item, f"{where}, {name}", choices)
-    return kind(**made)
+        values[name] = _made(about.type, item, f"{where}, {name}", choices)
+    return kind(**values)
 
 
 def _as_kind(kind: Any, value: Any, where: str, choices: Words) -> Any:
@@ -488,11 +489,11 @@ def _as_kind(kind: Any, value: Any, where: str, choices: Words) -> Any:
     return float(value) if kind is float else value
 
 
-def expect_one_of(known: Iterable[str], name: str, where: str) -> None:
-    """Raise DataError for a name that is not known, with the nearest that is, or all of them."""
-    nearest = difflib.get_close_matches(name, known, 1)
-    wanted = repr(nearest[0]) if nearest else f"one of {', '.join(known)}"
-    expect_data(name in known, f"{wanted} in {where}", name)
+def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
+    """Raise DataError if a name is not one of these; it suggests the nearest, or lists them all."""
+    nearest = difflib.get_close_matches(name, names, 1)
+    wanted = repr(nearest[0]) if nearest else f"one of {', '.join(names)}"
+    expect_data(name in names, f"{wanted} in {where}", name)
 
 
 def _plain(value: Any) -> Any:

@@ -73,8 +73,8 @@ class Table:
     def column(self, name: str) -> Cells:
         """Return a column; raise UnreadableError if there is none of this name."""
         if name not in self.columns:
-            found = listed(self.columns) or "none"
-            raise UnreadableError(f"Expected a column {name}, got {found}", self.header, name)
+            columns = listed(self.columns) or "none"
+            raise UnreadableError(f"Expected a column {name}, got {columns}", self.header, name)
         return self.columns[name]
 
     def take(self, rows: Any) -> "Table":
@@ -116,9 +116,9 @@ class Table:
         """Raise UnreadableError for the first cell of a column that is bad, if one is."""
         if is_bad.any():
             row = int(is_bad.argmax())
-            found = shortened(self.columns[name][row : row + 1].tolist()[0])
+            cell = shortened(self.columns[name][row : row + 1].tolist()[0])
             column = self.origin[name][row] if name in self.origin else name
-            raise UnreadableError(f"Expected {wanted}, got {found}", self.line(row), column)
+            raise UnreadableError(f"Expected {wanted}, got {cell}", self.line(row), column)
 
     def line(self, row: int) -> int:
         """Return the line of a row; 0 if it is not known."""

@@ -288,15 +288,14 @@ class Certificate:
         and it cannot escape. It may be negative: then not checking may have cost money. None
         without prices.
         """
-        ledger = self._ledger
-        return None if ledger is None else ledger[0] - ledger[1]
-
-    @property
-    def _ledger(self) -> tuple[float, float] | None:
-        """What the checks that were left out would have cost, and what bad parts cost at most."""
         if self.prices is None:
             return None
-        check, escape, _ = self.prices
+        checks, escapes = self._checks_and_escapes(self.prices)
+        return checks - escapes
+
+    def _checks_and_escapes(self, prices: tuple[float, float, float]) -> tuple[float, float]:
+        """Return what the checks that were left out would have cost, and bad parts cost at most."""
+        check, escape, _ = prices
         n_unchecked = self.accepted.n_unchecked
         n_escaped = min(n_unchecked, self.accepted.n * self.accepted.upper)
         return n_unchecked * check, escape * n_escaped
@@ -322,11 +321,11 @@ class Certificate:
         )
         which = "that went on without a check"
         claim = self._claim(self.accepted, which, "accept", "bad", unknown)
-        if self.prices is None or self._ledger is None:
+        if self.prices is None:
             return claim
         n_unchecked = self.accepted.n_unchecked
         if self.accepted.upper < 1.0 and n_unchecked:
-            checks, escapes = self._ledger
+            checks, escapes = self._checks_and_escapes(self.prices)
             balance = math.floor(checks - escapes)
             result = f"at least {balance:,} was saved"
             if balance <= 0:

@@ -121,7 +121,7 @@ class PricedRule(MemberRule):
     """
 
     sorts = True
-    prior_labels = 3.0  # its levels are probabilities, of which the first ones are too sure
+    prior_labels = 3.0  # its levels are probabilities, so the first escapes come from few labels
 
     def __init__(
         self,

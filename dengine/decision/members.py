@@ -44,6 +44,7 @@ CLOSED = 2.0  # a threshold that no score reaches
 OVERDRAFT = 1.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
 FALSE_ALARMS = 100.0  # at the tolerance itself one alarm in 100 / alpha parts on average, or fewer
 NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
+FEWEST_SINCE_ALARM = 25.0  # members: an account over fewer says little
 FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1 / NOVEL_SHARE - 1
 
 
@@ -181,7 +182,7 @@ class MemberEvidence(nn.Module):
             self.recovery_steps = self.level_steps
             self.level_minimum = [-OVERDRAFT, 0.0]
             self.recovery_minimum = 0.0
-            self.fewest_since_alarm = 25.0  # an account over fewer says little
+            self.fewest_since_alarm = FEWEST_SINCE_ALARM
         # Of a detector, what a wrong part adds, where a right one takes 1, and the alarm's limit.
         detectors = [cusum(share, FALSE_ALARMS / alpha) for share in (*tolerances, NOVEL_SHARE)]
         self.error_steps = [float(step) for step, _ in detectors]
@@ -382,10 +383,11 @@ class MemberEvidence(nn.Module):
         return weighted_sum(counts, self.level_steps[side]) >= self.level_minimum[side]
 
     def members_to_recovery(self, side: int) -> float:
-        """Return how many more members since the alarm recovery takes, if they go on like now.
+        """Return how many more members a side needs to recover, if they go on like since the alarm.
 
-        It is 0 or less if they show recovery, so that the side may open again, and beyond all
-        bounds if their evidence does not grow.
+        It is 0 or less once they show recovery, so that the side may open again. It is huge, about
+        1e12, while more evidence is needed and it does not grow. The priced rule needs at least
+        `FEWEST_SINCE_ALARM` members.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

@@ -16,11 +16,13 @@ SAFE_MODE = REASONS.index(Reason.SAFE_MODE)
 
 
 def fade(probability: float, n_labels: int, prior_labels: float) -> float:
-    """Return a probability whose logit is multiplied by n / (n + `prior_labels`).
+    """Return a probability that is drawn towards 1/2 while a model has learned from few labels.
 
-    A model that has learned from few labels is too sure. So its probability is drawn towards 1/2,
-    by a prior that is worth so many labels and fades as their number n grows.
+    Its logit is multiplied by n / (n + `prior_labels`), where n is the number of labels. Without
+    `prior_labels` the probability stays.
     """
+    if prior_labels == 0.0:
+        return probability
     share = n_labels / (n_labels + prior_labels)
     success: float = probability**share
     failure: float = (1.0 - probability) ** share
@@ -89,8 +91,7 @@ class RadiusNeighbours(nn.Module):
         n_success, n_failure = self.references.count_near(distances, self.radius)
         if self.scored:
             score = float(z.select(1, 0).mean().item())
-            if self.prior_labels > 0.0:
-                score = fade(score, distances.size(0), self.prior_labels)
+            score = fade(score, distances.size(0), self.prior_labels)
             return self.rule.action(score, score), score, score, n_success, n_failure
         action, lower, upper = self.rule(n_success, n_failure)
         return action, lower, upper, n_success, n_failure

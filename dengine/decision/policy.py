@@ -32,8 +32,6 @@ RULES = {  # names in `member_rules`, by guarantee and by which line stops are k
 NO_WINDOWS = "none"
 # Squared, it is finite in float32, so that a query's own part, infinitely far, is never within it.
 LARGEST_RADIUS = 1e18
-
-
 PRICES = (5.0, 120.0, 47.5)  # seconds: the paper's check, a line stop, and the paper's cycle
 AUDIT_RATE = 0.05  # that prices without a guarantee imply
 

@@ -64,7 +64,8 @@ class DecisionRule(nn.Module):
     sorts : bool
         Class attribute: whether the bound only sorts parts, so that any score could take its place.
     prior_labels : float
-        Class attribute: labels that the prior of a predicted probability is worth; 0: it has none.
+        Class attribute: how strongly a predicted probability is drawn towards 1/2 while labels are
+        few, as a number of labels (`neighbours.fade`); 0: not at all.
     scriptable : bool
         Whether this rule with its interval can be compiled.
     accept_threshold, reject_threshold : float

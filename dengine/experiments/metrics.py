@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..decision.intervals import wilson_interval
+from ..decision.policy import PRICES
 from ..errors import expect
 from ..records import is_number
 
 # What was decided -> the field of `Replay` that marks the wrong ones among them.
 SIDES = {"accepted": "false_positive", "rejected": "false_negative"}
-VERIFY_SECONDS = 5.0  # what a height check adds to a cycle, in the paper's cell
-# The paper: an insertion takes 45 to 50 s; a good part that was rejected takes one more.
-CYCLE_SECONDS = 47.5
-# A line stop, operator included: of the simulated cell, the paper gives none.
-STOP_SECONDS = 120.0
+# What a height check adds to a cycle in the paper's cell; a line stop of the simulated cell,
+# operator included, since the paper gives none; and the paper's cycle, 45 to 50 s: a good part that
+# was rejected takes one more.
+VERIFY_SECONDS, STOP_SECONDS, CYCLE_SECONDS = PRICES
 
 
 @dataclass(frozen=True, slots=True)

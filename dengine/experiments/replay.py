@@ -578,9 +578,9 @@ def replay(
 def replay_policy(scores: Replay, policy: Policy) -> Replay:
     """Play a policy on the scores of a replay in shadow mode, without its model.
 
-    The decisions are those of a replay under the policy if every label becomes known there. So the
-    policy must have `stops="all"`, and the labels of parts that it rejects are what its model would
-    not have learned. Audits are drawn anew; what an operator's limits reject is verified.
+    The policy needs `stops="all"`, so that every label but those of rejected parts becomes known.
+    One difference from a replay of its own stays: the scores come from a model that has learned the
+    rejected parts as well. Audits are drawn anew; what an operator's limits reject is verified.
 
     Parameters
     ----------
@@ -591,7 +591,7 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     Returns
     -------
     replay : Replay
-        With the actions of the policy.
+        With the actions and the recipe of the policy; all else is as in `scores`.
     """
     import torch
 

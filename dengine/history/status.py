@@ -558,9 +558,10 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
 def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | None:
     """Return how close the detectors of drift are to an alarm, by the rule as it is now.
 
-    The rule is the stored one, updated with all outcomes since. None if the rule has no detectors,
-    as "local" with stops="some", or cannot be restored. In a safe mode that novel traces began,
-    the detectors are at 0. `mode` is the newest event at which a safe mode began or ended.
+    In safe mode the result also says in words how far its end is. The rule is the stored one,
+    updated with all outcomes since. None before the first version, and if the rule has no
+    detectors, as "local" with stops="some", or cannot be restored. In a safe mode that novel traces
+    began, the three values are 0. `mode` is the newest event at which a safe mode began or ended.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule

@@ -135,7 +135,7 @@ def as_text(text: str) -> str:
 def check_state(
     report: RetrainReport, state: Mapping[str, NDArray[Any]] | None
 ) -> dict[str, NDArray[Any]] | None:
-    """Return copies of a version's arrays, by name; None for a dropped candidate without arrays.
+    """Check a version's arrays and return copies of them, by name; None if there are none.
 
     Raise StoreError for an accepted version without arrays, and for an array of Python objects,
     which would need a pickle.

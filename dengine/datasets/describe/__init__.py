@@ -1,7 +1,7 @@
 """Propose what recordings are, by looking at some of them: the only place that infers anything.
 
-A value stands where a rule proves it, with its evidence as a comment; otherwise it is `?`, with the
-candidates. `load_dataset` then reads exactly what the description says.
+A value is written only if a rule proves it, with its evidence as a comment; else it is `?`, with
+the candidates. `load_dataset` then reads exactly what the description says.
 """
 
 import re
@@ -174,7 +174,8 @@ def tables_in(p: Proposal, content: bytes, name: str) -> Tables:
 
     The only archive holds all parts if its arrays hold curves. Raises DataError if it is damaged.
     """
-    kind, layout = p.description.format, p.stated.get("layout", "")
+    kind = p.description.format
+    layout = p.stated.get("layout", "")
     if kind == "npz" and (layout == "npz" or (len(p.names) == 1 and not layout)):
         parts = part_tables(content, name)
         if any(len(cells) > 1 for cells in parts[0].columns.values()):

@@ -1,4 +1,4 @@
-"""Which columns are the clock, in which form, and at which rate they tick."""
+"""Which columns are the clock, in which form, and at which rate the samples follow each other."""
 
 import re
 from collections import defaultdict
@@ -126,7 +126,8 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
     rising = column.steps[column.steps > 0]
     if not len(rising):
         return UNKNOWN, "no form of times that is known fits"
-    first, step = float(column.numbers[0][0]), float(np.median(rising))
+    first = float(column.numbers[0][0])
+    step = float(np.median(rising))
     for unit, zero, title in EPOCHS:
         scale = scale_of(unit)
         if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):

@@ -1,4 +1,4 @@
-"""`Column`, what the cells of one column are in all recordings, and `Proposal`, what is known."""
+"""`Column`, one column in all recordings, and `Proposal`, the description so far."""
 
 import re
 from collections import Counter
@@ -125,10 +125,11 @@ def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
 class Proposal:
     """A description that is put together key by key, and what its keys are inferred from.
 
-    stated : keys that the user knows. base : the folder. names : of all recordings, if each is a
-    file. others : of the files beside them. is_cut : whether some file was read in part. places :
-    where each recording stands that was looked at, by its source. columns : of the rows that are
-    samples, as far as that is known.
+    stated : keys that the user gave, with their values. description : with all keys so far. base :
+    the folder. names : the recordings' files, if each is one. others : the other files. is_cut :
+    whether some file was read in part. places : the place of each recording that was looked at, by
+    its source. columns : of the rows that are samples, as far as that is known. notes : a comment
+    for each key that needs one.
     """
 
     stated: Stated

@@ -1,7 +1,8 @@
 """Every place that may hold the labels, counted, and whether those places agree.
 
-A word means good or bad only if it is one of a short list of plain verdicts in a place of its own:
-the end of a name, a folder, a cell of a column, or a line, whose name is a verdict's.
+A word means good or bad only if it is one of a short list of plain verdicts, and stands by itself:
+at the end or beginning of a file's name, as a folder, or in a column or line whose name says that
+it holds a verdict.
 """
 
 import re
@@ -74,8 +75,8 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     words = sorted({*words})
     verdicts = (*_verdicts(source, {word.lower() for word in words}), UNCHECKED)
     about: dict[str, Any] = {
-        key: getattr(source, key) or tuple(word for word in words if word.lower() in some)
-        for key, some in zip(("good", "bad", "unchecked"), verdicts, strict=True)
+        key: getattr(source, key) or tuple(word for word in words if word.lower() in group)
+        for key, group in zip(("good", "bad", "unchecked"), verdicts, strict=True)
     }
     is_one_sided = source.path and not (about["good"] and about["bad"])
     if is_one_sided or {*words}.difference(*about.values()):
@@ -181,7 +182,8 @@ def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
 
     Of columns and lines, these are the recordings that were looked at.
     """
-    label, parts = p.description.label, part_words(p.description.part, places)
+    label = p.description.label
+    parts = part_words(p.description.part, places)
     is_stated = any(getattr(label, kind) for kind in KINDS)
     paths = [place.path for place in places.values()]
     counted = dict[LabelSource, Words]()

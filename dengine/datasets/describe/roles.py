@@ -1,4 +1,6 @@
-"""The role of each column: of rows, of the clock, of parts, labels and channels, or ignored."""
+"""What each column is for: to tell which rows are samples, as clock, part, label or channel, or for
+nothing.
+"""
 
 import re
 from collections.abc import Mapping
@@ -60,8 +62,8 @@ def propose_roles(p: Proposal) -> None:
 
 def kept_rows(p: Proposal, table: Table) -> Table:
     """Return the rows of a table that are samples, as far as their words are known."""
-    known = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
-    plain = replace(p.description, rows=known, channels=())
+    stated = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
+    plain = replace(p.description, rows=stated, channels=())
     with suppress(DataError):
         return Reader(plain, LabelReader(LabelSource())).kept_rows(table)[0]
     return table
@@ -79,7 +81,8 @@ def qualify_rows(p: Proposal) -> None:
 
     Where the user states some words, the others are kept, or dropped if those to keep are stated.
     """
-    rows, unused = dict(p.description.rows), p.unused
+    rows = dict(p.description.rows)
+    unused = p.unused
     for name in rows.keys() & p.columns.keys():
         about = rows[name]
         named = {*about.keep, *about.drop, *about.invalid}
@@ -104,7 +107,8 @@ def qualifies(column: Column) -> bool:
     `Status` does, also if it has only one word; `TagName` does if it changes within a recording.
     Numbers do so only in a column with such a name, and labels do not.
     """
-    name, words = column.name, column.counts
+    name = column.name
+    words = column.counts
     is_named = QUALIFIER_NAME.search(name) is not None
     is_text = any(column.odd) and not CLOCK_NAME.search(name)
     varies = not column.fixed or (is_named and len(words) == 1)
@@ -120,12 +124,12 @@ def propose_part(p: Proposal) -> None:
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
     least = len(p.places) / 2
-    found = [s for s in sources if len({*part_words(s, p.places).values()}) > least]
-    if len(found) > 1:
-        names = listed(source.line or source.column[0] for source in found)
+    sources = [s for s in sources if len({*part_words(s, p.places).values()}) > least]
+    if len(sources) > 1:
+        names = listed(source.line or source.column[0] for source in sources)
         p.notes["part.column"] = f"may be one of {names}"
-    elif p.description.part == PartSource() and found:
-        p.description = replace(p.description, part=found[0])
+    elif p.description.part == PartSource() and sources:
+        p.description = replace(p.description, part=sources[0])
 
 
 def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
@@ -156,7 +160,9 @@ def _units(p: Proposal) -> dict[str, str]:
     """
     units = dict[str, str]()
     for column in p.unused:
-        name, odd, n = column.name, column.odd, column.counts.total()
+        name = column.name
+        odd = column.odd
+        n = column.counts.total()
         strange = [w for w, k in odd.items() if w.lower() not in LOST and k > STRANGE * n]
         is_number = len(column.counts) - len(odd) > 1 and odd.total() <= MOST_FREQUENT * n
         is_clock = CLOCK_NAME.search(name) and is_rising(column)

@@ -1,6 +1,6 @@
 """How text files are written: their encoding, delimiter, header, units and marks in numbers.
 
-Each value follows from a count over the lines that were looked at; where two fit, it is `?`.
+Each value follows from a count over the lines that were looked at. If two values fit, it is `?`.
 """
 
 import codecs
@@ -79,7 +79,8 @@ def look(content: bytes, stated: Stated) -> Look | None:
     marks = stated.get("text.delimiter", DELIMITERS)
     share, width, delimiter = max((*_share_of_numbers(lines, mark), mark) for mark in marks)
     if share == 0:  # a single column
-        delimiter, width = ",", 1
+        delimiter = ","
+        width = 1
     rows = [split_line(line, delimiter) if line.strip() else [] for line in lines]
     data = _first_row(rows, width)
     heads = [i for i in range(data) if len(rows[i]) >= width and any(map(str.strip, rows[i]))]
@@ -142,8 +143,11 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     These have another delimiter, another number of columns, or no column in common with most. If
     several have samples, it is asked why.
     """
-    found = {name: look(content, p.stated) for name, content in contents.items()}
-    looks = {name: form for name, form in found.items() if form is not None}
+    looks = {
+        name: form
+        for name, content in contents.items()
+        if (form := look(content, p.stated)) is not None
+    }
     if not looks:
         raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
     lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
@@ -209,7 +213,8 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     for mark, other in (".,", ",."):
         repeats = any(cell.count(other) > 1 for cell in seen[other])
         if proofs[mark] > 20 * proofs[other] or (repeats and not proofs[other]):
-            decimal, note = mark, ""
+            decimal = mark
+            note = ""
             group = other if seen[other] else group
     p.put("text.decimal", decimal, note)
     p.put("text.thousands", group)

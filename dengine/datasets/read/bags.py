@@ -1,8 +1,8 @@
 """Read ROS 2 bags as one table: a row for each message of the channels' topic.
 
 A channel is `TOPIC.FIELD`, like `/ft/wrench.wrench.force.z`. The column `stamp` has the times in
-the messages' headers, `log_time` those of the log, both in nanoseconds. A column with the name of
-another topic has the newest `data` of it.
+the messages' headers, `log_time` those of the log, both in nanoseconds. A column that is named like
+another topic has in each row the newest `data` of that topic.
 """
 
 import struct
@@ -143,7 +143,8 @@ def _stamp_of(message: Any) -> int:
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
     """Return the column of a topic beside the rows of the log; see `read_bag`."""
     messages.sort(key=itemgetter(0))
-    times, words = [time for time, _ in messages], [word for _, word in messages]
+    times = [time for time, _ in messages]
+    words = [word for _, word in messages]
     places = np.searchsorted(times, logs, side="left" if is_verdict else "right")
     if not is_verdict:
         return as_cells([words[i - 1] if i else None for i in places])

@@ -62,7 +62,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
         if len({1, len(seconds), len(relative)}) > 2:
             message = f"Expected {len(seconds)} times, got {len(relative)}"
             raise UnreadableError(message, column=name)
-        seconds, start = seconds + relative, start + first
+        seconds = seconds + relative
+        start += first
     return seconds, start
 
 
@@ -82,7 +83,8 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
         with suppress(ValueError, OverflowError):
             whole = cells.astype(np.int64)  # too long for a float, as nanoseconds since 1970 are
             times = whole if (whole == times).all() else times
-        values, first = (times - times[0]) * scale, float(times[0]) * scale
+        values = (times - times[0]) * scale
+        first = float(times[0]) * scale
         period = clock.wrap * scale
     return values + np.cumsum(np.diff(values, prepend=0.0) < -period / 2) * period, first
 
@@ -113,8 +115,11 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     A rate of 0 stands for any that is even: steps are then compared with their mean. Equal times
     are none that rise, unless any gap is allowed.
     """
-    steps, rate, column = np.diff(seconds), clock.rate_hz, " + ".join(clock.column)
-    n, span = len(steps), float(seconds[-1] - seconds[0])
+    steps = np.diff(seconds)
+    rate = clock.rate_hz
+    column = " + ".join(clock.column)
+    n = len(steps)
+    span = float(seconds[-1] - seconds[0])
     most = clock.gap / rate if rate else clock.gap * span / max(n, 1)
     is_equal = (steps == 0) & (clock.gap > 0 or span == 0)
     is_bad = (steps < 0) | is_equal | (steps > (most or np.inf))

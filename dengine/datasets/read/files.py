@@ -1,4 +1,4 @@
-"""The files that a description names, their content, and the faults in them."""
+"""The files that a description names, their content, and how errors in them become faults."""
 
 import fnmatch
 import gzip
@@ -67,7 +67,10 @@ def read_file(path: Path) -> bytes:
 
 @contextmanager
 def caught(faults: list[Fault], source: str) -> Iterator[None]:
-    """Context manager that puts an error into `faults`, with the file or part in which it is."""
+    """Context manager that turns a DataError of its block into a fault; the program goes on.
+
+    The fault, with `source`, the file or part, is appended to `faults`.
+    """
     try:
         yield
     except DataError as error:

@@ -1,8 +1,8 @@
 """Read JSON, Parquet tables, NumPy archives, UCR's `.ts` files and DataFrames as a `Table`.
 
 Nested objects become columns with dots in their names: `{"curve": {"force": [1, 2]}}` has the
-column `curve.force`, a list of pairs under `points` the columns `points.0` and `points.1`, and a
-list of objects the columns of their keys.
+column `curve.force`. A list of pairs under `points` has the columns `points.0` and `points.1`. A
+list of objects has a column for each of their keys.
 """
 
 import io
@@ -18,7 +18,6 @@ from ..description import TextForm
 from ..table import Cells, Table, UnreadableError
 from .text import to_utf8
 
-MOST_CHANNELS = 16  # an archive whose arrays have more rows holds parts
 DAMAGES = (LookupError, TypeError, ValueError)  # of lists of several forms
 Columns = dict[str, Cells]
 
@@ -30,15 +29,15 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
     lines = enumerate(text.split("\n"), 1) if has_lines else [(0, text)]
     for number, line in lines:
         try:
-            found = json.loads(line.strip() or "[]")
+            value = json.loads(line.strip() or "[]")
         except (ValueError, RecursionError) as error:
             do = "" if has_lines else '; if each line is an object, state format="jsonl"'
             raise UnreadableError(f"Expected JSON: {error}{do}", number) from error
-        for value in found if isinstance(found, list) else [found]:
-            if not isinstance(value, Mapping):
-                message = f"Expected an object of JSON, got {shortened(value)}"
+        for item in value if isinstance(value, list) else [value]:
+            if not isinstance(item, Mapping):
+                message = f"Expected an object of JSON, got {shortened(item)}"
                 raise UnreadableError(message, number)
-            tables.append(Table(source, columns_of("", value), [number]))
+            tables.append(Table(source, columns_of("", item), [number]))
     if not tables:
         raise UnreadableError("Expected objects of JSON, got none")
     return tables
@@ -84,8 +83,8 @@ def join(tables: Sequence[Table]) -> Table:
     """Return one table of tables with a row each, in the columns of the first."""
     columns: Columns = {}
     for name in tables[0].columns:
-        cells = [table.columns.get(name, np.empty(0)).tolist() for table in tables]
-        columns[name] = as_cells([some[0] if len(some) == 1 else None for some in cells])
+        rows = [table.columns.get(name, np.empty(0)).tolist() for table in tables]
+        columns[name] = as_cells([cells[0] if len(cells) == 1 else None for cells in rows])
     return Table(tables[0].source, columns, [table.line(0) for table in tables])
 
 
@@ -117,10 +116,10 @@ def part_tables(content: bytes, source: str) -> list[Table]:
     Parts are the first axis of the largest array. Arrays of another first axis hold for all parts.
     """
     arrays, _ = read_archive(content, name=source)
-    found = {name: np.atleast_1d(x) for name, x in arrays.items()}
-    n = len(max(found.values(), key=np.size, default=()))
+    arrays = {name: np.atleast_1d(x) for name, x in arrays.items()}
+    n = len(max(arrays.values(), key=np.size, default=()))
     parts = [
-        {k: np.atleast_1d(x[i]) if len(x) == n else x for k, x in found.items()} for i in range(n)
+        {k: np.atleast_1d(x[i]) if len(x) == n else x for k, x in arrays.items()} for i in range(n)
     ]
     return [Table(source, columns_of("", part), []) for part in parts]
 

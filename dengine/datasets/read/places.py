@@ -1,4 +1,6 @@
-"""Where a recording's label and part number stand: its path, its columns, a line, or a listing."""
+"""Where a recording's label and part number stand: in its path, in its columns, in a line above the
+header, or in a listing, which is a file with a row for each recording or part.
+"""
 
 import re
 from collections import defaultdict
@@ -126,7 +128,8 @@ class LabelReader:
         Its key in a listing is the part's number, the path, the file's name, or one of these
         without a suffix.
         """
-        source, path = self.source, place.path
+        source = self.source
+        path = place.path
         if not source.listing:
             return place.words(source, [source.column or source.topic], source.at)
         name = PurePosixPath(path).name
@@ -142,7 +145,8 @@ class LabelReader:
 
         Raises UnreadableError if there is no label, several, or a word of unknown meaning.
         """
-        source, words = self.source, self.words(place, part)
+        source = self.source
+        words = self.words(place, part)
         line = 0 if source.listing or source.path else place.table.line(0)
         labels = {self.meaning(word, line) for word in words}
         if len(labels) > 1:
@@ -153,12 +157,12 @@ class LabelReader:
     def meaning(self, word: str, line: int = 0) -> int | None:
         """Return what a word means; raise UnreadableError for an unknown one."""
         source = self.source
-        known: dict[str, int | None] = dict.fromkeys(source.unchecked)
-        known |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
-        if word not in known and ANY not in known:
-            message = f"Expected a label among {listed(known)}, got {shortened(word)}"
+        meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
+        meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
+        if word not in meanings and ANY not in meanings:
+            message = f"Expected a label among {listed(meanings)}, got {shortened(word)}"
             raise UnreadableError(message, line, source.column)
-        return known.get(word, known.get(ANY))
+        return meanings.get(word, meanings.get(ANY))
 
     def unused_note(self) -> str:
         """Return a note on the rows of the listing that name no recording; "" if all do."""

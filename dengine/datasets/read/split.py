@@ -114,7 +114,8 @@ def _split_rows(table: Table, name: str, description: Description, faults: list[
     for key, group in pd.Series(kept).groupby(keys, sort=False):
         rows = group.to_numpy()
         source = f"{name}, {' '.join(key)}"
-        first, last = int(rows[0]), int(rows[-1])
+        first = int(rows[0])
+        last = int(rows[-1])
         is_whole = last - first < len(rows)
         near = [row for row in damaged if first - 1 <= row <= last + 1]
         if near:

@@ -58,13 +58,16 @@ def read_text(
         of cells.
     """
     content = to_utf8(content, form.encoding)
-    header, above = form.header, 0
+    header = form.header
+    above = 0
     if isinstance(header, str):
-        begin, lines = header.encode(), enumerate(io.BytesIO(content), 1)
+        begin = header.encode()
+        lines = enumerate(io.BytesIO(content), 1)
         header = above = next((i for i, line in lines if line.startswith(begin)), 0)
         if not header:
             raise UnreadableError(f"Expected a header that begins with {form.header!r}, got none")
-    first, units = form.data + above, form.units and form.units + above
+    first = form.data + above
+    units = form.units and form.units + above
     end = content.rstrip(b"\n").count(b"\n") + 2
     if first >= end or not content.strip():
         line = first if content.strip() else 0
@@ -170,7 +173,8 @@ def _read_plain(
 
 def _read_strictly(content: bytes, table: Table, form: TextForm, keep_damaged: bool) -> Table:
     """Return the table with the cells of a text, without lines that are empty or dropped."""
-    names, lines = [*table.columns], enumerate(content.decode().split("\n"), 1)
+    names = [*table.columns]
+    lines = enumerate(content.decode().split("\n"), 1)
     rows = {
         i: split_line(line, form.delimiter)
         for i, line in lines

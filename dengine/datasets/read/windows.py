@@ -51,24 +51,29 @@ def cut(table: Table, name: str, description: Description, base: Path) -> Parts:
 
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
     """Yield the number, the rows and the fault of each part that a trigger begins."""
-    samples, rate = description.traces.samples, description.time.rate_hz
+    samples = description.traces.samples
+    rate = description.time.rate_hz
     if not rate:
         raise DataError("Expected time.rate_hz, by which a trigger cuts.")
     trigger = as_trigger(description.windows.trigger)
     signals = {signal: table.numbers(signal, description.text) for signal in trigger.signals}
     finder = StartFinder(1 / rate, trigger.quiet_s)
-    number, free = 0, 0
+    number = 0
+    free = 0  # the first row behind the newest part
     for i, (time, is_on) in enumerate(zip(times, trigger.active(signals), strict=True)):
         start = finder.feed(time, is_on)
         if start is not None and i >= free:
-            number, free = number + 1, i + samples
+            number += 1
+            free = i + samples
             fault = "" if start.seen else "Expected its first sample, which fell into a gap"
             yield str(number), slice(i, free), fault
 
 
 def _listed(table: Table, times: Floats, description: Description, base: Path) -> Windows:
     """Yield the key, the rows and the fault of each window, in the order of their starts."""
-    about, form, clock = description.windows, description.text, Clock(zone=description.time.zone)
+    about = description.windows
+    form = description.text
+    clock = Clock(zone=description.time.zone)
     bounds = []
     with in_listing(about.listing):
         listing = listing_table(base / about.listing, (about.key, about.start, about.end), form)
@@ -78,11 +83,14 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
             bounds.append(relative + first)
     begins, ends = np.array(bounds) - TOLERANCE
     if ends.max() < EPOCH <= times[0]:
-        begins, ends = begins + times[0], ends + times[0]
+        begins += times[0]
+        ends += times[0]
     step = 1.5 / (description.time.rate_hz or np.inf) + TOLERANCE
     latest = -np.inf
     for i in np.argsort(begins, kind="stable"):
-        begin, end, fault = begins[i], ends[i], ""
+        begin = begins[i]
+        end = ends[i]
+        fault = ""
         inside = np.flatnonzero((times >= begin) & (times < end))
         if begin < latest - TOLERANCE:
             fault = "Expected windows apart, it overlaps the one before"
