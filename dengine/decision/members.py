@@ -15,7 +15,7 @@ most alpha while that claim is true. So the pooled rule opens a level while the 
 1 / alpha. Statement, assumptions, proof and references: docs/explanation/pooled_proof.md.
 
 *The account.* The priced rule counts what accepting all members would have cost beyond checking
-them, in units of one false accept, and opens a level while the balance is at least -1.
+them, in units of one false accept, and opens a level while the balance is at least -3.
 
 *Safe mode.* A mean over all members reacts late to drift. So CUSUM detectors (`certificate.cusum`)
 watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm every
@@ -41,7 +41,7 @@ BET = 0.55  # share of the largest stake; best for failure rates of nearly half 
 N_RECENT = 50  # newest outcomes of a level that are tested by themselves
 TAIL_PROBABILITY = 0.2  # at most, of the allowed number of errors among them at the tolerance
 CLOSED = 2.0  # a threshold that no score reaches
-OVERDRAFT = 1.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
+OVERDRAFT = 3.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
 FALSE_ALARMS = 100.0  # at the tolerance itself one alarm in 100 / alpha parts on average, or fewer
 NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
 FEWEST_SINCE_ALARM = 25.0  # members: an account over fewer says little
@@ -181,6 +181,7 @@ class MemberEvidence(nn.Module):
             ]
             self.recovery_steps = self.level_steps
             self.level_minimum = [-OVERDRAFT, 0.0]
+            self.max_recent_errors = [N_RECENT] * 2  # the account and the detectors are enough
             self.recovery_minimum = 0.0
             self.fewest_since_alarm = FEWEST_SINCE_ALARM
         # Of a detector, what a wrong part adds, where a right one takes 1, and the alarm's limit.
@@ -348,11 +349,11 @@ class MemberEvidence(nn.Module):
         """Set target level and threshold of one side, 0 accept or 1 reject, from the counts.
 
         The target is the lowest level whose parts since the last alarm pass the bet (or, under the
-        priced rule, the account) and whose newest parts have few errors; if there is none, it is
-        the strictest level. The threshold is the target's score if such a level was found, the
-        members of all time pass, and those since an alarm show recovery; else it is `CLOSED`. The
-        watched rule has no target: its threshold stays, and after an alarm is the first level again
-        once the members since then show recovery.
+        priced rule, the account) and, under the pooled rule, whose newest parts have few errors; if
+        there is none, it is the strictest level. The threshold is the target's score if such a
+        level was found, the members of all time pass, and those since an alarm show recovery; else
+        it is `CLOSED`. The watched rule has no target: its threshold stays, and after an alarm is
+        the first level again once the members since then show recovery.
         """
         is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it

@@ -13,9 +13,9 @@ that no policy pays by the limits, which are the same under each.
 The candidates are levels of LB around break-even, 1 - check / escape, and the guarantees "pooled"
 and "cost". `PolicySearch` halves them: all play two shuffles, the cheaper half plays two more, and
 so on. The last two play fresh shuffles, which are all that is reported, so that no figure was
-picked for being small. With `stops="all"` the early rounds replay one engine that checks every
-part, and play each candidate's rule on its scores (`replay_policy`): only labels of rejected parts
-tell it apart from replays of their own, which the last two have.
+picked for being small. The early rounds replay one engine that checks every part, and play each
+candidate's rule on its scores (`replay_policy`): in replays of their own, which the last two have,
+they would learn fewer labels.
 
 The interval has the luck of the recordings and of the order: the shares of wrong decisions at the
 ends of their intervals, whose unit is the part, and the spread over the shuffles.
@@ -370,11 +370,10 @@ class PolicySearch:
             self._add(contender, changes, self._cycles * float(data.y.mean()))
         do = f"this is what they lack: {'; '.join(self.out_of_reach)}"
         expect(bool(self.remaining), "recordings enough for one policy", len(data), do)
-        # Plays the scores of all candidates; None where they would learn other labels.
+        # Plays the scores of all candidates; a baseline has none.
         self._scores: Contender | None = None
-        policy = contender.recipe.policy
-        if contender.baseline is None and policy.stops == "all":
-            shadow = Policy(shadow=True, windows=policy.windows)
+        if contender.baseline is None:
+            shadow = Policy(shadow=True, windows=contender.recipe.policy.windows)
             self._scores = replace(contender, recipe=replace(contender.recipe, policy=shadow))
         self._screened: dict[Policy, dict[int, Replay]] = defaultdict(dict)
         self._reported: dict[Policy, dict[int, Replay]] = defaultdict(dict)

@@ -578,9 +578,10 @@ def replay(
 def replay_policy(scores: Replay, policy: Policy) -> Replay:
     """Play a policy on the scores of a replay in shadow mode, without its model.
 
-    The policy needs `stops="all"`, so that every label but those of rejected parts becomes known.
-    One difference from a replay of its own stays: the scores come from a model that has learned the
-    rejected parts as well. Audits are drawn anew; what an operator's limits reject is verified.
+    What becomes known is as in a replay of its own: checks, audits and line stops, and with
+    `stops="all"` that an accepted part was good. One difference stays: the scores come from a model
+    that has learned all labels. Audits are drawn anew; what an operator's limits reject is
+    verified.
 
     Parameters
     ----------
@@ -602,6 +603,7 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     asked = np.isin(scores.reason, ASKED)
     novel = scores.novel
     actions = np.zeros(len(scores), dtype=np.int64)
+    n_silent = 0
     with torch.inference_mode():
         for i, success in enumerate(scores.truth.tolist()):
             predicted = 0
@@ -615,9 +617,14 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
                 counts = int(scores.n_success[i]), int(scores.n_failure[i])
                 predicted, lower, upper = rule(*counts)
             actions[i] = 0 if audited[i] else predicted
-            if actions[i] != 2:  # nobody learns whether a rejected part was good
-                asked_with = policy.audited_share if predicted else 1.0
-                rule.observe(0, bool(novel[i]))
-                rule.update(lower, upper, success, predicted, 0.0 if actions[i] else asked_with)
+            if actions[i] == 2:  # nobody learns whether a rejected part was good
+                continue
+            if actions[i] == 1 and success and policy.stops != "all":
+                n_silent += 1
+                continue
+            asked_with = policy.audited_share if predicted else 1.0
+            rule.observe(n_silent, bool(novel[i]))
+            rule.update(lower, upper, success, predicted, 0.0 if actions[i] else asked_with)
+            n_silent = 0
     recipe = replace(scores.recipe, policy=policy)
     return replace(scores, action=np.array(ACTIONS)[actions].astype(np.str_), recipe=recipe)

@@ -56,7 +56,7 @@ def outcomes(
     """
     p_good = np.where(parts["lower"] > 0.5, 0.99, 0.01)
     if t % 400 > 340:  # the one side fails, or the other
-        p_good = np.full(N_REPLAYS, [0.1, 0.9][t // 400 % 2])
+        p_good = np.full(N_REPLAYS, [0.3, 0.9][t // 400 % 2])
     success = rng.random(N_REPLAYS) < p_good
     asked = (actions == 0) | (rng.random(N_REPLAYS) < q)
     inclusion = np.where(asked, np.where(actions == 0, 1.0, q), 0.0)

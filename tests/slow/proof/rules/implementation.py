@@ -29,7 +29,7 @@ NOVEL_SHARE = 0.2
 CALM = 25.0
 ENDINGS = {"local": "likelihood", "pooled": "bet", "cost": "account"}
 FEWEST_SINCE_ALARM = 25
-OVERDRAFTS = (1.0, 0.0)  # of accepting and of rejecting, in wrong decisions
+OVERDRAFTS = (3.0, 0.0)  # of accepting and of rejecting, in wrong decisions
 BET_SHARES = np.array([0.05, 0.1, 0.2, 0.4, 0.7, 0.98])
 
 
@@ -205,8 +205,8 @@ class Side:
             members_keep = self.balance(members) >= -self.overdraft
         else:
             good = self.level_capital[rows] >= self.needed
+            good &= self.last_wrong[0, rows] <= self.n_reached[rows] - N_NEWEST
             members_keep = self.log_capital(members) >= self.needed
-        good &= self.last_wrong[0, rows] <= self.n_reached[rows] - N_NEWEST
         any_good = good.any(axis=1)
         lowest = good.shape[1] - 1 - good[:, ::-1].argmax(axis=1)
         alarmed = in_safe_mode[rows] | (since != members).any(axis=0)

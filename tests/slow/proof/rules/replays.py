@@ -6,12 +6,12 @@ What is judged at each moment at which the rule would accept a part:
 
 - **pooled**: the mean failure probability of all members so far is at most the tolerance.
 - **cost**, all outcomes known: accepting the members whose outcomes were reported has cost at most
-  one false accept more than checking them. This follows from the rule itself, so no replay may
+  three false accepts more than checking them. This follows from the rule itself, so no replay may
   break it.
 - **cost**, audited: the rule's account is an estimate. With A the estimate and B the account of
   all outcomes, exp(s (B - A)) divided by the product of its conditional means is a martingale for
   every fixed s. By Ville's inequality it reaches 1 / alpha with a probability of at most alpha,
-  which is what is judged, with s = `SLOPE`. Where it stays below, B is at most 1 plus the margin
+  which is what is judged, with s = `SLOPE`. Where it stays below, B is at most 3 plus the margin
   (log(1 / alpha) + the sum of the logarithms of these means) / s.
 - **local** promises nothing about many parts. Its rows show safe modes only.
 
@@ -26,6 +26,7 @@ from scipy.optimize import minimize_scalar
 
 from .implementation import (
     ACCEPT,
+    OVERDRAFTS,
     REJECT,
     VERIFY,
     Bools,
@@ -277,7 +278,7 @@ class JudgedReplays:
 
     def _judge(self, accepts: Bools) -> None:
         """Judge the promise in the replays that accept at this moment."""
-        self.over_account |= accepts & (self.account > 1.0 + 1e-9)
+        self.over_account |= accepts & (self.account > OVERDRAFTS[0] + 1e-9)
         if self.case.rule == "pooled":
             excess = self.sum_members - self.tolerance * self.n_members
             self.broke |= accepts & (excess > 1e-9)
