@@ -108,7 +108,6 @@ class KeptReplays:
             task.shuffle,
             task.confirm,
             contender.baseline,
-            dict(contender.params),
             contender.recipe.to_toml(),
             # A transformer with everything that it holds: arrays and functions too.
             reducer,
