@@ -310,18 +310,22 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
             )
             wrong.append(f"{n_wrong} {word} of {n_decided} {decided}")
         handles += certain.plot([], color=colour, label=f"{name}: {', '.join(wrong)}")
-    bounds = sorted({replay.recipe.policy.lower_bound for replay in all_replays})
-    for bound in bounds:
-        precision.axhline(100 * bound, label=f"LB = {100 * bound:g} %", **LIMIT)
-        tolerance = 100 * (1 - bound)
-        errors.axhline(tolerance, label=f"tolerance 100 - LB = {tolerance:g} %", **LIMIT)
+    bounds = sorted({100 * replay.recipe.policy.lower_bound for replay in all_replays})
+    tolerances = [100 - bound for bound in bounds]
+    for axes, levels, name in (
+        (precision, bounds, "LB"),
+        (errors, tolerances, "tolerance 100 - LB"),
+    ):
+        text = ", ".join(f"{level:g}" for level in levels)
+        for i, level in enumerate(levels):
+            axes.axhline(level, label="_" if i else f"{name} = {text} %", **LIMIT)
     finish(certain, 0, ylim=(0, 102), ylabel="certain\n[% of cycles]")
-    finish(precision, min(len(bounds), 4), ylabel="precision\n[% of accepted]")
-    precision.set_ylim(max(0.0, min(precision.get_ylim()[0], 100 * bounds[0] - 1)), 100.5)
+    finish(precision, ylabel="precision\n[% of accepted]")
+    precision.set_ylim(max(0.0, min(precision.get_ylim()[0], bounds[0] - 1)), 100.5)
     # At least half as much again above the tolerance: the panel shows whether errors keep to it.
-    highest = max(errors.get_ylim()[1], 150 * (1 - bounds[0]))
+    highest = max(errors.get_ylim()[1], 1.5 * tolerances[0])
     y_label = "bad of accepted, good of\nrejected (dashed) [%]"
-    finish(errors, min(len(bounds), 4), ylim=(0, highest), ylabel=y_label)
+    finish(errors, ylim=(0, highest), ylabel=y_label)
     windows = f"end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn"
     errors.set(xlabel=f"cycle ({windows})")
     figure.legend(handles=handles, loc="outside lower center", frameon=False, fontsize=SMALL)
