@@ -177,6 +177,23 @@ def is_database(path: Path) -> bool:
         return file.read(16).startswith(DATABASES)
 
 
+def toml_value(value: Any) -> str:
+    """Return a text, a number, a boolean, or a list or tuple of these, as TOML writes it.
+
+    Numbers of NumPy are taken as well; anything else is written as the text that `str` gives.
+    """
+    if isinstance(value, float):
+        return repr(float(value))  # JSON has no infinity
+    # JSON's texts, lists and booleans are TOML's, but for DEL, which TOML wants escaped.
+    text = json.dumps(value, ensure_ascii=False, default=_plain_value)
+    return text.replace("\x7f", "\\u007f")
+
+
+def _plain_value(value: Any) -> Any:
+    """Return a number of NumPy as Python's, anything else as its text."""
+    return value.item() if isinstance(value, np.generic) else str(value)
+
+
 def check_output(path: FilePath, force: bool = False) -> None:
     """Raise OutputError if a file must not be written.
 

@@ -9,7 +9,6 @@ The decisions of a run follow from its recipe, its data and its seed; nothing el
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import tomllib
@@ -23,6 +22,7 @@ import numpy as np
 
 from .decision.policy import Policy, check_radius
 from .errors import SettingError, StoreError, expect, instead, listed
+from .files import toml_value
 from .records import is_number, is_whole
 from .reducers import REDUCERS, class_default, make_reducer, reducer_class
 
@@ -364,26 +364,13 @@ def _with_none(table: Table) -> dict[str, Any]:
 
 
 def _table_text(name: str, values: Table) -> str:
-    """Return a table of TOML: its header, unless the name is "", and a line for each value."""
-    header = f"[{name}]\n" if name else ""
-    return header + "".join(f"{key} = {_value_text(value)}\n" for key, value in values.items())
+    """Return a table of TOML: its header, unless the name is "", and a line for each value.
 
-
-def _value_text(value: Any) -> str:
-    """Return a plain value, None, or a tuple as TOML writes it.
-
-    None becomes "none", and an item of a tuple that is not plain the text that `str` gives.
+    None becomes "none".
     """
-    if value is None:
-        return '"none"'
-    if isinstance(value, str):  # written as in JSON, except for one character
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
-    if isinstance(value, tuple):  # windows or prices
-        items = (item if isinstance(item, PLAIN) else str(item) for item in value)
-        return f"[{', '.join(map(_value_text, items))}]"
-    # The repr of a NumPy scalar names its type, which is not TOML.
-    plain = value.item() if isinstance(value, np.generic) else value
-    return str(plain).lower() if isinstance(plain, bool) else repr(plain)
+    header = f"[{name}]\n" if name else ""
+    texts = {key: toml_value("none" if value is None else value) for key, value in values.items()}
+    return header + "".join(f"{key} = {text}\n" for key, text in texts.items())
 
 
 RECIPES: dict[str, Recipe] = {

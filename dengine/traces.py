@@ -7,7 +7,6 @@ right shape, a NaN, a dead or a saturated sensor, and `ForceLimitsGate` whether 
 operator's limits: such a part is verified or rejected. Both are scripted into exported files.
 """
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,24 +20,6 @@ from .folds import CLAMP, QUANTUM, hash_weights
 from .limits import ForceLimits
 from .records import FITS, REASONS, Reason, TraceArray, TraceSpec
 
-# Words for the clock of a recording, in the languages of recorders. One of CLOCK_WORDS anywhere in
-# a column's name makes it a clock, as in `header.stamp` or `Relative Time`; CLOCK_NAMES are whole
-# names.
-CLOCK_WORDS = {
-    *("time", "times", "timestamps", "datetime", "stamp", "elapsed", "epoch", "clock"),
-    *("date", "datum", "uhrzeit", "zeit", "temps", "heure", "tiempo", "hora", "tempo", "ora"),
-    *("tijd", "tid", "czas", "čas", "время", "idő", "aika"),
-    *("時間", "时间", "時刻", "时刻", "시간"),
-}
-UNIT_NAMES = {
-    *("t", "ms", "us", "µs", "ns", "sec", "secs", "second", "seconds", "msec", "usec", "nsec"),
-    *("nsecs", "nanosec", "millis", "micros", "nanos", "milliseconds", "microseconds"),
-    *("nanoseconds", "sekunden", "x value"),
-}
-CLOCK_NAMES = UNIT_NAMES | {f"t {word}" for word in (*UNIT_NAMES, "s", "rel", "abs", "start")}
-# A unit behind a name, or the number that pandas puts behind a name that occurs twice.
-NAME_SUFFIX = re.compile(r"\s*([\[({<].*|(/|\bin )\s*[a-zµμ]{1,4}|\.\d+)$", re.IGNORECASE)
-WORDS = re.compile(r"[A-Z]+(?![a-zµ])|[A-Z]?[^\W\d_A-Z]+")
 NOT_FINITE = REASONS.index(Reason.NOT_FINITE)
 CONSTANT = REASONS.index(Reason.CONSTANT)
 SATURATED = REASONS.index(Reason.SATURATED)
@@ -52,9 +33,9 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
 
     Parameters
     ----------
-    trace : array, shape (samples,) or (channels, samples), Series or DataFrame
-        Of any real dtype. A DataFrame has a row for each sample: its channels are the columns that
-        the `TraceSpec` names, or all but those of time. A Series is one channel.
+    trace : array, shape (samples,) or (channels, samples), or DataFrame
+        Of any real dtype. A DataFrame has a row for each sample; its channels are the columns that
+        the `TraceSpec` names.
     trace_spec : TraceSpec or None
         What the trace must look like. Another length is fitted as `trace_spec.fit` says. None: any
         shape with no more channels than samples.
@@ -67,21 +48,17 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
     Raises
     ------
     TraceError
-        For a trace of another shape, for values that are no real numbers, and for a DataFrame whose
-        columns do not fit. NaN and infinities pass; `TraceGate` finds them.
+        For a trace of another shape, for values that are no real numbers, and for a DataFrame
+        without the named columns, or if none are named. NaN and infinities pass; `TraceGate` finds
+        them.
     """
-    x = _as_real(trace if isinstance(trace, np.ndarray) else _frame_to_array(trace, trace_spec))
+    x = _as_real(_channels_of(trace, trace_spec) if hasattr(trace, "columns") else trace)
     x = x[None, :] if x.ndim == 1 else x
     if x.ndim != 2 or x.size == 0:
         wanted = "one trace, (samples,) or (channels, samples)"
         raise TraceError(f"Expected {wanted}, got shape {np.shape(trace)}.")
     if trace_spec is not None:
         x = _match_spec(x, trace_spec)
-    elif len(x) > x.shape[1] and _is_frame(trace):
-        wanted = "a DataFrame of one trace, a row a sample, a column a channel"
-        actual = f"{x.shape[1]} rows of {len(x)} columns"
-        do = "pass one row, as a Series, if each is a trace"
-        raise TraceError(f"Expected {wanted}, got {actual}; {do}.")
     elif len(x) > x.shape[1]:
         actual = f"{len(x)} channels of {x.shape[1]} samples, which looks transposed"
         meant = f"TraceSpec(samples={x.shape[1]}, channels={len(x)})"
@@ -133,16 +110,6 @@ def as_labels(y: ArrayLike) -> NDArray[np.int64]:
     return labels.astype(np.int64)
 
 
-def spec_of(x: TraceArray, trace: Any = None) -> TraceSpec:
-    """Return the `TraceSpec` of a converted trace `x` (C, T), with defaults for all but its shape.
-
-    If `trace`, the same trace before its conversion, is a DataFrame, the columns get the names of
-    its channels.
-    """
-    columns = tuple(map(str, _channel_columns(trace))) if _is_frame(trace) else ()
-    return TraceSpec(samples=x.shape[1], channels=x.shape[0], columns=columns)
-
-
 def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     """Fit traces of another length to a number of samples.
 
@@ -185,58 +152,19 @@ def can_fit_length(length: int, samples: int, fit: int) -> bool:
     return 2 * length >= samples and length <= 2 * samples
 
 
-def is_time_column(name: str) -> bool:
-    """Return whether a column's name says that it is a clock, and no channel.
+def _channels_of(table: Any, trace_spec: TraceSpec | None) -> Any:
+    """Return the columns of a DataFrame that the `TraceSpec` names, as an array (C, T).
 
-    Names such as `%time`, `t [ms]`, `Zeit/s`, `header.stamp` and `t_ms` do.
+    Raises TraceError if it names none, or one is missing.
     """
-    words = [word.lower() for word in WORDS.findall(NAME_SUFFIX.sub("", name.strip()))]
-    if not CLOCK_WORDS.isdisjoint(words):
-        return True
-    if any("zeit" in word or word.endswith(("time", "stamp")) for word in words):
-        return True
-    return " ".join(words) in CLOCK_NAMES
-
-
-def _is_frame(trace: Any) -> bool:
-    """Return whether a value is a DataFrame of pandas, polars or a package like them."""
-    return hasattr(trace, "columns") and hasattr(trace, "to_numpy")
-
-
-def _frame_to_array(trace: Any, trace_spec: TraceSpec | None) -> Any:
-    """Return the channels of a DataFrame as an array (C, T), anything else unchanged.
-
-    The channels are the columns that the `TraceSpec` names, else all but those of time. Raises
-    TraceError if a named column is missing; without names, if there is no channel, or not as many
-    as the `TraceSpec` has.
-    """
-    if not _is_frame(trace):
-        return trace
-    columns = list(trace.columns)
-    if trace_spec is not None and trace_spec.columns:
-        if not set(trace_spec.columns) <= set(columns):
-            wanted = f"the columns {', '.join(trace_spec.columns)}"
-            raise TraceError(f"Expected {wanted}, got {listed(columns)}.")
-        return trace[list(trace_spec.columns)].to_numpy().T
-    names = _channel_columns(trace)
-    if not names or (trace_spec is not None and len(names) != trace_spec.channels):
-        number = (
-            "at least one channel" if trace_spec is None else f"{trace_spec.channels} channel(s)"
-        )
-        wanted = f"a DataFrame with {number}, a column each"
-        do = "pass the right ones, or name them, TraceSpec(columns=...)"
-        raise TraceError(f"Expected {wanted}, got the columns {listed(columns)}; {do}.")
-    return trace[names].to_numpy().T
-
-
-def _channel_columns(frame: Any) -> list[Any]:
-    """Return the columns of a DataFrame, in order, that no dtype or name marks as a clock."""
-    types = {name: str(frame[name].dtype).lower() for name in frame.columns}
-    return [
-        name
-        for name, dtype in types.items()
-        if not dtype.startswith(("date", "time")) and not is_time_column(str(name))
-    ]
+    names = [] if trace_spec is None else list(trace_spec.columns)
+    if not names:
+        do = "name its channels, TraceSpec(columns=...), or pass table[CHANNELS].to_numpy().T"
+        raise TraceError(f"Expected an array (channels, samples), got a table; {do}.")
+    if not set(names) <= set(table.columns):
+        wanted = f"the columns {', '.join(names)}"
+        raise TraceError(f"Expected {wanted}, got {listed(table.columns)}.")
+    return table[names].to_numpy().T
 
 
 def _as_real(values: ArrayLike) -> TraceArray:
@@ -516,8 +444,8 @@ def _spec_advice(trace: Any) -> str:
     return f"DataEngine(trace=TraceSpec(samples={samples}, channels={channel_count}))"
 
 
-def infer_trace_spec(x: TraceArray, trace: Any) -> tuple[TraceSpec, bool]:
-    """Infer the `TraceSpec` of all traces from the first one: its shape and column names.
+def infer_trace_spec(x: TraceArray, trace: object) -> tuple[TraceSpec, bool]:
+    """Infer the `TraceSpec` of all traces from the shape of the first one.
 
     All else has the defaults of `TraceSpec`; rate and unit are unknown.
 
@@ -526,7 +454,7 @@ def infer_trace_spec(x: TraceArray, trace: Any) -> tuple[TraceSpec, bool]:
     x : array of float32, shape (C, T)
         The trace after `as_trace`.
     trace : object
-        The trace before it, whose column names are taken.
+        The trace before it, which is not read.
 
     Returns
     -------
@@ -539,7 +467,7 @@ def infer_trace_spec(x: TraceArray, trace: Any) -> tuple[TraceSpec, bool]:
     TraceError
         For a trace of fewer than `MIN_SAMPLES` samples.
     """
-    trace_spec = spec_of(x, trace)
+    trace_spec = TraceSpec(samples=x.shape[1], channels=x.shape[0])
     if trace_spec.samples < MIN_SAMPLES:
         wanted = f"a first trace of {MIN_SAMPLES} samples or more"
         why = "for it sets the contract of all that follow"

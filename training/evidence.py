@@ -35,8 +35,7 @@ from evidence_sets import GENERATORS, SETS, load_set
 
 import dengine
 from dengine import Dataset, Replay
-from dengine.experiments.grid import KeptReplays, Task, iterate_replays
-from dengine.experiments.paper import ALPHAS, INTERVALS, LOWER_BOUNDS
+from dengine.experiments.grid import PAPER_GRID, KeptReplays, Task, iterate_replays
 from dengine.experiments.replay import Contender
 from dengine.experiments.tables import write_csv
 from dengine.reducers import ConvReducer, RocketReducer
@@ -202,7 +201,10 @@ class Plan:
         ]
         has_all_policies = self.n_policies == len(POLICIES)
         if set_name == "insertion" and has_all_policies and index < N_GRID_SHUFFLES:
-            grid = product(GRID_METHODS, INTERVALS, ALPHAS, LOWER_BOUNDS)
+            grid = product(
+                GRID_METHODS,
+                *(PAPER_GRID[name] for name in ("intervals", "alphas", "lower_bounds")),
+            )
             conditions += [Condition(*settings) for settings in grid]
         contenders = [
             condition.contender()

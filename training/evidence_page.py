@@ -27,12 +27,12 @@ import torch
 from evidence_sets import SETS
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from paper import INTERVALS, findings, paper_table
 from scipy.stats import t as student_t
 
 from dengine.experiments.baselines import BASELINES
 from dengine.experiments.figures import LIMIT, RECIPES, blank, finish, save
 from dengine.experiments.metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS
-from dengine.experiments.paper import INTERVALS, findings, paper_table
 from dengine.experiments.tables import write_csv
 from dengine.files import write_output
 
@@ -492,8 +492,6 @@ def loss_lines(rows: pd.DataFrame) -> list[str]:
 def paper_lines(replays: pd.DataFrame) -> list[str]:
     """Return the paper's tables and findings; [] if its combinations were not played."""
     rows = replays[(replays["set"] == "insertion") & replays["recipe"].isin(PAPER_REDUCERS)]
-    # Replays share the cores, so their times are not kept; without them no finding speaks of them.
-    rows = rows.assign(retrain_max_s=math.nan)
     if rows[["alpha", "lower_bound"]].drop_duplicates().shape[0] <= len(POLICIES):
         return []
     lines = [

@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from ..experiments.replay import Contender, Replay
 
 CONFIRM_BY_FEEDBACK = {"stops": False, "confirmed": True}
-GRID_COLUMNS = ("interval", "alpha", "lower_bound")  # what the paper's grid varies
 
 
 @dataclass(frozen=True)
@@ -295,9 +294,9 @@ def compare(
         raise click.UsageError(
             f"--reducers needs a name of its own for each method, got {', '.join(short_names)}."
         )
-    from ..experiments.paper import GRID
+    from ..experiments.grid import PAPER_GRID
 
-    grid: dict[str, Any] = {**(GRID if paper else {}), **lists}
+    grid: dict[str, Any] = {**(PAPER_GRID if paper else {}), **lists}
     _refuse_value_beside_list(settings, grid)
     grid["confirms"] = [CONFIRM_BY_FEEDBACK[name] for name in feedback]
     contenders = [RecipeChoice(name, settings).make_contender() for name in names]
@@ -337,7 +336,6 @@ def _replay_and_print(
     """
     from ..experiments import tables
     from ..experiments.grid import grid_tasks
-    from ..experiments.paper import findings
 
     dataset = source.load()
     tasks = grid_tasks(
@@ -350,17 +348,12 @@ def _replay_and_print(
     rows = tables.pool(frame, replays)
     by_name = _group_replays(replays, lambda replay: replay.name)
     title = _title(dataset.name, by_name, not stream.shuffle)
-    # The paper's findings are about a grid under one guarantee and one feedback.
-    is_paper_grid = _varies(frame, *GRID_COLUMNS)
-    is_paper_grid = is_paper_grid and not _varies(frame, "guarantee", "stops", "confirm")
-    finding_lines = findings(frame) if is_paper_grid else []
     record = {
         "data": dataset.name,
         "in_order": not stream.shuffle,
         "faults": dataset.faults,
         "rows": rows,
         "interrupted": bool(interrupted),
-        "findings": finding_lines,
         "costs": costs,
     }
     legend = legend_or_hint(tables.LEGEND)
@@ -368,7 +361,7 @@ def _replay_and_print(
     for name, group in by_name.items():
         retrains = [retrain for replay in group for retrain in replay.retrains]
         parts.append(f"{name}: {tables.retrain_line(retrains)}")
-    parts += [*finding_lines, _duration_line(len(replays), costs)]
+    parts.append(_duration_line(len(replays), costs))
     print_result(
         record, *parts, out=out, make_files=lambda: dict(_replay_files(frame, replays, title))
     )
@@ -410,33 +403,21 @@ def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> st
     return f"{', '.join(by_name)} on {dataset}, {order}, {repeats}"
 
 
-def _varies(frame: pd.DataFrame, *names: str) -> bool:
-    """Return whether any of these columns holds more than one value."""
-    return any(len(frame[name].unique()) > 1 for name in names)
-
-
 def _replay_files(
     frame: pd.DataFrame, replays: Sequence[Replay], title: str
 ) -> Iterator[tuple[str, Any]]:
-    """Yield (file name, content) of what `--out` keeps: tables as frames or text, and figures.
+    """Yield (file name, content) of what `--out` keeps.
 
-    These are the CSV of all replays; tables and figures of a grid if interval, alpha or LB vary,
-    else one figure of curves; and a map of the first replay of each contender that embeds.
+    These are the CSV of all replays, their curves, and a map of the first replay of each contender
+    that embeds.
     """
     import numpy as np
 
-    from ..experiments.figures import curves, embedding_map, grid_figure
-    from ..experiments.paper import grid_lines
+    from ..experiments.figures import curves, embedding_map
 
     yield "replays.csv", frame
-    if _varies(frame, *GRID_COLUMNS):
-        yield "tables.md", "\n".join(grid_lines(frame)) + "\n"
-        groups = _group_replays(replays, lambda replay: _row_name(replay, frame, "interval"))
-        for name, group in groups.items():
-            yield _file_name(f"grid_{name}"), grid_figure(group, name)
-    else:
-        groups = _group_replays(replays, lambda replay: _row_name(replay, frame))
-        yield "curves.png", curves(groups, title)
+    groups = _group_replays(replays, lambda replay: _row_name(replay, frame))
+    yield "curves.png", curves(groups, title)
     for name, (first, *_) in _group_replays(replays, lambda replay: replay.name).items():
         if not np.isnan(first.position).all():  # baselines embed nothing
             map_title = f"{name}, newest parts of one replay (seed {first.seed})"
@@ -448,11 +429,9 @@ def _file_name(title: str) -> str:
     return re.sub(r"[^\w.=-]+", "_", title) + ".png"
 
 
-def _row_name(replay: Replay, frame: pd.DataFrame, *always: str) -> str:
-    """Return a label for a replay in figures: its contender and some settings, by commas.
-
-    The settings are those that vary in the frame, of guarantee, stops, confirm and interval, and
-    those named in `always`.
+def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
+    """Return a label for a replay in figures: its contender and the settings that vary in the
+    frame, with commas between.
     """
     policy = replay.recipe.policy
     settings = {
@@ -460,8 +439,10 @@ def _row_name(replay: Replay, frame: pd.DataFrame, *always: str) -> str:
         "stops": policy.stops,
         "confirm": "good ones confirmed" if replay.confirm else "stops alone",
         "interval": policy.interval,
+        "alpha": f"alpha {policy.alpha:g}",
+        "lower_bound": f"LB {percent(policy.lower_bound, 'g')}",
     }
-    shown = [text for name, text in settings.items() if name in always or _varies(frame, name)]
+    shown = [text for name, text in settings.items() if len(frame[name].unique()) > 1]
     return ", ".join([replay.name, *shown])
 
 

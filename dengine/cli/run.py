@@ -346,7 +346,7 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
 
     Adds the counts to `record`, which `--json` prints, and writes run.csv and run.png to `out`.
     """
-    from ..experiments.figures import run_picture
+    from ..experiments.figures import curves
     from ..experiments.metrics import Costs
     from ..experiments.tables import retrain_line, table_of_numbers
 
@@ -386,7 +386,7 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
         out=out,
         make_files=lambda: {
             "run.csv": replay.to_frame().reset_index(),
-            "run.png": run_picture(replay, record["title"]),
+            "run.png": curves({"this run": [replay]}, record["title"]),
         },
     )
 

@@ -10,7 +10,7 @@ import click
 
 from ..errors import SettingError
 from . import options
-from .options import COUNT, FILE, TRACE, RecipeChoice
+from .options import FILE, TRACE, RecipeChoice
 from .run import host_and_port
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ _TOKEN_FILE = (
 )
 _ALLOW_HOST = "A further name by which clients may call the server."
 _DEADLINE_HELP = "Seconds that a decision may wait in line; after that it is recorded as verify."
-_RATE = "Requests per second of one client; 0: no limit."
 _LARGEST = "Largest request body, in bytes."
 _XMLRPC = "XML-RPC at /RPC2, for robot programs."
 _OPCUA = "Port of OPC UA, for PLC and SCADA, usually 4840.  [default: off]"
@@ -71,12 +70,8 @@ _SHADOW = "Verify every part; what the model would have done is only recorded."
 )
 @options.check_option
 @options.bundle_options("trace_options", options.drop_none, TRACE)
-@click.option("--rate", type=click.FloatRange(0.0), default=500.0, show_default=True, help=_RATE)
 @click.option(
     "--largest", type=click.IntRange(1024), default=2**20, show_default=True, help=_LARGEST
-)
-@click.option(
-    "--connections", type=COUNT, default=100, show_default=True, help="Connections at a time."
 )
 @click.option("--shadow", is_flag=True, help=_SHADOW)
 @click.option("--xmlrpc/--no-xmlrpc", default=True, show_default=True, help=_XMLRPC)

@@ -9,7 +9,6 @@ made of these.
 """
 
 import difflib
-import json
 import re
 import sys
 import tomllib
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from ..errors import DataError, instead
-from ..files import FilePath, write_output
+from ..files import FilePath, toml_value, write_output
 from .dataset import expect_data
 
 UNKNOWN = "?"
@@ -532,5 +531,4 @@ def _toml_value(value: Any) -> str:
         return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, list) and len(value) == 1:
         return _toml_value(value[0])
-    # JSON's texts, lists and booleans are TOML's, but for DEL, which TOML wants escaped.
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return toml_value(value)

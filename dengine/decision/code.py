@@ -4,14 +4,14 @@
 refuses.
 
 A notebook cell that is run again defines another class, which is compiled. But if a method, a
-helper's method, a function or a constant of a module is replaced, the class stays the same, and
-torch answers with the code of before.
+function that it calls or a constant of a module is replaced, the class stays the same, and torch
+answers with the code of before.
 """
 
 import sys
-from collections.abc import Iterator
-from contextlib import suppress
-from types import CodeType, FunctionType, ModuleType
+from collections.abc import Collection, Iterator
+from inspect import getclosurevars
+from types import FunctionType, ModuleType
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -21,10 +21,9 @@ LIBRARIES = {*sys.stdlib_module_names, "dengine", "numpy", "scipy", "sklearn", "
     "__main__"
 }
 PLAIN = bool, int, float, complex, str, bytes, tuple, list, dict, set, frozenset, type(None)
-IGNORED_MEMBERS = ("__dict__", "__weakref__", "__module__", "__doc__", "__annotations__")
 
-# Classes and functions that were compiled, and a text of all the code that they refer to.
-_COMPILED: WeakKeyDictionary[Any, str] = WeakKeyDictionary()
+# Classes and functions that were compiled, and the code that they had then.
+_COMPILED: WeakKeyDictionary[Any, list[Any]] = WeakKeyDictionary()
 
 
 def remember_code(module: nn.Module) -> None:
@@ -33,7 +32,7 @@ def remember_code(module: nn.Module) -> None:
     Classes and functions that were noted before keep their first note.
     """
     for unit in _user_code(module):
-        _COMPILED.setdefault(unit, _code_text(unit))
+        _COMPILED.setdefault(unit, _code_of(unit))
 
 
 def is_code_changed(module: nn.Module) -> bool:
@@ -42,7 +41,7 @@ def is_code_changed(module: nn.Module) -> bool:
     False for code that was never noted.
     """
     return any(
-        unit in _COMPILED and _COMPILED[unit] != _code_text(unit) for unit in _user_code(module)
+        unit in _COMPILED and _COMPILED[unit] != _code_of(unit) for unit in _user_code(module)
     )
 
 
@@ -53,89 +52,50 @@ def _user_code(module: nn.Module) -> Iterator[Any]:
     """
     for submodule in module.modules():
         functions = [value for value in vars(submodule).values() if isinstance(value, FunctionType)]
-        for unit in (type(submodule), *functions):
-            if not _is_of_library(unit):
-                yield unit
+        yield from (unit for unit in (type(submodule), *functions) if not _is_of_library(unit))
 
 
 def _is_of_library(value: Any) -> bool:
     """Return whether a module, class or function belongs to a package in `LIBRARIES`."""
     attribute = "__name__" if isinstance(value, ModuleType) else "__module__"
-    name = getattr(value, attribute, None)
-    return str(name).partition(".")[0] in LIBRARIES
+    return str(getattr(value, attribute, None)).partition(".")[0] in LIBRARIES
 
 
-def _code_text(unit: Any) -> str:
-    """Return a text that changes with the code and constants that a class or function refers to."""
-    return repr(_describe(unit, set(), set()))
+def _code_of(unit: Any) -> list[Any]:
+    """Return the code of a function, or of all methods of a class, with what they name, to compare.
 
-
-def _describe(value: Any, names: set[str], seen: set[int]) -> Any:
-    """Describe all code that a value refers to, and the constants in it, for comparison by `repr`.
-
-    A class gives a list of (name, description) of its members and of its bases' members, a module
-    the same of the variables in `names`, a function what `_describe_function` returns, a property a
-    list of its getter and its setter, a constant its text. Anything else, a library's code, and
-    what was described before give a name only. `names` are the names that the referring code
-    mentions. `seen` holds the ids of values that were described already; it is added to.
+    Of a class also its plain attributes; those of bases of `LIBRARIES` are left out.
     """
-    if isinstance(value, staticmethod | classmethod):
-        return _describe(value.__func__, names, seen)
-    if isinstance(value, property):
-        return [_describe(function, names, seen) for function in (value.fget, value.fset)]
-    if isinstance(value, PLAIN):
-        return repr(value)
-    is_code = isinstance(value, FunctionType | type | ModuleType)
-    if not is_code or _is_of_library(value) or id(value) in seen:
-        return getattr(value, "__qualname__", type(value).__qualname__)
-    seen.add(id(value))
-    if isinstance(value, ModuleType):
-        mentioned = sorted(names & vars(value).keys())
-        return [(name, _describe(vars(value)[name], names, seen)) for name in mentioned]
-    if isinstance(value, type):
-        classes = [base for base in value.__mro__ if not _is_of_library(base)]
-        members = [pair for base in classes for pair in sorted(vars(base).items())]
-        return [
-            (name, _describe(member, names, seen))
-            for name, member in members
-            if name not in IGNORED_MEMBERS
-        ]
-    return _describe_function(value, seen)
+    if isinstance(unit, FunctionType):
+        return [_note(unit), *_named_values(unit)]
+    notes: list[Any] = []
+    for base in unit.__mro__:
+        for name, member in sorted(vars(base).items()) if not _is_of_library(base) else ():
+            is_property = isinstance(member, property)
+            for value in (member.fget, member.fset) if is_property else (member,):
+                value = getattr(value, "__func__", value)  # of a class method, say
+                named = _named_values(value) if isinstance(value, FunctionType) else []
+                notes.append((name, _note(value), named))
+    return notes
 
 
-def _describe_function(function: FunctionType, seen: set[int]) -> tuple[Any, str, list[Any]]:
-    """Return (instructions, text of the defaults, referred values) of a function.
+def _named_values(function: FunctionType) -> list[Any]:
+    """Return notes on the globals and the closure's variables that a function names."""
+    try:
+        variables = getclosurevars(function)
+    except ValueError:  # a variable has no value yet, or was deleted
+        return []
+    values = {**variables.globals, **variables.nonlocals}
+    return [(name, _note(value, variables.unbound)) for name, value in sorted(values.items())]
 
-    The referred values are (name, description) of each global and closure variable that the code
-    mentions, by name. Defaults of keyword-only parameters are left out: TorchScript takes none.
-    `seen` is added to, as by `_describe`.
+
+def _note(value: Any, names: Collection[str] = ()) -> Any:
+    """Return what a value is compared by: a function's code, a constant's text, else nothing.
+
+    Of a module that is no library, those of its variables that are among `names`.
     """
-    mentioned = set(_names(function.__code__))
-    namespace = function.__globals__
-    values = {name: namespace[name] for name in mentioned & namespace.keys()}
-    cells = function.__closure__ or ()
-    for name, cell in zip(function.__code__.co_freevars, cells, strict=True):
-        with suppress(ValueError):  # an empty cell: the variable has no value yet, or was deleted
-            values[name] = cell.cell_contents
-    referred = [(name, _describe(values[name], mentioned, seen)) for name in sorted(values)]
-    return _instructions(function.__code__), repr(function.__defaults__), referred
-
-
-def _names(code: CodeType) -> Iterator[str]:
-    """Yield the names of globals and attributes that code mentions, nested functions included."""
-    yield from code.co_names
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _names(constant)
-
-
-def _instructions(code: CodeType) -> tuple[bytes, tuple[str, ...], list[Any]]:
-    """Return (bytecode, names, constants) of code, to compare by.
-
-    The constants are texts, and for a nested function again such a triple.
-    """
-    constants = [
-        _instructions(constant) if isinstance(constant, CodeType) else repr(constant)
-        for constant in code.co_consts
-    ]
-    return code.co_code, code.co_names, constants
+    if isinstance(value, FunctionType) and not _is_of_library(value):
+        return value.__code__, repr(value.__defaults__)
+    if isinstance(value, ModuleType) and not _is_of_library(value):
+        return [(name, _note(vars(value).get(name))) for name in sorted(names)]
+    return repr(value) if isinstance(value, PLAIN) else None

@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from ..errors import StoreError
 from .code import remember_code
 
+State = dict[str, NDArray[Any]]
+Arrays = Mapping[str, NDArray[Any]]
 _SCRIPTING = threading.Lock()
 # Attributes in which torch keeps parameters, submodules and hooks; scripting adds the last.
 INTERNAL = {*vars(nn.Module()), "__overloads__"} - {"training"}
@@ -92,20 +94,20 @@ def register_tensors(module: nn.Module) -> None:
                 submodule.register_buffer(name, value.contiguous())
 
 
-def module_state(module: nn.Module, prefix: str) -> dict[str, NDArray[Any]]:
+def module_state(module: nn.Module, prefix: str) -> State:
     """Return copies of a module's tensors as arrays, by their names behind the prefix."""
     tensors = module.state_dict()
     return {f"{prefix}{name}": tensor.numpy().copy() for name, tensor in tensors.items()}
 
 
-def arrays_with_prefix(state: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
+def arrays_with_prefix(state: Arrays, prefix: str) -> State:
     """Return the arrays of a state whose names begin with `prefix`, by the rest of their names."""
     return {
         name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)
     }
 
 
-def restore(module: nn.Module, arrays: Mapping[str, NDArray[Any]]) -> None:
+def restore(module: nn.Module, arrays: Arrays) -> None:
     """Copy arrays, in place, into the parameters and buffers of a module.
 
     Parameters

@@ -24,9 +24,9 @@ ends of their intervals, whose unit is the part, and the spread over the shuffle
 import math
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
-from itertools import count, islice
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -206,8 +206,7 @@ class CostCurve:
                 )
                 for size, rate in zip(sizes, rates, strict=True)
             )
-            wrong = row.accepted * bad, row.rejected * good
-            worst = self.costs.check - self.costs.saved(row.accepted + row.rejected, *wrong)
+            worst = self.costs.of_part(row.accepted, row.rejected, bad, good)
             upper = row.cost + math.hypot(worst - row.cost, row.luck / math.sqrt(more))
             return self.costs.check - upper
 
@@ -375,8 +374,8 @@ class PolicySearch:
         if contender.baseline is None:
             shadow = Policy(shadow=True, windows=contender.recipe.policy.windows)
             self._scores = replace(contender, recipe=replace(contender.recipe, policy=shadow))
-        self._screened: dict[Policy, dict[int, Replay]] = defaultdict(dict)
-        self._reported: dict[Policy, dict[int, Replay]] = defaultdict(dict)
+        self._replays: dict[Policy, dict[int, Replay]] = defaultdict(dict)  # by seed
+        self._fresh: set[int] = set()  # seeds of the shuffles that choose nothing
 
     def _add(self, contender: Contender, changes: dict[str, Any], n_good: float) -> None:
         """Add a candidate, or a note on why it is not tried; `n_good` good parts are played."""
@@ -407,19 +406,21 @@ class PolicySearch:
             Returns the replays of tasks. If it returns fewer, as after Ctrl-C, these are kept and
             nothing more is played.
         """
-        seeds = count(self._seed)
+        seed = self._seed
         while len(self.remaining) > N_LAST:
-            if not self._play(play, islice(seeds, N_SCREENING), self._screened, self._scores):
+            if not self._play(play, range(seed, seed + N_SCREENING), self._scores):
                 return
             self.remaining.sort(key=self._screening_key)
             del self.remaining[max(N_LAST, len(self.remaining) // 2) :]
-        self._play(play, islice(seeds, self._repeats), self._reported, None)
+            seed += N_SCREENING
+        fresh = range(seed, seed + self._repeats)
+        self._fresh.update(fresh)
+        self._play(play, fresh, None)
 
     def _play(
         self,
         play: Callable[[Sequence[Task]], Sequence[Replay]],
-        seeds: Iterable[int],
-        into: dict[Policy, dict[int, Replay]],
+        seeds: range,
         scores: Contender | None,
     ) -> bool:
         """Play the remaining candidates over some seeds, if given on the scores of one engine.
@@ -432,14 +433,18 @@ class PolicySearch:
         policies = [candidate.recipe.policy for candidate in self.remaining]
         for replay in replays:
             for policy in policies if scores else [replay.recipe.policy]:
-                into[policy][replay.seed] = replay_policy(replay, policy) if scores else replay
+                played = replay_policy(replay, policy) if scores else replay
+                self._replays[policy][replay.seed] = played
         return len(replays) == len(tasks)
 
     def _screening_key(self, contender: Contender) -> tuple[bool, float]:
         """Return what candidates are sorted by: whether all was verified, and the expected cost."""
-        policy = contender.recipe.policy
-        row = _policy_cost(policy, list(self._screened[policy].values()), self.costs)
+        row = self._row(contender.recipe.policy)
         return row.accepted + row.rejected == 0.0, row.expected_cost
+
+    def _row(self, policy: Policy) -> PolicyCost:
+        """Return what a part costs under a policy, over all its shuffles."""
+        return _policy_cost(policy, list(self._replays[policy].values()), self.costs)
 
     def curve(self) -> CostCurve | None:
         """Return the cost curve of what was played.
@@ -447,19 +452,15 @@ class PolicySearch:
         It is of the shuffles that every policy that is left has finished: those that report, or
         if there are fewer than two, those that chose; None if there are fewer of these, too.
         """
-        policies = [candidate.recipe.policy for candidate in self.remaining]
-        behind = [
-            _policy_cost(policy, list(replays.values()), self.costs)
-            for policy, replays in self._screened.items()
-            if policy not in policies
-        ]
-        for played in (self._reported, self._screened):
-            seeds = sorted(set.intersection(*(set(played[policy]) for policy in policies)))
-            if len(seeds) > 1:
-                groups = {policy: [played[policy][seed] for seed in seeds] for policy in policies}
-                notes = tuple(behind), tuple(self.out_of_reach), played is self._reported
-                return curve_of(groups, self.costs, *notes)
-        return None
+        played = {c.recipe.policy: self._replays[c.recipe.policy] for c in self.remaining}
+        behind = [self._row(policy) for policy in self._replays if policy not in played]
+        seeds = set.intersection(*map(set, played.values()))
+        is_fresh = len(seeds & self._fresh) > 1
+        chosen = sorted(seeds & self._fresh if is_fresh else seeds - self._fresh)
+        if len(chosen) < 2:
+            return None
+        groups = {policy: [by_seed[seed] for seed in chosen] for policy, by_seed in played.items()}
+        return curve_of(groups, self.costs, tuple(behind), tuple(self.out_of_reach), is_fresh)
 
 
 def candidates(
@@ -635,18 +636,13 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
     )
     bad = pooled_error(replays, "accepted", ALPHA_EACH)
     good = pooled_error(replays, "rejected", ALPHA_EACH)
-
-    def cost_at(bad_rate: float, good_rate: float) -> float:
-        """Return the cost per part at these rates of wrong decisions."""
-        wrong = accepted * bad_rate, rejected * good_rate
-        return costs.check - costs.saved(accepted + rejected, *wrong)
-
+    cost_at = partial(costs.of_part, accepted, rejected)
     of_parts = np.array([part_costs(replay, costs) for replay in replays])  # (shuffles, cycles)
     cost = float(of_parts.mean())
     luck = float(student.ppf(1.0 - ERROR_LEVEL / 2, max(1, n - 1))) * _order_error(of_parts.mean(1))
     return PolicyCost(
         policy=policy,
-        expected_cost=cost_at(*(_expected_rate(error) for error in (bad, good))),
+        expected_cost=cost_at(_expected_rate(bad), _expected_rate(good)),
         cost=cost,
         lower=cost - math.hypot(cost - cost_at(bad.lower, good.lower), luck),
         upper=cost + math.hypot(cost - cost_at(bad.upper, good.upper), luck),

@@ -36,6 +36,11 @@ from .tables import frame_of
 if TYPE_CHECKING:
     import pandas as pd
 
+PAPER_GRID: dict[str, tuple[Any, ...]] = {  # of the paper's experiments
+    "alphas": (0.5, 0.1, 0.05),
+    "lower_bounds": (0.8, 0.9, 0.95),
+    "intervals": ("wilson", "binomial"),
+}
 LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon")
 
 
@@ -108,7 +113,6 @@ class KeptReplays:
             task.shuffle,
             task.confirm,
             contender.baseline,
-            dict(contender.params),
             contender.recipe.to_toml(),
             # A transformer with everything that it holds: arrays and functions too.
             reducer,

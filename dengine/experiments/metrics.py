@@ -168,3 +168,10 @@ class Costs:
         """
         checks = self.check * certain
         return checks - self.escape * false_positive - self.false_reject * false_negative
+
+    def of_part(self, accepted: float, rejected: float, bad: float, good: float) -> float:
+        """Return the mean cost of a part where so many are accepted, and rejected, by the model.
+
+        All are shares: `bad` of the accepted parts, and `good` of the rejected ones, are wrong.
+        """
+        return self.check - self.saved(accepted + rejected, accepted * bad, rejected * good)

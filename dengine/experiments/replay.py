@@ -10,7 +10,7 @@ prototype online environment does. A `Contender` says who plays: a recipe or a b
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -80,14 +80,11 @@ class Contender:
         with.
     baseline : str or None, default None
         A name in `BASELINES` that decides instead of the reducer and its neighbours.
-    params : mapping
-        The baseline's own settings.
     """
 
     name: str
     recipe: Recipe
     baseline: str | None = None
-    params: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def load(cls, recipe: Any) -> "Contender":
@@ -96,7 +93,7 @@ class Contender:
         Parameters
         ----------
         recipe : Contender, str or object
-            A contender is returned as it is. A baseline's name gives the baseline with its chosen
+            A contender is returned as it is. A baseline's name gives the baseline with its default
             settings. Otherwise anything that `Recipe.load` takes; a TOML file gives its stem as the
             name.
 
@@ -110,7 +107,7 @@ class Contender:
         if isinstance(recipe, str) and recipe in BASELINES:
             # conv has a schedule of its own; baselines retrain by the default one.
             schedule = Recipe(retrain_every=Reducer.default_retrain_every)
-            return cls(recipe, schedule, recipe, BASELINES[recipe].chosen_params())
+            return cls(recipe, schedule, recipe)
         loaded = Recipe.load(recipe)
         is_path = isinstance(recipe, str | os.PathLike)
         is_named = is_path and (str(recipe) in RECIPES or Path(recipe).is_file())
@@ -128,7 +125,7 @@ class Contender:
         """
         model = None
         if self.baseline is not None:
-            model = make_baseline(self.baseline, self.recipe.policy, seed, **self.params)
+            model = make_baseline(self.baseline, self.recipe.policy, seed)
         return DataEngine(recipe=self.recipe, model=model, trace=trace, seed=seed, replaying=True)
 
 

@@ -24,8 +24,6 @@ class Excess:
     ----------
     channel : int
         From 0.
-    from_s, to_s : float or None
-        Times of its first and last sample, in seconds; None if the rate is unknown.
     above : bool
         Whether it lies above the band.
     widths : float
@@ -35,8 +33,6 @@ class Excess:
     """
 
     channel: int
-    from_s: float | None
-    to_s: float | None
     above: bool
     widths: float
     first: int
@@ -73,7 +69,7 @@ class Envelope:
     excesses: tuple[Excess, ...]
 
 
-def envelope_of(successes: TraceArray, trace: TraceArray, rate_hz: float | None) -> Envelope | None:
+def envelope_of(successes: TraceArray, trace: TraceArray) -> Envelope | None:
     """Compute the envelope of successes, and where a trace leaves it.
 
     At each sample the envelope contains the middle 95 % of the successes.
@@ -83,8 +79,6 @@ def envelope_of(successes: TraceArray, trace: TraceArray, rate_hz: float | None)
     successes : array of float32, shape (n, C, T)
     trace : array of float32, shape (C, T)
         Its NaN and infinite samples are left out.
-    rate_hz : float or None
-        Sampling rate; None: unknown.
 
     Returns
     -------
@@ -109,11 +103,11 @@ def envelope_of(successes: TraceArray, trace: TraceArray, rate_hz: float | None)
         outside=float((excess != 0.0).sum() / max(1, finite.sum())),
         usual=float(np.quantile(((successes < low) | (successes > high)).mean(axis=(1, 2)), 0.95)),
         not_finite=int((~finite).sum()),
-        excesses=tuple(sorted(_find_excesses(excess, rate_hz), key=lambda piece: -piece.widths)),
+        excesses=tuple(sorted(_find_excesses(excess), key=lambda piece: -piece.widths)),
     )
 
 
-def _find_excesses(excess: NDArray[np.float64], rate_hz: float | None) -> Iterator[Excess]:
+def _find_excesses(excess: NDArray[np.float64]) -> Iterator[Excess]:
     """Yield the pieces of the excess (C, T) that are above 0, or below 0, throughout.
 
     They come channel by channel, in the order of time. The excess is in widths of the band:
@@ -127,6 +121,4 @@ def _find_excesses(excess: NDArray[np.float64], rate_hz: float | None) -> Iterat
             if side[first]:
                 widths = float(np.abs(row[first:end]).max())
                 above = bool(side[first] > 0)
-                last = end - 1
-                from_s, to_s = (rate_hz and sample / rate_hz for sample in (first, last))
-                yield Excess(channel, from_s, to_s, above, widths, first, last)
+                yield Excess(channel, above, widths, first, end - 1)

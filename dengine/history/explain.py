@@ -246,7 +246,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         novelty=circumstances.novelty,
         neighbours=tuple(_find_neighbours(store, neighbourhood, version, neighbours)),
         radius=None if neighbourhood is None else neighbourhood.radius,
-        envelope=_find_envelope(store, item, version, circumstances.spec),
+        envelope=_find_envelope(store, item, version),
         policy=recipe.policy,
     )
 
@@ -315,7 +315,7 @@ def _find_neighbours(
 
 
 def _find_envelope(
-    store: SqlStore, item: StoredDecision, version: PastVersion | None, spec: TraceSpec
+    store: SqlStore, item: StoredDecision, version: PastVersion | None
 ) -> Envelope | None:
     """Return the envelope of the successes among the newest labels that the version could know.
 
@@ -326,7 +326,7 @@ def _find_envelope(
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labelled(MAX_ENVELOPE_LABELS, last=last)
         is_other_success = (labelled.labels == 1) & (labelled.hashes != item.content_hash)
-        envelope = envelope_of(labelled.traces[is_other_success], item.trace, spec.rate_hz)
+        envelope = envelope_of(labelled.traces[is_other_success], item.trace)
         if envelope is not None:
             return envelope
     return None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
@@ -25,7 +25,7 @@ from ..errors import ExportError, SettingError, shortened
 from ..limits import ForceLimits
 from ..recipe import Recipe
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
-from ..reducers.base import FitReport, Floats, Ints, State, StopRule
+from ..reducers.base import Arrays, FitReport, Floats, Ints, State, StopRule
 from ..traces import clip_extremes
 
 Embedding = tuple[tuple[float, ...], ...]  # (K, d)
@@ -335,11 +335,11 @@ class EngineModel(ABC):
         """Return the model's state as arrays by name, for the store."""
         return {}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self."""
         return self
 
-    def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
+    def needs_refit(self, state: Arrays) -> bool:
         """Return whether `set_state` needs a model that was trained on the state's own traces."""
         return True
 

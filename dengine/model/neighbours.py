@@ -15,7 +15,7 @@ compiles to TorchScript. Compiled deciders are copied from templates, because sc
 import copy
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from enum import Enum
@@ -53,6 +53,7 @@ from ..records import ACTIONS, REASONS, REPEATS, Reason, TraceSpec, as_success
 from ..reducers import class_default, make_reducer
 from ..reducers.base import (
     SAME_POINTS,
+    Arrays,
     FitReport,
     Floats,
     Ints,
@@ -822,7 +823,7 @@ class ModelPrediction(EngineModel):
         reducer_state = self.spaces.get_state() or {}
         return state | {f"reducer.{name}": values for name, values in reducer_state.items()}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
         References, scale, rule and gate are restored, and the reducer if its state is there; else
@@ -847,7 +848,7 @@ class ModelPrediction(EngineModel):
         self._decider = None
         return self
 
-    def needs_refit(self, state: Mapping[str, NDArray[Any]]) -> bool:
+    def needs_refit(self, state: Arrays) -> bool:
         """Return whether the reducer has no state there, so that it must be fitted again."""
         return not arrays_with_prefix(state, "reducer.")
 

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 State = dict[str, NDArray[Any]]
+Arrays = Mapping[str, NDArray[Any]]  # of a state that is read
 OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
 OUTLIER_SHARE = 0.05  # more points than this share are not outliers
 SMALLEST = 1e-12  # that the largest sample must reach
@@ -255,14 +256,14 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
         return None
 
-    def restore_shape(self, state: Mapping[str, NDArray[Any]]) -> tuple[int, int]:
+    def restore_shape(self, state: Arrays) -> tuple[int, int]:
         """Restore the shape of traces from the array "shape" of a state; return it, (C, T)."""
         channels, samples = (int(value) for value in state["shape"])
         self.trace_shape_ = (channels, samples)
         self.n_features_in_ = channels * samples
         return channels, samples
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned and return self; the parameters must be the same.
 
         The default raises NotImplementedError.

@@ -23,18 +23,16 @@ classification using multi-channels deep convolutional neural networks, WAIM: se
 for each signal.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Self
 
 import torch
-from numpy.typing import NDArray
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 
 from ..decision.scripting import arrays_with_prefix, incompatible_model_error
-from .base import Floats, Ints, StopRule
+from .base import Arrays, Floats, Ints, State, StopRule
 from .encoder import Encoder, FoldableSequential, NetworkFactory
 from .rocket import FeatureEmbedding, RocketReducer
 from .torch_reducer import TorchReducer
@@ -248,11 +246,11 @@ class ConvReducer(TorchReducer):
         check_is_fitted(self, "encoder_")
         return ConvEncoder(self.encoder_, self.rocket_.module()).eval()
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> State:
         rocket = {f"rocket.{name}": value for name, value in self.rocket_.get_state().items()}
         return super().get_state() | rocket
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone
             raise incompatible_model_error("conv has no rocket beside its network")

@@ -2,19 +2,18 @@
 closed form at every training, and `PcaEncoder`, the module that it exports.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.decomposition import PCA
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
 from ..errors import SettingError
-from .base import Floats, Reducer, as_rows
+from .base import Arrays, Floats, Reducer, State, as_rows
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -82,7 +81,7 @@ class PcaReducer(Reducer):
         check_is_fitted(self, "components_")
         return PcaEncoder(torch.from_numpy(self.mean_), torch.from_numpy(self.components_))
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit.
 
         They are "mean" (C * T,), "components" (n_components, C * T) and "shape", (C, T); not
@@ -95,7 +94,7 @@ class PcaReducer(Reducer):
             "shape": np.array(self.trace_shape_),
         }
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         The arrays are copied.

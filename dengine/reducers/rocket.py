@@ -26,7 +26,7 @@ Econometrics Journal 21: cross-fitting.
 """
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
@@ -41,10 +41,12 @@ from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import expect
 from ..records import is_whole
 from .base import (
+    Arrays,
     FitReport,
     Floats,
     Ints,
     Reducer,
+    State,
     StopRule,
     binary_labels,
     check_classes,
@@ -650,7 +652,7 @@ class RocketReducer(Reducer):
         check_is_fitted(self, "net_")
         return self.net_
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, losses, the towers and, after "net.", the module's tensors. The
@@ -668,7 +670,7 @@ class RocketReducer(Reducer):
             state |= {f"{name}.{i}": value.numpy() for name, value in tower._asdict().items()}
         return state | module_state(self.net_, "net.")
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         The cache of features is empty and `note_` is "" afterwards. Raises StoreError if the sizes

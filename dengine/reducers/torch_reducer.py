@@ -21,7 +21,7 @@ al. (2018), Double/debiased machine learning, Econometrics Journal 21: cross-fit
 
 import copy
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from os import PathLike
@@ -29,7 +29,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.base import clone
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
@@ -48,10 +48,12 @@ from ..errors import SettingError, expect
 from ..records import is_number, is_whole
 from .base import (
     SAME_POINTS,
+    Arrays,
     FitReport,
     Floats,
     Ints,
     Reducer,
+    State,
     StopRule,
     binary_labels,
     draw_seed,
@@ -533,7 +535,7 @@ class TorchReducer(Reducer):
         note = ", ".join(filter(None, (note, left)))
         return FitReport(self.n_new_steps_, note, self.n_steps_left_)
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
@@ -556,7 +558,7 @@ class TorchReducer(Reducer):
                 state[f"optimizer.{i}.{name}"] = value.numpy().copy()
         return state
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self.
 
         The constructor's parameters must be the same. Raises StoreError if the sizes are others, or

@@ -23,14 +23,13 @@ McInnes, Healy and Melville (2018), UMAP: Uniform manifold approximation and pro
 dimension reduction, arXiv:1802.03426; the library umap-learn 0.5.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from math import log2
 from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import csr_matrix
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
@@ -38,7 +37,7 @@ from torch import Tensor, nn
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import SettingError, expect
 from ..records import is_number, is_whole
-from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, draw_seed
+from .base import Arrays, FitReport, Floats, Ints, Reducer, State, StopRule, as_points, draw_seed
 from .umap_graph import (
     CHUNK,
     Frames,
@@ -450,7 +449,7 @@ class UmapReducer(Reducer):
         note = f"{left} epochs of the first layout to go" if left else ""
         return FitReport(self.n_new_steps_, note, left)
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, and of the last training numbers, frames, neighbours, distances
@@ -470,7 +469,7 @@ class UmapReducer(Reducer):
             "embedding": self.embedding_.numpy(),
         }
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> Self:
+    def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         What `precompute` found is dropped. Raises StoreError if the frames are of another size.

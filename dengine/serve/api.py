@@ -56,7 +56,6 @@ JSON = "application/json"
 RAW = "application/octet-stream"
 MSGPACK = "application/msgpack"
 PROBLEM = "application/problem+json"
-RETRY_LATER = (HTTPStatus.TOO_MANY_REQUESTS, HTTPStatus.SERVICE_UNAVAILABLE)
 RETRY_SECONDS = 1
 NO_ROUTE = {
     404: "Expected one of the paths in /openapi.json, got another.",
@@ -446,10 +445,10 @@ def problem_response(
 ) -> Response:
     """Return the response to a request that is not served, a `Problem` as JSON.
 
-    Its detail is put on one line, and passwords of URLs are masked. With a status of `RETRY_LATER`
-    a header says when to try again.
+    Its detail is put on one line, and passwords of URLs are masked. With status 503 a header says
+    when to try again.
     """
-    retry = {"Retry-After": str(RETRY_SECONDS)} if status in RETRY_LATER else {}
+    retry = {"Retry-After": str(RETRY_SECONDS)} if status == 503 else {}
     line = " ".join(without_password(detail).split())
     problem = Problem(HTTPStatus(status).phrase, status, line)
     return json_response(problem, status, retry | dict(headers or {}), PROBLEM)

@@ -1,5 +1,5 @@
 """Access control of the HTTP server: `Guard` refuses a request by its token, host name, origin,
-size, time or rate, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the
+size or time, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the
 application.
 
 A server that only this machine can reach needs no token. But a browser on this machine may also
@@ -13,8 +13,6 @@ import hmac
 import logging
 import os
 import stat
-import time
-from collections import OrderedDict
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -32,8 +30,7 @@ from .api import Refusal, problem_response
 
 log = logging.getLogger("dengine")
 MIN_TOKEN_LENGTH = 16  # characters
-MAX_CLIENTS = 4096  # whose rate is remembered
-LET_IN = "dengine.let_in"  # key in the scope of an authorized request, read by `Connection`
+MAX_CLIENTS = 1000  # whose wrong tokens are logged
 SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing
 RPC = "/RPC2"  # a robot that cannot send headers may append its token to this path
 
@@ -70,15 +67,12 @@ class Access:
         Most bytes of a request's body.
     body_seconds : float
         Seconds within which the body must arrive.
-    rate : float
-        Mean requests per second of one client, with bursts of twice as many. 0: no limit.
     """
 
     tokens: tuple[Token, ...] = ()
     hosts: tuple[str, ...] = ()
     largest: int = 2**20
     body_seconds: float = 5.0
-    rate: float = 500.0
 
     def find_token(self, secret: str) -> Token | None:
         """Return the token with this secret, or None. All tokens are compared, in constant time."""
@@ -89,39 +83,6 @@ class Access:
 
 ANYBODY = Token()  # of requests to a server that needs no token
 CURRENT_TOKEN = ContextVar("CURRENT_TOKEN", default=ANYBODY)  # of the request being answered
-
-
-class RateLimiter:
-    """Limits the rate of each client by a token bucket.
-
-    Parameters
-    ----------
-    rate : float
-        Events per second; 0: no limit.
-    burst : float
-        Events that a client may have at once.
-    """
-
-    def __init__(self, rate: float, burst: float) -> None:
-        self.rate = rate
-        self.burst = burst
-        # By client: the events left, and the time of that count. Oldest first.
-        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
-
-    def allow(self, client: str) -> bool:
-        """Return whether a client may have an event now, and take it from its budget if so.
-
-        The budget grows with `rate` up to `burst`. A rate of 0 allows everything. Of more than
-        `MAX_CLIENTS` clients the one that was not seen for longest is forgotten.
-        """
-        now = time.monotonic()
-        left, counted_at = self._buckets.pop(client, (self.burst, now))
-        left = min(self.burst, left + (now - counted_at) * self.rate)
-        is_allowed = self.rate <= 0.0 or left >= 1.0
-        self._buckets[client] = (left - is_allowed, now)
-        if len(self._buckets) > MAX_CLIENTS:
-            self._buckets.popitem(last=False)
-        return is_allowed
 
 
 def read_tokens(file: Path) -> tuple[Token, ...]:
@@ -262,8 +223,7 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app = app
         self.access = access
-        self.requests = RateLimiter(access.rate, max(1.0, 2.0 * access.rate))
-        self.log_lines = RateLimiter(0.1, 3)  # about wrong tokens of a client
+        self._named: set[str] = set()  # clients whose wrong token was logged
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an allowed request on to the application, or answer it with the refusal."""
@@ -284,9 +244,9 @@ class Guard:
     def _check(self, scope: Scope) -> None:
         """Raise Refusal for a request that is not allowed; else note its token for the handlers.
 
-        In this order it checks the host name (421), rate and token (`_check_token`), the site that
-        a change comes from (403), and the announced length of the body (400, 413). A token in the
-        path is removed from the scope.
+        In this order it checks the host name (421), the token (`_check_token`), the site that a
+        change comes from (403), and the announced length of the body (413). A token in the path is
+        removed from the scope.
         """
         headers = Headers(scope=scope)
         host = headers.get("host")
@@ -305,42 +265,39 @@ class Guard:
                 HTTPStatus.FORBIDDEN,
                 "Expected a request of this server's own pages, got one of another site.",
             )
-        length = headers.get("content-length", "0")
-        if not (length.isascii() and length.isdecimal()):
-            raise Refusal(HTTPStatus.BAD_REQUEST, "Expected Content-Length to be a whole number.")
-        if len(length) > 18 or int(length) > self.access.largest:
+        if int(headers.get("content-length", 0)) > self.access.largest:
             raise _too_large(self.access.largest)
 
     def _check_token(self, scope: Scope, headers: Headers) -> None:
-        """Check a request's rate and token, set `CURRENT_TOKEN` and mark the scope with `LET_IN`.
+        """Check a request's token, and set `CURRENT_TOKEN`.
 
-        A secret in the path is removed from it. Raises Refusal: 429 for too many requests of a
-        client, 401 without a right token, 403 for a viewer's token on a request that could change
-        something. A wrong token is logged, but not each time. /healthz needs no right token;
-        without one nothing is set or marked. A server without tokens takes every request.
+        A secret in the path is removed from it. Raises Refusal: 401 without a right token, 403 for
+        a viewer's token on a request that could change something. The first wrong token of a client
+        is logged. /healthz needs no right token; without one nothing is set. A server without
+        tokens takes every request.
         """
-        client = (scope.get("client") or ("", 0))[0]
         secret = take_token(scope, headers.get("authorization", ""))
         token = self.access.find_token(secret) if self.access.tokens else ANYBODY
-        # Requests without a token are counted apart, so that they block nobody who has one.
-        if not self.requests.allow(client if token else f"{client}, without"):
-            limit = f"Expected at most {self.access.rate:g} requests per second from one client."
-            raise Refusal(HTTPStatus.TOO_MANY_REQUESTS, limit)
         if token is not None:
-            scope[LET_IN] = True
             CURRENT_TOKEN.set(token)
             if not token.operates and scope["method"] not in SAFE_METHODS:
                 raise Refusal(
                     HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's token."
                 )
         elif scope["path"] != "/healthz":
-            if (secret or "authorization" in headers) and self.log_lines.allow(client):
-                log.warning("a wrong token came from %s", client)
+            if secret or "authorization" in headers:
+                self._log_wrong_token((scope.get("client") or ("", 0))[0])
             how = "Authorization: Bearer TOKEN, or any user name with it as the password"
             challenge = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
             raise Refusal(
                 HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", challenge
             )
+
+    def _log_wrong_token(self, client: str) -> None:
+        """Log that a client sent a wrong token, once for each of at most `MAX_CLIENTS` clients."""
+        if client not in self._named and len(self._named) < MAX_CLIENTS:
+            self._named.add(client)
+            log.warning("a wrong token came from %s", client)
 
 
 def _limit_body(receive: Receive, access: Access) -> Receive:

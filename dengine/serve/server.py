@@ -25,7 +25,7 @@ import uvicorn
 from ..engine.engine import DataEngine, frozen_objects
 from ..errors import SettingError, instead, without_password
 from .auth import Access, host_in_url, is_loopback, read_tokens
-from .connections import CONNECTIONS, ConnectionPool
+from .connections import Connection
 from .http import Beside, create_app
 from .retraining import END_SIGNALS, RetrainingProcess
 from .robot_calls import Recorder
@@ -37,6 +37,20 @@ GRACE = 5  # seconds for requests under way when the server ends
 # Seconds after which a thread gives Python's lock to a waiting one. A robot may wait for either of
 # the server's two threads.
 SWITCH_INTERVAL = 0.0005
+# uvicorn writes no log of its own, trusts no proxy's headers and serves no web sockets.
+UVICORN_OPTIONS: dict[str, Any] = {
+    "http": Connection,
+    "timeout_keep_alive": KEEP_ALIVE,
+    "timeout_graceful_shutdown": GRACE,
+    "loop": "auto",  # uvloop if that is installed
+    "ws": "none",
+    "lifespan": "on",
+    "server_header": False,
+    "proxy_headers": False,
+    "log_config": None,
+    "log_level": "critical",
+    "access_log": False,
+}
 
 
 class LineFormatter(logging.Formatter):
@@ -92,8 +106,6 @@ def serve(
     allow_hosts: Sequence[str],
     deadline: float,
     largest: int,
-    rate: float,
-    connections: int,
     check_seconds: float,
     opcua: int | None,
     opcua_cert: Path | None,
@@ -140,7 +152,7 @@ def serve(
     tls = _tls_options(cert, key)
     tokens = () if token_file is None else read_tokens(token_file)
     own_names = () if is_loopback(host) else (host, socket.gethostname())
-    access = Access(tokens, (*own_names, *allow_hosts), largest, rate=rate)
+    access = Access(tokens, (*own_names, *allow_hosts), largest)
     with (
         listening_socket(host, port) as listening,
         log_lines_to(sys.stderr),
@@ -163,7 +175,7 @@ def serve(
                 )
                 beside = [*beside, start_opcua]
             app = create_app(service, access, beside=beside, recorder=opened_recorder, **interfaces)
-            config = uvicorn.Config(app, **uvicorn_options(connections) | tls)
+            config = uvicorn.Config(app, **UVICORN_OPTIONS | tls)
             scheme = "https" if cert else "http"
             address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
             audience = "" if tokens else ", to this machine alone"
@@ -177,27 +189,6 @@ def serve(
                 raise getattr(app.state, "failure", failure) from None
         finally:
             service.close()
-
-
-def uvicorn_options(connections: int = CONNECTIONS) -> dict[str, Any]:
-    """Return the options of `uvicorn.Config` by name, without those of TLS.
-
-    At most `connections` may be open at once. uvicorn writes no log of its own, trusts no proxy's
-    headers and serves no web sockets.
-    """
-    return {
-        "http": ConnectionPool(connections).new_connection,
-        "timeout_keep_alive": KEEP_ALIVE,
-        "timeout_graceful_shutdown": GRACE,
-        "loop": "auto",  # uvloop if that is installed
-        "ws": "none",
-        "lifespan": "on",
-        "server_header": False,
-        "proxy_headers": False,
-        "log_config": None,
-        "log_level": "critical",
-        "access_log": False,
-    }
 
 
 class CellServer(uvicorn.Server):

@@ -107,7 +107,7 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
     np.testing.assert_array_equal(baseline.predict_interval(X[120:]), before)
 
 
-def test_the_table_is_complete_and_imports_nothing() -> None:
+def test_the_table_imports_nothing() -> None:
     code = "import sys; from dengine.experiments.baselines import BASELINES; print(*{'aeon'} & {*sys.modules})"
     assert (
         subprocess.run(
@@ -115,8 +115,6 @@ def test_the_table_is_complete_and_imports_nothing() -> None:
         ).stdout.split()
         == []
     )
-    assert all(len(kind.candidates) == 4 and 0 <= kind.chosen < 4 for kind in BASELINES.values())
-    assert [name for name, kind in BASELINES.items() if not kind.bound] == ["knn", "never"]
 
 
 @pytest.mark.parametrize(

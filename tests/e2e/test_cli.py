@@ -195,19 +195,14 @@ def compare(data: Path, words: str) -> list[object]:
     return ["compare", "--data", data, "--cycles", 60, *words.split()]
 
 
-def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(
+def test_the_papers_grid_is_played_and_drawn_with_a_line_for_each_of_its_cells(
     data: Path, tmp_path: Path
 ) -> None:
     shown = line_of(*compare(data, "--reducers pca --paper --repeats 1"), "--out", tmp_path)
-    page = (tmp_path / "tables.md").read_text(encoding="utf-8")
-    assert page.count("| alpha / LB | 80 % | 90 % | 95 % |") == 2
-    assert "[36.9 / 1019.8]" in page
-    assert {path.name for path in tmp_path.glob("grid_*")} == {
-        "grid_pca_wilson.png",
-        "grid_pca_binomial.png",
-    }
-    assert "of 9 cells, at most" in shown
     assert "18 replays" in shown
+    rows = (tmp_path / "replays.csv").read_text("utf-8").splitlines()
+    assert len({tuple(row.split(",")[1:4]) for row in rows[1:]}) == 18
+    assert [path.name for path in tmp_path.glob("*.png")] == ["map_pca.png", "curves.png"]
 
 
 def test_baselines_are_compared_under_their_names_which_the_help_says_and_leave_no_map(

@@ -339,7 +339,7 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
     tokens = Token("a-viewer-s-password", False, "Line display"), Token(TOKEN, True, "Kim")
     file = tmp_path / "cell.db"
     trace = TraceSpec(60, rate_hz=500.0)  # which limits in seconds need
-    access = Access(tokens, rate=0.0)
+    access = Access(tokens)
     with a_service(file, trace=trace) as service, served(create_app(service, access)) as port:
         demo, part = DemoCell(f"http://127.0.0.1:{port}", file), played(service, stream).part
         with (

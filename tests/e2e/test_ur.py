@@ -15,7 +15,7 @@ import pytest
 
 from dengine import DataEngine, Dataset, Policy, ReplayCell
 from dengine.cells import Cell, FakeController, RtdeRecorder, UrCell
-from dengine.cells.ur import RobotProgram, Trouble
+from dengine.cells.ur import RobotProgram
 from dengine.cells.ur.cell import (
     ANSWER,
     MAX_NUMBER,
@@ -39,6 +39,7 @@ from dengine.cells.ur.stream import RtdeClient, RtdeStream
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError, DengineError
 from tests.support.command_line import dengine, document, line_of, succeed
+from tests.support.robots import FaultyController, Trouble
 
 SAMPLES = 80
 FORCE = "actual_TCP_force[2]"
@@ -103,7 +104,7 @@ def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(
     refused: PackageType | str, column: str, text: str
 ) -> None:
     with (
-        FakeController(speed=None, refuses=[refused]) as fake,
+        FaultyController(speed=None, refuses=[refused]) as fake,
         pytest.raises(DengineError, match=text),
     ):
         RtdeClient(fake.host, fake.port, (column,), (ORDER,))
@@ -138,7 +139,7 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(
     parts: Dataset,
 ) -> None:
     with (
-        FakeController(RobotProgram(parts), speed=SPEED, troubles=TROUBLES) as fake,
+        FaultyController(RobotProgram(parts), TROUBLES, speed=SPEED) as fake,
         cell_of(fake) as cell,
     ):
         for part in range(16):
@@ -276,7 +277,7 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
         program.restart()
         del program.step
 
-    with FakeController(program, speed=20.0) as fake, cell_of(fake) as cell:
+    with FaultyController(program, speed=20.0) as fake, cell_of(fake) as cell:
         program.step = lambda inputs: program.outputs  # it answers nothing
         if value == "is deaf":
             cell.order_timeout = 0.3
@@ -290,7 +291,7 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
             cell.recorder.stream.take(0.05)
         before = cell.report().reconnects
         fake.inputs.clear()
-        fake.hang_up(False)
+        fake.hang_up()
         while cell.report().reconnects == before:
             cell.recorder.stream.take(0.05)
         begun = cell.report().packages
@@ -301,7 +302,7 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
 
 def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
     now, order = [0.0], encode_message(7, Verb.INSERT)
-    fake = FakeController(speed=20.0)
+    fake = FaultyController(speed=20.0)
 
     def until(true: Callable[[], bool]) -> None:
         while not true():
@@ -374,9 +375,8 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(
     parts: Dataset, tmp_path: Path
 ) -> None:
     store = tmp_path / "cell.db"
-    with FakeController(
-        RobotProgram(parts), speed=SPEED, troubles=[Trouble(3, 9, "drop", 2)]
-    ) as fake:
+    gap = Trouble(3, 9, "drop", 2)
+    with FaultyController(RobotProgram(parts), [gap], speed=SPEED) as fake:
         result = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
         shown = line_of(*run_on(fake, store), "--cycles", 3)
     assert (result["total"]["verified"], result["cell"]["incomplete"]) == (12, 1)

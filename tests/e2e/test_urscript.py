@@ -106,7 +106,7 @@ class Handle(xmlrpc.client.ServerProxy):
 @pytest.fixture
 def cell(tmp_path: Path) -> Iterator[SimpleNamespace]:
     """A server at a port of its own, its service, and its recorder."""
-    recorder, access = PushedTraces(), Access(rate=0.0)
+    recorder, access = PushedTraces(), Access()
     with (
         a_service(tmp_path / "cell.db") as service,
         served(create_app(service, access, recorder=recorder)) as port,

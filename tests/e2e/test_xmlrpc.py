@@ -52,7 +52,7 @@ class Cell:
 def cell(tmp_path_factory: pytest.TempPathFactory, stream: Dataset) -> Iterator[Cell]:
     recorder = PushedTraces()
     with a_service(tmp_path_factory.mktemp("cell") / "cell.db") as service:
-        app = create_app(service, Access(rate=0.0, largest=200_000), page=False, recorder=recorder)
+        app = create_app(service, Access(largest=200_000), page=False, recorder=recorder)
         with served(app) as port:
             created = Cell(service, recorder, port)
             robot = created.robot()

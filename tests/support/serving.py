@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -49,21 +50,18 @@ def a_service(
 
 
 @contextmanager
-def served(app: Any, port: int = 0, connections: int = 100, **limits: Any) -> Iterator[int]:
+def served(app: Any, port: int = 0, **limits: Any) -> Iterator[int]:
     """An application in a thread of this process, as `dengine serve` has it; gives its port.
 
-    limits : of `ConnectionPool`.
+    limits : of `Connection`.
     """
     import uvicorn
 
-    from dengine.serve.connections import ConnectionPool
-    from dengine.serve.server import listening_socket, uvicorn_options
+    from dengine.serve.connections import Connection
+    from dengine.serve.server import UVICORN_OPTIONS, listening_socket
 
-    options = {
-        "http": ConnectionPool(connections, **limits).new_connection,
-        "timeout_graceful_shutdown": 1,
-    }
-    server = uvicorn.Server(uvicorn.Config(app, **uvicorn_options() | options))
+    options = {"http": partial(Connection, **limits), "timeout_graceful_shutdown": 1}
+    server = uvicorn.Server(uvicorn.Config(app, **UVICORN_OPTIONS | options))
     with listening_socket("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()

@@ -226,7 +226,7 @@ def test_times_are_in_samples_and_values_have_no_unit_while_these_are_unknown(
     )
     assert "every sample is 4: a dead sensor" in said_of(constant)
     excess = outside.envelope.excesses[0]
-    assert (excess.first, excess.last, excess.from_s, excess.to_s) == (20, 24, None, None)
+    assert (excess.first, excess.last) == (20, 24)
 
 
 def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
@@ -288,23 +288,23 @@ def test_a_planted_excess_is_found_where_and_how_far_it_is() -> None:
     trace = np.median(X, axis=0)
     trace[1, 20:25] = 6.0
     trace[0, 40] = -5.0
-    result = envelope_of(X, trace, rate_hz=100.0)
+    result = envelope_of(X, trace)
     high, low = result.excesses
-    assert (low.channel, low.from_s, low.to_s, low.above) == (0, 0.4, 0.4, False)
-    assert (high.channel, high.from_s, high.to_s, high.above) == (1, 0.2, 0.24, True)
+    assert (low.channel, low.first, low.last, low.above) == (0, 40, 40, False)
+    assert (high.channel, high.first, high.last, high.above) == (1, 20, 24, True)
     widths = (6.0 - result.high[1, 20:25]) / (result.high - result.low)[1, 20:25]
     assert high.widths == pytest.approx(widths.max(), rel=1e-5)
     assert result.outside == pytest.approx(6 / 100)
     trace = np.zeros((2, 50), np.float32)
     trace[0, 3], trace[1, 4:6] = np.nan, np.inf  # these lie nowhere
     trace[0, 10:12], trace[0, 12:15] = 9.0, -9.0  # one that changes sides is two
-    result = envelope_of(X, trace, rate_hz=1.0)
+    result = envelope_of(X, trace)
     assert result.not_finite == 3
-    assert sorted((excess.from_s, excess.to_s, excess.above) for excess in result.excesses) == [
+    assert sorted((excess.first, excess.last, excess.above) for excess in result.excesses) == [
         (10, 11, True),
         (12, 14, False),
     ]
-    assert envelope_of(X[:19], trace, 1.0) is envelope_of(X, trace[:, :49], 1.0) is None
+    assert envelope_of(X[:19], trace) is envelope_of(X, trace[:, :49]) is None
 
 
 @pytest.mark.parametrize("clock_goes", [1.0, 0.0, -1.0], ids=["on", "not", "back"])

@@ -39,7 +39,7 @@ def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_
     asked += [
         FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))
     ]
-    asked += [FunctionTransformer(np.abs), "knn", replace(Contender.load("knn"), params={"k": 3})]
+    asked += [FunctionTransformer(np.abs), "knn"]
     others = [
         replace(task, **change)
         for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})

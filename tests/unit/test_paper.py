@@ -5,20 +5,13 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from dengine.experiments.paper import (
-    ALPHAS,
-    INTERVALS,
-    LOWER_BOUNDS,
-    PUBLISHED,
-    findings,
-    grid_lines,
-    paper_table,
-)
+from dengine.experiments.grid import PAPER_GRID
+from training.paper import LOWER_BOUNDS, PUBLISHED, findings, paper_table
+
+ALPHAS = PAPER_GRID["alphas"]
 
 
-def frame(
-    interval: str = "wilson", recipe: str = "conv", retrain: float = 0.1, **cells
-) -> pd.DataFrame:
+def frame(interval: str = "wilson", recipe: str = "conv", **cells) -> pd.DataFrame:
     """Two replays a cell: those of the paper, one a little above and one below; or what `cells`
     says of all.
     """
@@ -30,12 +23,7 @@ def frame(
                 row = {"recipe": recipe, "interval": interval, "alpha": alpha, "lower_bound": bound}
                 row |= {"guarantee": "local", "stops": "some", "confirm": False}
                 row |= {"certain": certain + sign, "false_positive": false_positive + sign}
-                row |= {
-                    "first_certain": 10.0 / alpha,
-                    "retrain_p50_s": retrain,
-                    "retrain_max_s": retrain,
-                }
-                rows.append(row | cells)
+                rows.append(row | {"first_certain": 10.0 / alpha} | cells)
     return pd.DataFrame(rows)
 
 
@@ -81,17 +69,15 @@ def test_the_papers_own_figures_bear_its_findings_out() -> None:
         "Binomial does not answer",
         "share of false positives",
         "delays the first",
-        "a retrain of",
     )
     assert [by_claim(lines, claim) for claim in claims] == [
         [True],
         [True],
         [True] * 2,
         [True] * 3,
-        [True],
     ]
     answer = findings(frame(recipe="knn k=5"))  # no interval of ours
-    assert [by_claim(answer, claim) for claim in claims] == [[], [], [True], [], [True]]
+    assert [by_claim(answer, claim) for claim in claims] == [[], [], [True], []]
 
 
 def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_nothing_breaks_no_tolerance() -> (
@@ -104,18 +90,6 @@ def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_not
     assert by_claim(lines, "share of false positives") == [True, False]
     assert any("in 3 of 9 cells, at most 12.0 %" in line for line in lines)  # not at LB 90 and 95 %
     assert by_claim(findings(frame(first_certain=50.0)), "delays the first") == [False] * 3
-    assert by_claim(findings(frame(retrain=2.4)), "a retrain of conv") == [False]
     lines = findings(frame(certain=0, false_positive=0, first_certain=float("nan")))
     claims = ("share of false positives", "delays the first", "answer")
     assert [by_claim(lines, claim) for claim in claims] == [[True], [], []]
-
-
-def test_the_page_has_a_part_for_each_feedback() -> None:
-    page = "\n".join(grid_lines(pd.concat([frame(), frame("binomial", confirm=True)])))
-    counts = {
-        "## Guarantee local": 2,
-        "good accepted parts confirmed": 1,
-        "false positives / certain": 2,
-    }
-    assert {text: page.count(text) for text in counts} == counts
-    assert all(f"**conv, {interval}**" in page for interval in INTERVALS)

@@ -30,7 +30,7 @@ from dengine import (
 from dengine.decision.scripting import script
 from dengine.errors import SettingError
 from dengine.records import FITS, stored_trace_spec
-from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length, spec_of
+from dengine.traces import REASONS, TraceGate, as_trace, can_fit_length
 from tests.support.driving import learn
 
 NO_TRACES = (np.float32(3.0), np.zeros((2, 3, 4)), np.zeros(0), np.zeros((1, 0)), np.zeros((0, 5)))
@@ -304,41 +304,15 @@ def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(
     assert {decision.action for _, decision in decided} >= {Action.VERIFY, Action.ACCEPT}
 
 
-def recording(samples: int = 60) -> pd.DataFrame:
-    x = ramp(samples, 3) * np.array([[1.0], [2.0], [3.0]], dtype=np.float32)
-    return pd.DataFrame({"Timestamp": np.arange(samples) / 500, "FX": x[0], "FY": x[1], "FZ": x[2]})
-
-
-def test_a_dataframe_has_samples_in_rows_and_channels_in_columns() -> None:
-    frame = recording()
-    result = as_trace(frame, None)
-    np.testing.assert_array_equal(result, frame[["FX", "FY", "FZ"]].to_numpy(dtype=np.float32).T)
-    assert spec_of(result, frame) == TraceSpec(60, channels=3, columns=("FX", "FY", "FZ"))
-    np.testing.assert_array_equal(as_trace(frame, TraceSpec(60, channels=3)), result)
-    np.testing.assert_array_equal(as_trace(frame["FZ"], None), result[2:])
-
-
-def test_columns_that_do_not_match_are_named_and_time_is_no_channel() -> None:
-    with pytest.raises(
-        TraceError,
-        match=r"Expected a DataFrame with 2 channel\(s\).*got the columns Timestamp, FX, FY, FZ",
-    ):
-        as_trace(recording(), TraceSpec(60, channels=2))
-    dated = (
-        recording().rename(columns={"Timestamp": "When"}).assign(When=pd.Timestamp("2026-01-01"))
-    )
-    assert as_trace(dated, None).shape == (3, 60)
-    with pytest.raises(TraceError, match="at least one channel"):
-        as_trace(recording()[["Timestamp"]], None)
-
-
-def test_a_first_dataframe_with_a_row_a_trace_is_refused_and_not_taken_for_many_channels() -> None:
-    wide = pd.DataFrame(np.random.default_rng(0).normal(size=(2, 1000)))
+def test_the_named_columns_of_a_table_are_channels_and_without_names_it_is_refused() -> None:
+    frame = pd.DataFrame(ramp(60, 3).T, columns=["FX", "FY", "FZ"])
+    spec = TraceSpec(60, channels=2, columns=("FZ", "FX"))
+    np.testing.assert_array_equal(as_trace(frame, spec), ramp(60, 3)[[2, 0]])
+    with pytest.raises(TraceError, match="Expected the columns FZ, FX, got FX, FY"):
+        as_trace(frame[["FX", "FY"]], spec)
     with DataEngine("pca") as engine:
-        with pytest.raises(
-            TraceError, match="got 2 rows of 1000 columns; pass one row, as a Series"
-        ):
-            engine.decide(wide)
+        with pytest.raises(TraceError, match=r"got a table; name its channels, TraceSpec"):
+            engine.decide(frame)
         assert engine.trace is None
-        engine.decide(wide.iloc[0])
-        assert (engine.trace.channels, engine.trace.samples) == (1, 1000)
+        engine.decide(frame["FZ"])
+        assert (engine.trace.channels, engine.trace.samples) == (1, 60)

@@ -10,7 +10,7 @@ last values for ever.
 """
 
 from .cell import UrCell
-from .controller import FakeController, RobotProgram, Trouble
+from .controller import FakeController, RobotProgram
 from .recorder import InsertionRecord, RtdeRecorder
 from .stream import StreamReport
 
@@ -20,6 +20,5 @@ __all__ = [
     "RobotProgram",
     "RtdeRecorder",
     "StreamReport",
-    "Trouble",
     "UrCell",
 ]

@@ -1,6 +1,5 @@
 """`FakeController`, a simulated controller that speaks RTDE over TCP, for tests and trials. It runs
-a `RobotProgram`, which carries out the orders of a `UrCell` with the traces of a data set, and can
-produce the faults that occur in practice, each a `Trouble`.
+a `RobotProgram`, which carries out the orders of a `UrCell` with the traces of a data set.
 
     with FakeController(RobotProgram("insertion")) as fake:
         with UrCell(fake.host, port=fake.port) as cell: ...
@@ -15,10 +14,8 @@ import socket
 import struct
 import threading
 import time
-from collections import Counter
-from collections.abc import Collection, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass
 from itertools import repeat
 from typing import Any
 
@@ -26,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...datasets import load_dataset
-from ...errors import CellError, expect
+from ...errors import CellError
 from .cell import ANSWER, ORDER, PHASE, RUNTIME, ResultCode, Runtime, Verb, encode_message
 from .protocol import (
     CHANNELS,
@@ -185,8 +182,6 @@ FOREIGN = (
 )  # of a client that has gone, or does not speak RTDE
 # A client that does not read for five seconds is disconnected. Windows wants milliseconds.
 SEND_TIMEOUT = 5000 if os.name == "nt" else struct.pack("ll", 5, 0)
-GARBAGE = b"\x00\x01\xff GET / HTTP/1.1"
-TROUBLES = ("drop", "hold", "close", "half", "garbage", "repeat", "reset")
 FIELDS = {  # patterns of the names of fields, and their types
     r"timestamp|speed_scaling|(in|out)put_double_register_\d+": "DOUBLE",
     r"actual_(q|qd|TCP_pose|TCP_speed|TCP_force)": "VECTOR6D",
@@ -203,35 +198,8 @@ def type_of(name: str) -> str:
     return next(types, NOT_FOUND)
 
 
-@dataclass(frozen=True, slots=True)
-class Trouble:
-    """A fault at one sample of one insertion.
-
-    Attributes
-    ----------
-    part, sample : int
-        Where it happens.
-    kind : str
-        "drop": `cycles` packages are not sent, from this one on. "hold": so many are delayed and
-        then sent at once. "repeat": the package is sent twice. "close": the connections are closed
-        before it. "half": after half of it. "garbage": after bytes that are no package. "reset":
-        the controller's clock starts anew.
-    cycles : int
-        Length of "drop" and "hold" in control cycles.
-    """
-
-    part: int
-    sample: int
-    kind: str
-    cycles: int = 1
-
-    def __post_init__(self) -> None:
-        is_valid = self.kind in TROUBLES and self.cycles >= 1
-        expect(is_valid, f"a trouble among {', '.join(TROUBLES)} of 1 or more cycles", self)
-
-
 class Client:
-    """A connected client of `FakeController`: its recipes, and bytes that are delayed for it."""
+    """A connected client of `FakeController`, and its recipes."""
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -241,18 +209,13 @@ class Client:
         self.every = 1  # sends a package in each n-th cycle
         self.inputs: dict[int, RtdeRecipe] = {}
         self.started = False
-        self.delayed = b""
 
-    def send(self, data: bytes) -> bool:
-        """Send bytes; return whether the client is still connected and has started to receive.
-
-        A client that has gone, or does not read for 5 s, is disconnected.
-        """
+    def send(self, data: bytes) -> None:
+        """Send bytes; a client that has gone, or does not read for 5 s, is disconnected."""
         try:
             self.socket.sendall(data)
-        except OSError:  # gone, or it does not read
+        except OSError:
             self.hang_up()
-        return self.started
 
     def hang_up(self, how: int = socket.SHUT_WR) -> None:
         """Shut the connection down; by default, what was sent still arrives.
@@ -270,7 +233,7 @@ class FakeController(AbstractContextManager["FakeController"]):
     Parameters
     ----------
     program : RobotProgram, optional
-        Has `step` and `place`. None: the robot does nothing.
+        Has `step`. None: the robot does nothing.
     host : str, default "127.0.0.1"
     port : int, default 0
         0: any free port, which the attribute `port` names.
@@ -278,18 +241,17 @@ class FakeController(AbstractContextManager["FakeController"]):
         Relative to real time. None: as fast as clients read from the socket. An `RtdeStream`
         reads in a thread of its own and buffers 60 s of packages of robot time, so if nobody takes
         them, as during a retrain, it soon drops the oldest.
-    troubles : iterable of Trouble
-        Faults to produce.
-    refuses : collection
-        Requests to refuse, PackageType.VERSION or START; names of outputs that it does not have,
-        and of inputs that another client writes.
 
     Attributes
     ----------
     inputs : dict
         Registers as clients have written them, by column.
-    lost : set of (int, int)
-        Part and sample of each package of an insertion that was sent to no client.
+    clients : list of Client
+        Those that are connected.
+    cycle, begin : int
+        The present control cycle, and that at which the controller's clock began.
+    lock : threading.Lock
+        Held during a control cycle, and while a client's request is carried out.
     """
 
     def __init__(
@@ -298,23 +260,18 @@ class FakeController(AbstractContextManager["FakeController"]):
         host: str = "127.0.0.1",
         port: int = 0,
         speed: float | None = 1.0,
-        troubles: Iterable[Trouble] = (),
-        refuses: Collection[PackageType | str] = (),
     ) -> None:
         self.program = program
         self.host = host
         self.speed = speed
-        self.refuses = refuses
-        self.lost: set[tuple[int, int]] = set()
-        self._troubles = {(trouble.part, trouble.sample): trouble for trouble in troubles}
+        self.inputs: Values = {}
+        self.clients: list[Client] = []
+        self.cycle = 0
+        self.begin = 0
+        self.lock = threading.Lock()
         self._server = socket.create_server((host, port))
         self.port: int = self._server.getsockname()[1]
-        self.inputs: dict[str, float] = {}
-        self._clients: list[Client] = []
-        self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._begin = self._cycle = 0
-        self._until = Counter[str]()  # by kind of trouble: the cycle at which it ends
         self._threads = [
             threading.Thread(target=loop, daemon=True)
             for loop in (self._accept_loop, self._run_loop)
@@ -328,30 +285,14 @@ class FakeController(AbstractContextManager["FakeController"]):
         with suppress(OSError):
             self._server.shutdown(socket.SHUT_RDWR)
         self._server.close()
-        with self._lock:
-            for client in self._clients:
+        with self.lock:
+            for client in self.clients:
                 client.hang_up(socket.SHUT_RDWR)  # packages under way may be lost
         for thread in list(self._threads):
             thread.join()
 
     def __exit__(self, *raised: object) -> None:
         self.close()
-
-    def hang_up(self, anew: bool = False) -> None:
-        """Close every connection; clients may connect again.
-
-        Parameters
-        ----------
-        anew : bool, default False
-            Act as switched off and on: the clock starts anew, and all inputs are forgotten. The
-            program goes on.
-        """
-        with self._lock:
-            if anew:
-                self.inputs.clear()
-                self._begin = self._cycle
-            for client in self._clients:
-                client.hang_up()
 
     def _accept_loop(self) -> None:
         """Accept connections, each served by a thread of its own, until the server is closed."""
@@ -368,28 +309,27 @@ class FakeController(AbstractContextManager["FakeController"]):
 
         It is the body of the client's thread; afterwards the client is forgotten.
         """
-        with self._lock:
-            self._clients.append(client)
+        with self.lock:
+            self.clients.append(client)
         packages = PackageReader()
         with client.socket, suppress(*FOREIGN):
             while piece := client.socket.recv(65536):
                 for package in packages.feed(piece):
-                    with self._lock:
-                        self._respond(client, package.type, package.payload)
-        with self._lock:
+                    with self.lock:
+                        self.respond(client, package.type, package.payload)
+        with self.lock:
             client.started = False
-            self._clients.remove(client)
+            self.clients.remove(client)
 
-    def _respond(self, client: Client, type_: PackageType, payload: bytes) -> None:
+    def respond(self, client: Client, type_: PackageType, payload: bytes) -> None:
         """Carry out one request of a client, and send the response if the protocol has one; the
         caller holds the lock.
 
         Text is ignored, and data sets `inputs`; neither has a response. The others are: declare
         outputs or inputs, start (packages are sent until the next of these requests), pause, and
-        ask for versions. What is in `refuses`, and an input of another client, is refused. A
-        malformed request raises one of `FOREIGN`.
+        ask for versions. An input of another client is refused. A malformed request raises one of
+        `FOREIGN`.
         """
-        is_allowed = type_ not in self.refuses
         match type_:
             case PackageType.TEXT:
                 return
@@ -399,47 +339,39 @@ class FakeController(AbstractContextManager["FakeController"]):
             case PackageType.OUTPUTS:
                 (rate,) = struct.unpack_from(">d", payload)
                 client.every = max(int(1 / (CYCLE_S * rate)), 1) if rate > 0 else 1
-                recipe = self._make_recipe(1, payload[8:], self.refuses, NOT_FOUND)
+                names = payload[8:].decode().split(",")
+                recipe = RtdeRecipe(1, tuple(names), tuple(map(type_of, names)))
                 client.output = None if NOT_FOUND in recipe.types else recipe
                 response = bytes([1]) + ",".join(recipe.types).encode()
             case PackageType.INPUTS:
-                others = [
-                    recipe.names
-                    for other in self._clients
-                    if other is not client
-                    for recipe in other.inputs.values()
-                ]
-                number = len(client.inputs) + 1
-                recipe = self._make_recipe(number, payload, {*self.refuses}.union(*others), IN_USE)
-                if {IN_USE, NOT_FOUND} & set(recipe.types):
-                    number = 0
-                else:
-                    client.inputs[number] = recipe
-                response = bytes([number]) + ",".join(recipe.types).encode()
+                response = self._declare_inputs(client, payload.decode().split(","))
             case PackageType.CONTROLLER:
                 response = struct.pack(">4I", 5, 11, 0, 0)  # of its software
             case PackageType.VERSION:
-                response = bytes([is_allowed and payload == struct.pack(">H", VERSION)])
+                response = bytes([payload == struct.pack(">H", VERSION)])
             case _:
-                response = bytes(
-                    [is_allowed and (type_ is not PackageType.START or client.output is not None)]
-                )
+                response = bytes([type_ is not PackageType.START or client.output is not None])
         client.socket.sendall(Package(type_, response).to_bytes())
         client.started = type_ is PackageType.START and response == b"\1"
 
-    def _make_recipe(
-        self, number: int, names: bytes, refused: Collection[PackageType | str], why: str
-    ) -> RtdeRecipe:
-        """Return a recipe of the fields in `names`, a text with commas between them.
+    def _declare_inputs(self, client: Client, names: list[str]) -> bytes:
+        """Note the inputs that a client will write, and return the payload of the response.
 
-        Refused ones have the type `why`, the others that of `type_of`, which may be NOT_FOUND.
+        None is noted if another client writes one of them, or there is none of a name.
         """
-        listed = names.decode().split(",")
-        return RtdeRecipe(
-            number,
-            tuple(listed),
-            tuple(why if name in refused else type_of(name) for name in listed),
-        )
+        in_use = {
+            name
+            for other in self.clients
+            if other is not client
+            for recipe in other.inputs.values()
+            for name in recipe.names
+        }
+        types = [IN_USE if name in in_use else type_of(name) for name in names]
+        number = 0
+        if not {IN_USE, NOT_FOUND} & set(types):
+            number = len(client.inputs) + 1
+            client.inputs[number] = RtdeRecipe(number, tuple(names), tuple(types))
+        return bytes([number]) + ",".join(types).encode()
 
     def _run_loop(self) -> None:
         """Run control cycles until the server is closed: the body of a thread.
@@ -448,61 +380,30 @@ class FakeController(AbstractContextManager["FakeController"]):
         """
         due = time.monotonic()
         while not self._closing.is_set():
-            with self._lock:
-                listened = self._step()
+            with self.lock:
+                listened = self.step()
             if self.speed is not None:
                 due += CYCLE_S / self.speed
                 self._closing.wait(max(due - time.monotonic(), 0.0))
             elif not listened:
                 time.sleep(IDLE_S)
 
-    def _step(self) -> bool:
-        """Run one control cycle: the program, troubles, and a package to each client that is due.
+    def step(self) -> bool:
+        """Run one control cycle: the program, and a package to each client that is due.
 
-        Return whether a client was to receive one. Part and sample of an insertion's package that
-        no client was sent are added to the set `lost`. The caller holds the lock.
+        Return whether a client was to receive one. The caller holds the lock.
         """
-        values = {
-            **STATE,
-            **self.inputs,
-            **(self.program.step(dict(self.inputs)) if self.program else {}),
-        }
-        place = self.program.place if self.program else None
-        trouble = self._troubles.pop(place, None) if place else None
-        kind = trouble.kind if trouble else ""
-        if trouble:
-            self._until[kind] = max(self._until[kind], self._cycle + trouble.cycles)
-        if kind == "reset":
-            self._begin = self._cycle
-        if kind == "close":
-            for client in self._clients:
-                client.hang_up()
-        values["timestamp"] = (self._cycle - self._begin) * CYCLE_S
-        started = [
-            client for client in self._clients if client.started and self._cycle % client.every == 0
-        ]
-        sent = [self._send(client, values, kind) for client in started]
-        if place is not None and not any(sent):
-            self.lost.add(place)
-        self._cycle += 1
-        return bool(started)
+        outputs = self.program.step(dict(self.inputs)) if self.program else {}
+        values = {**STATE, **self.inputs, **outputs}
+        listening = [client for client in self.clients if client.started]
+        due = [client for client in listening if not self.cycle % client.every]
+        for client in due:
+            values["timestamp"] = (self.cycle - self.begin) * CYCLE_S
+            self.send(client, values)
+        self.cycle += 1
+        return bool(due)
 
-    def _send(self, client: Client, values: Values, trouble: str) -> bool:
-        """Send a client the package of this cycle, or what `trouble` makes of it.
-
-        Return whether the package will arrive, now or later. After "half" and "garbage" the client
-        is disconnected.
-        """
-        if self._cycle < self._until["drop"] or client.output is None:
-            return False
-        data = client.output.pack(values)
-        if trouble in ("half", "garbage"):
-            client.send(data[: len(data) // 2] if trouble == "half" else GARBAGE)
-            client.hang_up()
-            return False
-        client.delayed += data * (2 if trouble == "repeat" else 1)
-        if self._cycle < self._until["hold"]:
-            return True
-        data = client.delayed
-        client.delayed = b""
-        return client.send(data)
+    def send(self, client: Client, values: Values) -> None:
+        """Send a client that has started the package of this cycle; the caller holds the lock."""
+        if client.output is not None:
+            client.send(client.output.pack(values))

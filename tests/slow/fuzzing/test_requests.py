@@ -243,7 +243,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     file = tmp_path_factory.mktemp("cell") / "cell.db"
     learned(file)
     with closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service:
-        app = create_app(service, Access(rate=0.0, body_seconds=0.2))
+        app = create_app(service, Access(body_seconds=0.2))
         with served(app, head_seconds=0.3) as port:
             created = Cell(service, port)
             yield created

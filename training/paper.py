@@ -1,7 +1,7 @@
-"""The paper's experiment: its grid, its two tables with its numbers beside ours, and its findings.
-The verb `compare` and `training/evidence_page.py` write them.
+"""The paper's experiment: its two tables with its numbers beside ours, and its findings.
+`evidence_page.py` writes them.
 
-    frame = run_grid("insertion", ["conv"], **GRID, repeats=30)
+    frame = run_grid("insertion", ["conv"], **PAPER_GRID, repeats=30)
     print(paper_table(frame, "conv", "wilson"))
     for line in findings(frame): print(line)
 
@@ -10,19 +10,16 @@ and "Binomial Interval score": mean false positives / mean certain predictions o
 1503 insertions.
 """
 
-import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from .baselines import BASELINES
+import pandas as pd
 
-if TYPE_CHECKING:
-    import pandas as pd
+from dengine.experiments.baselines import BASELINES
+from dengine.experiments.grid import PAPER_GRID
 
-ALPHAS = (0.5, 0.1, 0.05)
-LOWER_BOUNDS = (0.8, 0.9, 0.95)
-INTERVALS = ("wilson", "binomial")
-GRID = {"alphas": ALPHAS, "lower_bounds": LOWER_BOUNDS, "intervals": INTERVALS}
+LOWER_BOUNDS = PAPER_GRID["lower_bounds"]
+INTERVALS = PAPER_GRID["intervals"]
 
 _ROWS = {  # (interval, alpha) -> false positives and certain predictions for each LB
     ("wilson", 0.5): ((36.1, 1317.1), (39.6, 1281.6), (39.9, 1241.4)),
@@ -38,12 +35,11 @@ PUBLISHED = {
     for row, cells in _ROWS.items()
     for bound, cell in zip(LOWER_BOUNDS, cells, strict=True)
 }
-BUDGET_S = 0.45  # the paper's cycle budget of a retrain
 # The certain predictions answer to alpha and LB if they vary by more than this share of their mean.
 ANSWERS = 0.1
 
 
-def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
+def paper_table(frame: pd.DataFrame, recipe: str, interval: str) -> str:
     """Return one of the paper's two tables as Markdown.
 
     It has a row for each alpha, a column for each LB, and cells `false positives / certain`. Our
@@ -71,7 +67,7 @@ def paper_table(frame: "pd.DataFrame", recipe: str, interval: str) -> str:
     return "\n".join(lines)
 
 
-def _paper_cell(counts: "pd.DataFrame", published: tuple[float, float] | None) -> str:
+def _paper_cell(counts: pd.DataFrame, published: tuple[float, float] | None) -> str:
     """Return a cell of `paper_table`, means ± deviations, as text; "-" where nothing was played.
 
     `counts` has a row for each replay, with false positives and certain predictions; `published` is
@@ -84,15 +80,13 @@ def _paper_cell(counts: "pd.DataFrame", published: tuple[float, float] | None) -
     return cell if published is None else f"{cell} [{published[0]} / {published[1]}]"
 
 
-def findings(frame: "pd.DataFrame") -> list[str]:
+def findings(frame: pd.DataFrame) -> list[str]:
     """Check which of the paper's findings the replays of a grid confirm, and say it in lines.
 
     They are about how certain predictions, false positives and the first certain prediction depend
-    on alpha and LB, and that a retrain takes less than 0.45 s.
-
-    A finding is left out if the replays say nothing about it, for want of retrains, settings or
-    certain predictions to compare. Of a baseline, which has its own rule, only the findings about
-    false positives and retrains are checked.
+    on alpha and LB. A finding is left out if the replays say nothing about it, for want of settings
+    or certain predictions to compare. Of a baseline, which has its own rule, only the finding about
+    false positives is checked.
 
     Parameters
     ----------
@@ -107,12 +101,6 @@ def findings(frame: "pd.DataFrame") -> list[str]:
     lines: list[str] = []
     for (recipe, interval), rows in frame.groupby(["recipe", "interval"], sort=False):
         lines += _interval_findings(str(recipe), str(interval), rows)
-    for recipe, rows in frame.groupby("recipe", sort=False):
-        slowest = float(rows["retrain_max_s"].max())
-        if not math.isnan(slowest):
-            measured = f"median {rows['retrain_p50_s'].median():.3f} s, worst {slowest:.3f} s"
-            claim = f"a retrain of {recipe} takes less than {BUDGET_S:g} s"
-            lines.append(_finding(slowest < BUDGET_S, claim, measured))
     return lines
 
 
@@ -159,26 +147,3 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
             )
             claim = "lower alpha delays the first certain prediction"
             yield _finding(is_later, f"{claim}; {condition}, LB {100 * bound:g} %", measured)
-
-
-def grid_lines(frame: "pd.DataFrame") -> list[str]:
-    """Return the lines of a Markdown page with the tables and findings of a grid.
-
-    It has a heading for each combination of guarantee, `stops` and `confirm`, below it a table for
-    each recipe and interval, and a list of the findings.
-    """
-    caption = (
-        "false positives / certain, mean ± standard deviation over the shuffles [the paper's, on "
-        "its own parts]"
-    )
-    lines = []
-    groups = frame.groupby(["guarantee", "stops", "confirm"], sort=False)
-    for (guarantee, stops, confirm), rows in groups:
-        feedback = "good accepted parts confirmed" if confirm else f"stops: {stops}"
-        lines += [f"## Guarantee {guarantee}, {feedback}", ""]
-        pairs = rows[["recipe", "interval"]].drop_duplicates()
-        for recipe, interval in pairs.itertuples(index=False):
-            table = paper_table(rows, recipe, interval)
-            lines += [f"**{recipe}, {interval}**: {caption}", "", table, ""]
-        lines += [*(f"- {line}" for line in findings(rows)), ""]
-    return lines
