@@ -1,5 +1,5 @@
 """`Feedback` collects the outcomes of decided parts: it updates the decision rule and the
-references with them, and turns them into stored labels. `core.EngineCore` calls it for each
+references with them, and turns them into stored labels. `engine.DataEngine` calls it for each
 decision, `learner.Learner` for each report.
 
 With `Policy(stops="all")` a bad part stops the system before the next decision, so the next

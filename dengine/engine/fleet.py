@@ -13,9 +13,11 @@ import logging
 import numpy as np
 
 from ..errors import StoreError
+from ..model.base import EngineModel
+from ..reducers.base import State
 from ..store.outbox import Outbox
 from ..store.records import ModelVersion, ProductNews, without_rule
-from .guard import GuardedModel
+from .guard import NOT_READY, guarded
 from .labels import ProductLabels
 from .live_model import LiveModel
 from .resume import add_labels_since, newest_reference, restore_model
@@ -63,6 +65,21 @@ class Peers:
         self.is_lost = False
         self._asked = -np.inf  # when news was asked for, by the clock
         self._refused = 0  # a version that could not be taken over
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether news could not be had, or labels of this cell wait for peers' labels before
+        them.
+        """
+        return self.is_lost or self._labels.has_gaps
+
+    def get_state(self) -> State:
+        """Return, for a stored version, the number of the newest label that updated the rule."""
+        return {"rule_last_seq": np.array(self._labels.updated_to)}
+
+    def add_missing_references(self, model: EngineModel) -> None:
+        """Add this cell's labels that wait for peers' labels to a version that it trained."""
+        self._labels.add_missing_references(model)
 
     def resume(self) -> None:
         """Count the time to the next question from now, because the store was just read."""
@@ -149,6 +166,6 @@ class Peers:
             if not isinstance(error, StoreError):
                 self._refused = version.version
             return
-        GuardedModel(model).prepare(self._live.newest)
+        guarded(NOT_READY, model.prepare, self._live.newest)
         self._labels.take_over(model, newest_reference(version), trained_on.counts_from)
         self._live.swap_in(model, version.version, trained_on)

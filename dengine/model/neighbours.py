@@ -63,7 +63,15 @@ from ..reducers.base import (
     space_scale,
 )
 from ..traces import ForceLimitsGate, as_labels, as_traces, clip_extremes
-from .base import N_EXAMPLES, NO_TRACES, Embedding, EngineModel, Exportable, Prediction
+from .base import (
+    N_EXAMPLES,
+    NO_TRACES,
+    NOT_TRAINED,
+    Embedding,
+    EngineModel,
+    Exportable,
+    Prediction,
+)
 
 log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
@@ -801,7 +809,7 @@ class ModelPrediction(EngineModel):
 
     def check_answers(self) -> Iterator[str]:
         decider = self.decider(self._conditions)
-        yield from compare_points(decider, self.examples, self._example_points)
+        return compare_points(decider, self.examples, self._example_points)
 
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
@@ -858,9 +866,7 @@ class ModelPrediction(EngineModel):
         ExportError before the first training.
         """
         if "trace_shape" not in vars(self):
-            raise ExportError(
-                "Nothing was trained yet; report labels until the first retrain, then export."
-            )
+            raise ExportError(NOT_TRAINED)
         return Exportable(self, trace or self.trace_spec, examples=self.examples)
 
     def __getstate__(self) -> dict[str, Any]:

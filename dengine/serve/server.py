@@ -22,7 +22,8 @@ from typing import Any, TextIO
 
 import uvicorn
 
-from ..engine.engine import DataEngine, frozen_objects
+from ..engine.engine import DataEngine
+from ..engine.garbage import frozen_objects
 from ..errors import SettingError, instead, without_password
 from .auth import Access, host_in_url, is_loopback, read_tokens
 from .connections import CONNECTIONS, ConnectionPool
