@@ -593,7 +593,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         It sets off what follows from the label: safe mode may begin or end, and a retrain that is
         due is done in this thread, or begun in the executor. The label of a trace with a fault is
-        stored, and sets off no retrain.
+        stored, and sets off no retrain. If a part was confirmed wrongly before, the call also waits
+        for the store, so that the rule is put right now; where the store does not answer, that
+        happens later.
 
         Parameters
         ----------
@@ -618,8 +620,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         TraceError
             For a wrong trace or part's number of a lost decision.
         StoreError
-            Where the label is not known to be on disk: report the same again. Also for an engine
-            that is closed, was opened for reading, or is in use by another thread.
+            Where the label is not known to be on disk: it is learned all the same, and the same
+            report may come again. Also for an engine that is closed, was opened for reading, or is
+            in use by another thread.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -629,11 +632,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             stored = self._outbox.find_decision(id_, unsynced=True)
             if stored is None:
                 stored = self._record_lost_accept(id_, label, trace, part)
-            self._learner.report(stored, label)  # on disk from here on
+            confirmed_wrongly = self._feedback.take_in(stored, label)
+            self._outbox.sync()  # before anything else: nobody may hear of a label that can be lost
+            self._feedback.note_synced(id_)
+            if confirmed_wrongly:
+                with suppress(StoreError):  # then the rule is put right when the store is back
+                    self._outbox.drain()
+            self._learner.catch_up()  # the rule is put right, the label enters the window
             self._feedback.announce_safe_mode()  # a user's function that fails costs no label
             if stored.quarantined:
                 return None
-            return self._learner.retrain_if_due(self.recipe)  # last, for it may take its budget
+            # Last, since it may take its budget.
+            return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
 
     def _record_lost_accept(
         self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
@@ -804,7 +814,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         with self._exclusive:
             self._learner.advance(to_the_end=not brief)
-            self._learner.retrain_if_due(self.recipe, once=True)
+            self._learner.retrain_if_due(self.recipe.retrain_every, once=True)
             self._feedback.announce_safe_mode()
             return self._learner.take_report()
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,10 +21,9 @@ import torch
 from ..decision.policy import Policy
 from ..errors import StoreError
 from ..model.base import EngineModel
-from ..recipe import Recipe
 from ..records import RetrainReport
 from ..store.outbox import Outbox
-from ..store.records import Change, ModelVersion, StoredDecision, without_rule
+from ..store.records import Change, ModelVersion, without_rule
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import MOST, ROUNDS, Peers
@@ -133,24 +131,7 @@ class Learner:
         )
         pool.shutdown(wait=False)
 
-    # One outcome
-
-    def report(self, stored: StoredDecision, success: bool) -> None:
-        """Learn a reported label, and return once it is on disk.
-
-        If silence had confirmed the part before, it also waits for the store, so that the rule is
-        put right now; where the store does not answer, that happens later. Raises ReportError for a
-        second label, except that a line stop may follow a confirmation, and NotTakenError where the
-        label is not known to be on disk: it is learned all the same, and the same report may come
-        again.
-        """
-        confirmed_wrongly = self._feedback.take_in(stored, success)
-        self._outbox.sync()
-        self._feedback.note_synced(stored.decision.id)
-        if confirmed_wrongly:
-            with suppress(StoreError):  # then it is put right when the store is back
-                self._outbox.drain()
-        self.catch_up()
+    # Labels
 
     def catch_up(self) -> None:
         """Add labels that the store has numbered to the window, and do what `Feedback.remedy` asks
@@ -237,7 +218,7 @@ class Learner:
         # A version that is stored may still wait for labels that came since.
         return self._report or candidate.report
 
-    def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
+    def retrain_if_due(self, retrain_every: int, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
         There must be as many labels as the model's `min_traces`, unless it was asked for and could
@@ -247,14 +228,15 @@ class Learner:
         Returns the report of a retrain in this thread; else None: none is due, the store is
         unavailable, a training or its preparation is under way, or it was begun in the executor.
         """
-        is_due = self._is_due_after_news(recipe.retrain_every)
+        is_due = self._is_due_after_news(retrain_every)
         if self.live.pinned:
             self._is_requested = False
             return None
+        if is_due:
+            n_labels = max(self.labels.new_labels, len(self._window))
+            is_due = n_labels >= self.live.newest.min_traces
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
-        n_labels = max(self.labels.new_labels, len(self._window))
-        has_enough = n_labels >= self.live.newest.min_traces
-        if not (is_due and has_enough) and not lacks_steps and not self._is_requested:
+        if not (is_due or lacks_steps or self._is_requested):
             return None
         if self.is_at_work or self._outbox.fault:
             return None
@@ -320,7 +302,7 @@ class Learner:
         that is not done; then it is given up, as is one that hangs. Nothing happens while one is
         not done, or where there is none.
         """
-        if not self.is_at_work:
+        if self._candidate is None and self._retrainer.future is None:
             return
         if self._peers is not None:
             if self._retrainer.is_done:
