@@ -501,12 +501,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             False is for a server that answers by a deadline. The call does not wait for another
             call of the engine, nor for the disk; any thread may make it, and has one torch thread
             from then on. It returns None, and changes nothing, where that cannot be: with an id,
-            before the first trace, while a version is swapped in or something is to be stored or
-            rebuilt first, and where the model is a baseline, uses classes of the user's or is not
-            compiled. No other thread may use the engine meanwhile. With `timed_out` one may: the
-            VERIFY is then recorded beside its call, and waits for the disk, but not with a store in
-            memory or before the first trace; then ask for it again, with `wait`, in the engine's
-            thread. `on_safe_mode` is called in the thread of the call.
+            before the first trace, while something is to be stored or rebuilt first, and where the
+            model is a baseline, uses classes of the user's or is not compiled. A trained version is
+            swapped in, and a safe mode announced, only by a later call of `poll`. No other thread
+            may use the engine meanwhile. With `timed_out` one may: the VERIFY is then recorded
+            beside its call, and waits for the disk, but not with a store in memory or before the
+            first trace; then ask for it again, with `wait`, in the engine's thread.
 
         Returns
         -------
@@ -538,15 +538,27 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 if earlier is not None:
                     return earlier
             self._learner.advance()  # the newest version is to answer
-            x = self._maker.convert(trace)  # a wrong trace confirms nothing and changes no rule
-            self._learner.catch_up()  # a rule that lacks a correction must not decide
-            self._feedback.confirm_silent()  # the next trace has come
-            reason = Reason.LATE if timed_out else None
-            stored = self._maker.record(x, number, id_, reason)
-            if id_ is not None:
-                stored = self._maker.sync(stored)  # before the caller acts on it
-            self._feedback.record_decision(stored)  # the decision that counts, after the disk's
+            decision = self._decide(trace, number, id_, Reason.LATE if timed_out else None)
             self._feedback.announce_safe_mode()  # last: a user's function may fail
+        return decision
+
+    def _decide(
+        self, trace: ArrayLike, part: str | None, decision_id: str | None, reason: Reason | None
+    ) -> Decision:
+        """Decide on one trace by the model, or verify for a reason, and record that.
+
+        The steps are in this order because each needs the one before: a wrong trace must confirm
+        nothing; a rule that lacks a correction must not decide; this trace is the next one after
+        parts that nobody reported, which may change the rule; with an id the decision must be on
+        disk before the caller acts on it; and what the disk did not take is another decision.
+        """
+        x = self._maker.convert(trace)
+        self._learner.catch_up()
+        self._feedback.confirm_silent()
+        stored = self._maker.record(x, part, decision_id, reason)
+        if decision_id is not None:
+            stored = self._maker.sync(stored)
+        self._feedback.record_decision(stored)
         return stored.decision
 
     def _decide_at_once(
@@ -561,16 +573,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             newest = self._live.newest
             is_own_code = newest.keeps_references and not self.recipe.user_classes
             is_quick = newest.is_compiled or not self.version
-            has_work = (
-                self._learner.can_advance
-                or self._feedback.remedy is not None
-                or self._settings.is_unsaved
-                or not self._maker.has_seen_trace
-            )
+            has_work = self._settings.is_unsaved or self._feedback.remedy is not None
+            has_work = has_work or not self._maker.has_seen_trace
             if has_work or decision_id is not None or not (is_free and is_own_code and is_quick):
                 return None
             torch.set_num_threads(1)  # it holds for the present thread only
-            return self.decide(trace, part)
+            return self._decide(trace, as_part(part), None, None)
 
     def _record_timeout(
         self, trace: ArrayLike, part: PartNumber, decision_id: str | None

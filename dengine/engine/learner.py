@@ -265,11 +265,6 @@ class Learner:
         return self._candidate is not None
 
     @property
-    def can_advance(self) -> bool:
-        """Whether a training is done or its version is being swapped in: `advance` has work."""
-        return self._candidate is not None or self._retrainer.is_done
-
-    @property
     def is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is being swapped in."""
         return self._retrainer.future is not None or self._candidate is not None

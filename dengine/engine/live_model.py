@@ -242,8 +242,8 @@ class LiveModel:
             guarded(RULE_MISSED, self.newest.update_rule, *outcome[1:])
 
     def mark_examined_to(self, number: int) -> None:
-        """Note that decisions up to this number were examined for overdue checks."""
-        self.overdue_to = max(number, self.overdue_to)
+        """Note that decisions up to this number, a larger one, were examined for overdue checks."""
+        self.overdue_to = number
 
     def clear_overdue(self, decision_id: str) -> bool:
         """Count a decision as overdue no more, because its check was reported.
