@@ -30,7 +30,7 @@ from numpy.typing import ArrayLike
 from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import NotTakenError, StoreError, UnknownDecisionError, expect
+from ..errors import NotTakenError, StoreError, UnknownDecisionError, expect, listed
 from ..files import FilePath
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
@@ -190,7 +190,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             "budget": budget,
             "policy": policy,
         }
-        # Before a store is made: a wrong setting leaves none behind.
+        # Before a store is made: a wrong argument leaves none behind.
+        _check_names(options)
         settings, template = _new_settings(reducer, recipe, model, given, seed, trace)
         with opening(store) as opened:
             if settings.trace is None:
@@ -955,6 +956,17 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _check_names(options: Settings) -> None:
+    """Raise TypeError for an option, by name, that is none of `RunOptions`."""
+    unknown = sorted(options.keys() - RunOptions.__annotations__.keys())
+    if unknown:
+        names = listed(RunOptions.__annotations__)
+        raise TypeError(
+            f"Expected arguments of DataEngine, got {listed(unknown)}; "
+            f"beside its settings it takes {names}."
+        )
 
 
 def _new_settings(
