@@ -164,8 +164,7 @@ def serve(
             trace=trace or options.trace_spec_from(trace_options),
             allow_import=allow_import,
         )
-        served = ServerOptions(**settings)
-        serve_cell(make_engine, store, click.echo, served, beside, recorder)
+        serve_cell(make_engine, store, click.echo, ServerOptions(**settings), beside, recorder)
 
 
 def _open_engine(

@@ -158,8 +158,8 @@ class NoveltyGate(nn.Module):
 
         The order is that of `plain_features`.
         """
-        segments = 2 * self.segments * [self.length]  # of first, then of second differences
-        return [*segments, 2 * self.brief, self.brief, self.brief]
+        # Of the segments first and second differences, then three of brief stretches.
+        return [*2 * self.segments * [self.length], 2 * self.brief, self.brief, self.brief]
 
     def roughness(self, x: Tensor, length: int, stride: int) -> Tensor:
         """Return the norm of each stretch of `length` values of x (..., T), shape (..., n).

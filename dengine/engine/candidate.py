@@ -11,12 +11,8 @@ happens either all at once or in short steps between cycles.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from dataclasses import replace
-
-import numpy as np
 
 from ..decision.scripting import reason_of
 from ..model.base import EngineModel
@@ -47,10 +43,8 @@ class Candidate:
     report : RetrainReport
     trained_on : TrainedOn
         Set by `complete_report`.
-    storing : Future or None
-        The commit of the version, once it has begun; it returns the version's number in the store.
     is_stored : bool
-        Whether that is done.
+        Whether the version, or the report of a dropped one, is in the store.
     """
 
     def __init__(
@@ -61,13 +55,11 @@ class Candidate:
             version, 0.0, len(trained.seq), trained.n_steps, False, trained.reason
         )
         self.trained_on = TrainedOn()
-        self.storing: Future[int] | None = None
         self.is_stored = False
         self._previous = previous
         self._clock = clock
         self._seq = trained.seq
         self._learned_to = int(trained.seq[-1]) if len(trained.seq) else 0
-        self._store_until = np.inf  # by `time.monotonic`
         self._work_began = clock()
         self._seconds = self._work_began - trained.begin  # of work on it, until `_work_began`
 
@@ -108,8 +100,10 @@ class Candidate:
         A label that the model cannot take is logged and skipped. Returns False, and does nothing,
         if there is none, and always where there is no model.
         """
-        missing = [] if self.model is None else window.newer(self._learned_to)
-        if self.model is None or not missing:
+        if self.model is None:
+            return False
+        missing = window.newer(self._learned_to)
+        if not missing:
             return False
         seq = missing[0]
         trace, label, hash_ = window.row(seq)
@@ -131,23 +125,6 @@ class Candidate:
             self.report = replace(self.report, version=version, accepted=True)
             self.trained_on = TrainedOn(self._seq, corrected_to, int(self._seq[-1]))
         return self.report
-
-    def begin_storing(self, storing: Future[int], seconds: float) -> None:
-        """Keep the future of the version's commit, and give it `seconds` from now to begin."""
-        self.storing = storing
-        self._store_until = time.monotonic() + seconds
-
-    @property
-    def may_go_on_storing(self) -> bool:
-        """Whether the commit may be waited for.
-
-        True while it runs, and while it is queued and its seconds to begin have not passed. False
-        before `begin_storing` and once the commit is done.
-        """
-        storing = self.storing
-        if storing is None or storing.done():
-            return False
-        return storing.running() or time.monotonic() < self._store_until
 
     def end_storing(self, version: int) -> None:
         """Note that the version is stored, under the number that the store gave it; 0: its own.

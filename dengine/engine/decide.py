@@ -30,6 +30,7 @@ from ..records import (
     Reason,
     TraceArray,
     TraceSpec,
+    as_id,
     is_name,
 )
 from ..store.outbox import Outbox
@@ -213,19 +214,26 @@ class DecisionMaker:
                 return self._outbox.replace_decision(item)
         return stored
 
-    def record_timeout(self, trace: ArrayLike, part: str | None, decision_id: str) -> Decision:
+    def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
         """Record VERIFY, `Reason.LATE`, beside another call of the engine, and return it.
 
-        Any thread may call it. It returns once the decision is on disk, or when the store's time
-        limit is over. With a store in memory, and before the first trace, nothing is recorded: only
-        the thread that uses the engine may do that. Raises TraceError for a trace that the contract
-        does not allow.
+        Any thread may call it. An id that has a decision already gets that one. It returns once the
+        decision is on disk, or when the store's time limit is over. With a store in memory, and
+        before the first trace, nothing is recorded: only the thread that uses the engine may do
+        that. Raises TraceError for a wrong part's number, an id of another trace, and a trace that
+        the contract does not allow, ReportError for what is no id, and StoreError for an engine
+        that is closed or only reads.
         """
+        self._outbox.check_usable()
+        id_ = as_id(decision_id)
+        number = as_part(part)
+        earlier = self.find_earlier(id_, number, trace)
+        if earlier is not None:
+            return earlier
         spec = self._settings.now.trace
         if spec is None or self._outbox.store.wait is None:
-            return verify_decision(decision_id, part, self._live.version, Reason.LATE)
-        x = convert_trace(trace, spec, False)
-        stored = self.record(x, part, decision_id, Reason.LATE)
+            return verify_decision(id_, number, self._live.version, Reason.LATE)
+        stored = self.record(convert_trace(trace, spec, False), number, id_, Reason.LATE)
         with suppress(NotTakenError):
             self._outbox.sync()
         return check_same_trace(stored, trace, spec)

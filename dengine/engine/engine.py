@@ -191,7 +191,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             "policy": policy,
         }
         # Before a store is made: a wrong argument leaves none behind.
-        _check_names(options)
+        unknown = options.keys() - RunOptions.__annotations__.keys()
+        expect(not unknown, "arguments of DataEngine", listed(unknown))
         settings, template = _new_settings(reducer, recipe, model, given, seed, trace)
         with opening(store) as opened:
             if settings.trace is None:
@@ -527,9 +528,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             For an engine that is closed, was opened for reading, or is in use by another thread.
         """
+        if not wait and timed_out:
+            return self._maker.record_timeout(trace, part, decision_id)
         if not wait:
-            decide = self._record_timeout if timed_out else self._decide_at_once
-            return decide(trace, part, decision_id)
+            return self._decide_at_once(trace, part, decision_id)
         self._outbox.check_usable()
         with self._exclusive:
             id_ = None if decision_id is None else as_id(decision_id)
@@ -580,16 +582,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return None
             torch.set_num_threads(1)  # it holds for the present thread only
             return self._decide(trace, as_part(part), None, None)
-
-    def _record_timeout(
-        self, trace: ArrayLike, part: PartNumber, decision_id: str | None
-    ) -> Decision:
-        """Record VERIFY for a caller that gave up waiting, in any thread, beside another call."""
-        self._outbox.check_usable()
-        id_ = as_id(decision_id)
-        number = as_part(part)
-        earlier = self._maker.find_earlier(id_, number, trace)
-        return earlier or self._maker.record_timeout(trace, number, id_)
 
     def report(
         self,
@@ -792,8 +784,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 self._learner.end_training()  # what it would give lacks the newest labels
             else:
                 self._learner.advance()
-            if self._learner.is_at_work and not wait:
-                return None
             return self._learner.retrain(wait)
 
     def poll(self, brief: bool = False) -> RetrainReport | None:
@@ -956,17 +946,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
-
-
-def _check_names(options: Settings) -> None:
-    """Raise TypeError for an option, by name, that is none of `RunOptions`."""
-    unknown = sorted(options.keys() - RunOptions.__annotations__.keys())
-    if unknown:
-        names = listed(RunOptions.__annotations__)
-        raise TypeError(
-            f"Expected arguments of DataEngine, got {listed(unknown)}; "
-            f"beside its settings it takes {names}."
-        )
 
 
 def _new_settings(

@@ -13,8 +13,6 @@ import logging
 import numpy as np
 
 from ..errors import StoreError
-from ..model.base import EngineModel
-from ..reducers.base import State
 from ..store.outbox import Outbox
 from ..store.records import ModelVersion, ProductNews, without_rule
 from .guard import NOT_READY, guarded
@@ -45,6 +43,7 @@ class Peers:
 
     Attributes
     ----------
+    labels : ProductLabels
     is_lost : bool
         The last question for news failed.
     """
@@ -60,26 +59,11 @@ class Peers:
         self._outbox = outbox
         self._live = live
         self._window = window
-        self._labels = labels
+        self.labels = labels
         self._clock = clock
         self.is_lost = False
         self._asked = -np.inf  # when news was asked for, by the clock
         self._refused = 0  # a version that could not be taken over
-
-    @property
-    def is_behind(self) -> bool:
-        """Whether news could not be had, or labels of this cell wait for peers' labels before
-        them.
-        """
-        return self.is_lost or self._labels.has_gaps
-
-    def get_state(self) -> State:
-        """Return, for a stored version, the number of the newest label that updated the rule."""
-        return {"rule_last_seq": np.array(self._labels.updated_to)}
-
-    def add_missing_references(self, model: EngineModel) -> None:
-        """Add this cell's labels that wait for peers' labels to a version that it trained."""
-        self._labels.add_missing_references(model)
 
     def resume(self) -> None:
         """Count the time to the next question from now, because the store was just read."""
@@ -120,12 +104,6 @@ class Peers:
         self.is_lost = True
         self._asked = self._clock()
 
-    def note_connection(self) -> None:
-        """Note that news was had: clear `is_lost`, and log it if it was set."""
-        if self.is_lost:
-            log.warning("news of product %s comes again", self._outbox.store.product)
-        self.is_lost = False
-
     def take_in(self, news: ProductNews) -> None:
         """Add the labels of the news to the window, in their order, and count them for the next
         retrain; a peer's label becomes a reference of the answering model, unless it is one
@@ -134,13 +112,17 @@ class Peers:
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)
         for trace, label, hash_, seq in rows:
-            self._labels.admit(trace, int(label), int(hash_), int(seq))
+            self.labels.admit(trace, int(label), int(hash_), int(seq))
 
     def note_taken(self, n_labels: int) -> None:
-        """Note how many labels were taken in.
+        """Note that news was had and how many labels were taken in: clear `is_lost`.
 
-        Where more may be waiting, the next cycle asks again at once.
+        It is logged if `is_lost` was set. Where more labels may be waiting, the next cycle asks
+        again at once.
         """
+        if self.is_lost:
+            log.warning("news of product %s comes again", self._outbox.store.product)
+        self.is_lost = False
         self._asked = self._clock() if n_labels < MOST else -np.inf
 
     def take_over(self, version: ModelVersion) -> None:
@@ -167,5 +149,5 @@ class Peers:
                 self._refused = version.version
             return
         guarded(NOT_READY, model.prepare, self._live.newest)
-        self._labels.take_over(model, newest_reference(version), trained_on.counts_from)
+        self.labels.take_over(model, newest_reference(version), trained_on.counts_from)
         self._live.swap_in(model, version.version, trained_on)

@@ -8,8 +8,11 @@ with others, whose labels have one sequence in the store.
 
 from __future__ import annotations
 
+import numpy as np
+
 from ..model.base import EngineModel
 from ..records import TraceArray
+from ..reducers.base import State
 from .guard import NO_REFERENCE, guarded
 from .live_model import LiveModel
 from .trainer import TrainingWindow
@@ -79,11 +82,6 @@ class ProductLabels:
     window : TrainingWindow
     live : LiveModel
         Takes the peers' labels as references.
-
-    Attributes
-    ----------
-    updated_to : int
-        Number of this cell's newest label; the rule was updated with all until there.
     """
 
     def __init__(self, window: TrainingWindow, live: LiveModel) -> None:
@@ -94,7 +92,8 @@ class ProductLabels:
         # Labels since the newest retrain began: number, and whether the label is this cell's.
         self._since: list[tuple[int, bool]] = []
         self._trained_to = 0  # number of the newest label that the newest retrain had
-        self.updated_to = 0
+        # Number of this cell's newest label; the rule was updated with all until there.
+        self._updated_to = 0
         # The references of a version that was taken over hold every label up to this number; the
         # window may not yet.
         self._references_to = 0
@@ -118,7 +117,7 @@ class ProductLabels:
         numbers = self._window.newer(0)
         self._since = [(number, False) for number in numbers[len(numbers) - n_new :]]
         self._trained_to = numbers[-n_new - 1] if len(numbers) > n_new else 0
-        self.updated_to = self._window.newest_seq
+        self._updated_to = self._window.newest_seq
 
     def recount(self, counts_from: int) -> None:
         """Count the new labels again, after the window was filled anew without forgotten labels."""
@@ -140,7 +139,7 @@ class ProductLabels:
         before it have come.
         """
         self._waiting[seq] = trace, label, hash_
-        self.updated_to = max(seq, self.updated_to)
+        self._updated_to = max(seq, self._updated_to)
         if seq == self._window.newest_seq + 1:
             self.admit(trace, label, hash_, seq)
 
@@ -198,3 +197,7 @@ class ProductLabels:
         for seq, (trace, label, hash_) in self._waiting.items():
             if seq > self._references_to:
                 guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq)
+
+    def get_state(self) -> State:
+        """Return, for a stored version, the number of the newest label that updated the rule."""
+        return {"rule_last_seq": np.array(self._updated_to)}

@@ -10,6 +10,7 @@ product made; none of them knows the learner.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -187,20 +188,23 @@ class Learner:
         The steps, in this order: every label is stored, since a version is trained on numbered
         labels alone; what was computed in advance is waited for, and news of peers is taken in,
         since either may change what the training starts from; then new labels count from zero, and
-        the training begins. No other may be under way.
+        the training begins.
 
         With `wait`, and without an executor that takes work, it is done in this thread. Else None
-        is returned, and `advance` brings the version to its end. Where the executor still works on
-        a training that was discarded, or something is computed in advance, the training begins
-        later, by `retrain_if_due`.
+        is returned, and `advance` brings the version to its end. Nothing begins while a training is
+        under way. Where the executor still works on one that was discarded, or something is
+        computed in advance, the training begins later, by `retrain_if_due`.
 
         A version that fails or cannot be stored is dropped, and the report says so. A version that
         is stored, while labels that came since cannot be, answers at a later call; its report is
         returned all the same. Raises StoreError where the labels before it cannot be stored.
         """
-        if not wait and self._retrainer.executor is not None:
+        if not wait:
+            if self.is_at_work:
+                return None
             is_preparing = self._precomputed is not None and not self._precomputed.done()
-            if is_preparing or self._retrainer.is_occupied:
+            has_executor = self._retrainer.executor is not None
+            if has_executor and (is_preparing or self._retrainer.is_occupied):
                 self._is_requested = True
                 return None
         self.store_labels()
@@ -238,7 +242,7 @@ class Learner:
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
         if not (is_due or lacks_steps or self._is_requested):
             return None
-        if self.is_at_work or self._outbox.fault:
+        if self._outbox.fault:
             return None
         try:
             return self.retrain(wait=False)
@@ -393,10 +397,9 @@ class Learner:
         """
         yield from candidate.check()
         yield from self._catch_up_candidate(candidate)
-        candidate.begin_storing(self._begin_storing(candidate), self._outbox.limit)
-        storing = candidate.storing
-        assert storing is not None
-        while candidate.may_go_on_storing:
+        storing = self._begin_storing(candidate)
+        deadline = time.monotonic() + self._outbox.limit  # to begin; a commit that runs may go on
+        while not storing.done() and (storing.running() or time.monotonic() < deadline):
             yield partial(self._outbox.wait_for_result, storing)
         candidate.end_storing(self._outbox.wait_for_result(storing))
         yield from self._catch_up_candidate(candidate)
@@ -436,7 +439,7 @@ class Learner:
     def _state_of(self, model: EngineModel, trained_on: TrainedOn) -> dict[str, Any]:
         """Return the arrays of this model as a version, by name, for the store."""
         state = self.live.get_state(model, trained_on)
-        return state if self._peers is None else state | self._peers.get_state()
+        return state if self._peers is None else state | self._peers.labels.get_state()
 
     def _swap(self, candidate: Candidate) -> None:
         """Let a stored candidate answer, with the present rule, and keep its report for
@@ -455,7 +458,7 @@ class Learner:
             guarded(NOT_READY, candidate.model.prepare, self.live.newest)
             self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
             if self._peers is not None:
-                self._peers.add_missing_references(candidate.model)
+                self._peers.labels.add_missing_references(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
         """Drop a candidate that could not be stored, and keep a report that says so, in memory
@@ -532,7 +535,6 @@ class Learner:
         except StoreError as error:
             peers.note_loss(error)
             return 0
-        peers.note_connection()
         if version is not None:
             peers.take_over(version)
             if self.live.pinned:
@@ -561,7 +563,8 @@ class Learner:
         self.end_training()
         self.store_labels()
         self._take_in_all_news()
-        if self._peers is not None and self._peers.is_behind:
+        peers = self._peers
+        if peers is not None and (peers.is_lost or peers.labels.has_gaps):
             raise StoreError(
                 f"News of product {self._store.product!r} cannot be had now; try it again."
             )

@@ -62,11 +62,10 @@ class EngineState:
 
     def complete(self, status: Status) -> Status:
         """Return a copy of a status read from the store, with what only the engine knows put in."""
-        newest = self._live.newest
         return replace(
             status,
             version=self._live.version,
-            safe_mode=newest.safe_mode,
+            safe_mode=self._live.newest.safe_mode,
             new_labels=self.new_labels,
             store_fault=self.store_fault,
             store_lag=self.store_lag,

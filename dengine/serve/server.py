@@ -142,8 +142,7 @@ class ServerOptions:
             )
         tokens = () if self.token_file is None else read_tokens(self.token_file)
         own_names = () if is_loopback(self.host) else (self.host, socket.gethostname())
-        hosts = (*own_names, *self.allow_hosts)
-        return Access(tokens, hosts, self.largest, rate=self.rate)
+        return Access(tokens, (*own_names, *self.allow_hosts), self.largest, rate=self.rate)
 
     def started_beside(self, access: Access) -> list[Beside]:
         """Return the OPC UA server, as `create_app` starts it, in a list; an empty one if it is
