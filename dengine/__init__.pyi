@@ -22,8 +22,8 @@ from .decision.policy import Policy as Policy
 from .decision.rule import DecisionRule as DecisionRule
 from .decision.rule import action_of as action_of
 from .engine.engine import DataEngine as DataEngine
-from .engine.engine import frozen_objects as frozen_objects
-from .engine.engine import uncollected as uncollected
+from .engine.garbage import frozen_objects as frozen_objects
+from .engine.garbage import uncollected as uncollected
 from .errors import BusyError as BusyError
 from .errors import CellError as CellError
 from .errors import DataError as DataError

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from common import POLICY, options, print_table, quantiles, wall_time
 
 from dengine import DataEngine, Dataset, Recipe, ReplayCell, load_dataset, make_reducer, replay
-from dengine.engine.engine import core_of, frozen_objects, uncollected
+from dengine.engine.garbage import frozen_objects, uncollected
 from dengine.engine.trainer import LATE
 from dengine.traces import as_traces
 
@@ -155,8 +155,8 @@ def time_beside_retrains(data: Dataset, recipe: Recipe, executor: Executor) -> C
     times = ConcurrentTimes([], [])
     with executor:
         for i in range(len(data)):
-            if not core_of(engine).is_retraining:
-                core_of(engine).start_retrain()
+            if not engine.state.is_retraining:
+                engine.retrain(wait=False)
             version = engine.version
             trace = cell.insert()
             seconds, _ = wall_time(engine.decide, trace)

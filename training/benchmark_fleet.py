@@ -47,7 +47,6 @@ import sqlalchemy as sa
 from common import POLICY, noisy, options, print_table, quantiles, wall_time
 
 from dengine import Action, DataEngine, Dataset, Recipe, RetrainReport, SqlStore, load_dataset
-from dengine.engine.engine import core_of
 from dengine.errors import NotTakenError
 from dengine.experiments.tables import write_csv
 from dengine.store.journal import journal_path
@@ -207,7 +206,7 @@ def run_cell(plan: Plan, data: Dataset, cell: int) -> dict[str, Any]:
                 sent[decision.id] = (cycle, good)
             else:
                 certain += 1
-            duration, _ = wall_time(core_of(engine).process_retrains)
+            duration, _ = wall_time(engine.poll)
             seconds["settle, with news of peers"].append(duration)
             time.sleep(plan.pause)
         flush_within(engine, STORED_WITHIN_SECONDS)
@@ -234,7 +233,7 @@ def flush_within(engine: DataEngine, seconds: float) -> None:
     """
     deadline = time.monotonic() + seconds
     engine.flush()
-    while core_of(engine).store_fault and time.monotonic() < deadline:
+    while engine.state.store_fault and time.monotonic() < deadline:
         time.sleep(0.1)
         engine.flush()
 

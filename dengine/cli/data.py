@@ -225,7 +225,7 @@ def train(
     Ctrl-C keeps what was imported; the same command continues there.
     """
     from ..datasets.importing import import_labelled, in_form_of
-    from ..engine.engine import DataEngine, core_of
+    from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
     from ..store.opening import LONG_WAIT
 
@@ -252,14 +252,13 @@ def train(
             "notes": dataset.notes,
             "import": imported,
         }
-        if not (imported.imported or core_of(engine).new_labels) and engine.version:
+        if not (imported.imported or engine.state.new_labels) and engine.version:
             text = (
                 f"{store} already has all of {dataset.name}, nothing was done. "
                 f"Version {engine.version} of {name} answers."
             )
             print_result(record | {"retrain": None}, text)
             return
-        core_of(engine).wait_until_warm()  # or the first retrain's time would include that
         with progress_bar("training", None):
             reports = [engine.retrain()]
             while reports[-1].accepted and reports[-1].n_steps and engine.model.report.n_steps_left:

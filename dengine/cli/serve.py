@@ -1,6 +1,6 @@
 """The verb `dengine serve`: one engine behind HTTP, XML-RPC, OPC UA and a live page."""
 
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -120,14 +120,17 @@ def serve(
     from ..datasets import load_dataset
     from ..recipe import Recipe
     from ..serve.demo import POLICY, playing
+    from ..serve.server import ServerOptions
     from ..serve.server import serve as serve_cell
 
     recipe = choice.load_if_given()
     trace: TraceSpec | None = None
+    beside = []
+    recorder: Any = nullcontext
     if robot:
         host, port = host_and_port(robot)
         recording, trace = options.recorder_settings(trace_options)
-        settings["recorder"] = partial(RtdeRecorder, host, trigger, port=port, **recording)
+        recorder = partial(RtdeRecorder, host, trigger, port=port, **recording)
     with ExitStack() as stack:
         if demo:
             if store is not None and Path(store).exists():
@@ -137,7 +140,7 @@ def serve(
                 )
             data = load_dataset("insertion", samples=trace_options.get("samples"))
             trace = data.spec
-            settings["beside"] = [partial(playing, data=data, speed=speed, seed=seed or 0)]
+            beside = [partial(playing, data=data, speed=speed, seed=seed or 0)]
             settings["deadline"] = max(settings["deadline"], DEMO_DEADLINE)
             recipe = recipe or Recipe.load("conv").with_policy(**POLICY)
             if store is None:
@@ -156,7 +159,7 @@ def serve(
             trace=trace or options.trace_spec_from(trace_options),
             allow_import=allow_import,
         )
-        serve_cell(make_engine, store, click.echo, **settings)
+        serve_cell(make_engine, store, click.echo, ServerOptions(**settings), beside, recorder)
 
 
 def _open_engine(

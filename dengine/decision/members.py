@@ -313,23 +313,32 @@ class MemberEvidence(nn.Module):
     def step_detector(self, detector: int, step: float, times: int) -> None:
         """Add `step` to a CUSUM `times` times; start the safe mode if the sum reaches its limit.
 
-        Detector 0 watches accepted parts, 1 rejected parts, 2 novel traces. Before each step a sum
-        below 0 is taken as 0, so the stored sum may be one step below 0. An alarm
-        (`start_safe_mode`) sets all sums to 0. With more than one step, `step` must be negative.
-        Nothing happens if `times` is 0. The safe mode's reason is the detector's; an alarm during a
-        safe mode starts it anew, under that of the two reasons that stands first in `SAFE_MODES`.
+        Detector 0 watches accepted parts, 1 rejected parts, 2 novel traces. Nothing happens if
+        `times` is 0. An alarm sets the sums of all detectors to 0.
         """
-        if times <= 0:
-            return
+        if times > 0 and self.add_steps(detector, step, times) >= self.alarm_limits[detector]:
+            self.raise_alarm(detector)
+
+    def add_steps(self, detector: int, step: float, times: int) -> float:
+        """Add `step` to a CUSUM `times` times, once or more, and return the new sum.
+
+        Before each step a sum below 0 is taken as 0, so the new sum may be one step below 0. More
+        than one step must be negative: only then do the earlier ones need no look at the limit.
+        """
         before = float(self.detector_sums[detector].item())
         total = max(before + (times - 1) * step, 0.0) + step
         self.detector_sums[detector].fill_(total)
-        if total >= self.alarm_limits[detector]:
-            safe_mode = int(self.safe_mode.item())
-            if safe_mode == 0 or safe_mode == 3:
-                self.start_safe_mode(detector + 1)
-            else:  # a side that has not shown its tolerance yet stays the reason
-                self.start_safe_mode(min(safe_mode, detector + 1))
+        return total
+
+    def raise_alarm(self, detector: int) -> None:
+        """Start the safe mode for the reason of a detector, or start it anew during one.
+
+        During one the reason is that of the two which stands first in `SAFE_MODES`: a side that has
+        not shown its tolerance yet stays the reason when novel traces come on top.
+        """
+        safe_mode = int(self.safe_mode.item())
+        reason = detector + 1
+        self.start_safe_mode(reason if safe_mode == 0 else min(safe_mode, reason))
 
     def start_safe_mode(self, safe_mode: int) -> None:
         """Close both sides until the members from now on show recovery.

@@ -153,6 +153,14 @@ class NoveltyGate(nn.Module):
         # Two calls, for aminmax takes half as long again as both.
         return torch.cat([pieces.amin(-1), pieces.amax(-1), logs], -1).flatten(-2)
 
+    def stretch_lengths(self) -> list[int]:
+        """Return how many samples each roughness of a channel is taken over, of 2*S + 3.
+
+        The order is that of `plain_features`.
+        """
+        # Of the segments first and second differences, then three of brief stretches.
+        return [*2 * self.segments * [self.length], 2 * self.brief, self.brief, self.brief]
+
     def roughness(self, x: Tensor, length: int, stride: int) -> Tensor:
         """Return the norm of each stretch of `length` values of x (..., T), shape (..., n).
 
@@ -244,8 +252,7 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     steps = torch.zeros(x.size(1))
     if n_samples > 1:
         steps = torch.linalg.vector_norm(torch.diff(x), dim=2).median(0).values
-    brief = gate.brief
-    lengths = torch.tensor([*2 * gate.segments * [gate.length], 2 * brief, brief, brief])
+    lengths = torch.tensor(gate.stretch_lengths())
     return (0.05 * (lengths / n_samples).sqrt() * steps[:, None]).clamp(min=1e-12)
 
 

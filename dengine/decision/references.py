@@ -194,7 +194,7 @@ class RadiusIndex(nn.Module):
             Labels are a copy, int8, 1 for success; the others are views of the index.
         """
         block = self.numbers if name == "numbers" else getattr(self, name).numpy()
-        values: NDArray[Any] = block[..., : len(self)]
+        values: NDArray[Any] = block[..., : self.size()]
         if name == "points":
             return values.T
         return values[1].astype(np.int8) if name == "labels" else values

@@ -65,7 +65,9 @@ def reason_of(error: Exception) -> str:
 
 def attributes_of(module: nn.Module) -> dict[str, Any]:
     """Return parameters, buffers and plain attributes of one module, without its submodules."""
-    plain = {name: value for name, value in vars(module).items() if name not in INTERNAL}
+    plain = dict(vars(module))
+    for name in INTERNAL & plain.keys():
+        del plain[name]
     plain |= module.named_parameters(recurse=False, remove_duplicate=False)
     plain |= module.named_buffers(recurse=False, remove_duplicate=False)
     return plain
@@ -73,10 +75,11 @@ def attributes_of(module: nn.Module) -> dict[str, Any]:
 
 def has_tensor(value: Any) -> bool:
     """Return whether a value is a tensor, or a list, tuple or dict with a tensor in it."""
-    values = value.values() if isinstance(value, dict) else value
-    return isinstance(value, Tensor) or (
-        isinstance(value, list | tuple | dict) and any(map(has_tensor, values))
-    )
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        return any(map(has_tensor, value))
+    return isinstance(value, Tensor)
 
 
 def register_tensors(module: nn.Module) -> None:

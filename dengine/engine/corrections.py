@@ -19,6 +19,7 @@ from ..decision.members import SAFE_MODES
 from ..decision.policy import Policy
 from ..errors import ReportError, SettingError, expect, listed
 from ..records import as_success
+from ..store.outbox import Outbox
 from ..store.records import (
     POLICY_CHANGED,
     SHADOW_CHANGED,
@@ -28,8 +29,10 @@ from ..store.records import (
     unknown_decision,
 )
 from ..traces import check_rate
-from .core import EngineCore
-from .settings import BASELINE_SETTINGS, EvidenceWindow, Settings
+from .feedback import Feedback
+from .learner import Learner
+from .live_model import LiveModel
+from .settings import BASELINE_SETTINGS, EvidenceWindow, Settings, SettingsInForce
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
@@ -72,12 +75,27 @@ class Corrections:
 
     Parameters
     ----------
-    core : EngineCore
+    outbox : Outbox
+    settings : SettingsInForce
+    live : LiveModel
+    learner : Learner
+    feedback : Feedback
     """
 
-    def __init__(self, core: EngineCore) -> None:
-        self._core = core
-        self._store = core.store
+    def __init__(
+        self,
+        outbox: Outbox,
+        settings: SettingsInForce,
+        live: LiveModel,
+        learner: Learner,
+        feedback: Feedback,
+    ) -> None:
+        self._outbox = outbox
+        self._store = outbox.store
+        self._settings = settings
+        self._live = live
+        self._learner = learner
+        self._feedback = feedback
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Correct a wrong label, or let a forgotten one count again, from the next decision on.
@@ -161,11 +179,11 @@ class Corrections:
         text = f"{_labels_are(list(labels))} forgotten" + (f": {reason}" if reason else "")
         changes = {id_: {"was": label, "now": None} for id_, label in labels.items()}
         data = {"decisions": changes, "reason": reason}
-        live = self._core.live
+        live = self._live
         has_seen = live.trained_on.has_seen
         if live.pinned and any(has_seen(stored.label_seq or 0) for stored in decisions):
             text += f"; version {live.version}, which learned from this, is pinned no more"
-            self._core.learner.release(author)
+            self._learner.release(author)
         return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
 
     def release(self, author: str = "") -> Changed:
@@ -190,9 +208,9 @@ class Corrections:
             Where the store does not answer.
         """
         self._bring_up_to_date()
-        if not self._core.live.pinned:
+        if not self._live.pinned:
             return self._as_unchanged("release", "No version is pinned")
-        return self._finish_change(self._core.learner.release(author))
+        return self._finish_change(self._learner.release(author))
 
     def rollback(self, version: int, author: str = "") -> Changed:
         """Let an earlier version answer again, stored as a new version with a new number, and pin
@@ -231,15 +249,15 @@ class Corrections:
                 f"Expected the number of a version, got {version!r}; `store.retrains()` lists them."
             )
         self._bring_up_to_date()
-        before = self._core.live.version
-        pinned = self._core.live.pinned
+        before = self._live.version
+        pinned = self._live.pinned
         if pinned and version in (before, pinned):
             return self._as_unchanged("rollback", f"Version {version} is pinned already")
-        new = self._core.live.next_version
+        new = self._live.next_version
         text = f"version {version} answers again, as version {new} after {before}, and is pinned"
         data = {"to": int(version), "was": before, "now": new}
         event = Change("rollback", text, data, author)
-        self._core.learner.roll_back(int(version), event)
+        self._learner.roll_back(int(version), event)
         return self._finish_change(event)
 
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
@@ -285,7 +303,7 @@ class Corrections:
         """
         example = "for example Policy(alpha=0.05, lower_bound=0.95)"
         expect(isinstance(policy, Policy), "a Policy", policy, example)
-        present = self._core.settings.now
+        present = self._settings.now
         check_rate(policy.windows, present.trace)
         old_values = present.recipe.policy.to_values()
         new_values = policy.to_values()
@@ -302,7 +320,7 @@ class Corrections:
         old_probability = present.recipe.policy.inclusion_probability
         rate_counts = is_sorting and policy.inclusion_probability != old_probability
         starts_anew = not is_baseline and (rate_counts or any(name in changes for name in SCORING))
-        live = self._core.live
+        live = self._live
         since = 0 if live.answering is None else live.next_version
         evidence = present.evidence
         if starts_anew:
@@ -318,9 +336,9 @@ class Corrections:
             text = f"the policy's {', '.join(steps)}"
         data = {"old": old_values, "new": new_values}
         event = Change(kind, text, data, author, settings=settings.to_store())
-        self._core.learner.set_policy(policy if starts_anew else None, evidence, event)
-        self._core.settings.change(settings)
-        self._core.feedback.begin_policy()
+        self._learner.set_policy(policy if starts_anew else None, evidence, event)
+        self._settings.change(settings)
+        self._feedback.begin_policy()
         return self._finish_change(event, "the rule of the new policy has no safe mode")
 
     def _bring_up_to_date(self) -> None:
@@ -329,8 +347,8 @@ class Corrections:
         A correction comes after everything that was known before it. Raises StoreError where the
         engine is closed or the store does not answer.
         """
-        self._core.outbox.check_usable()
-        self._core.learner.bring_up_to_date()
+        self._outbox.check_usable()
+        self._learner.bring_up_to_date()
 
     def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
         """Finish what is under way, then return the decisions of these ids, in their order.
@@ -359,8 +377,8 @@ class Corrections:
         """
         self._store.apply_change(change)
         for id_ in change.decisions:
-            self._core.outbox.evict_decision(id_)
-        self._core.learner.apply_corrections()
+            self._outbox.evict_decision(id_)
+        self._learner.apply_corrections()
         return self._finish_change(change)
 
     def _finish_change(
@@ -372,12 +390,12 @@ class Corrections:
         event of the store as the event of the change.
         """
         number = self._store.events(1)[0].number
-        self._core.feedback.announce_safe_mode(reason_ended)
-        return Changed(change.kind, _sentence(f"{change.text}."), number, self._core.live.version)
+        self._feedback.announce_safe_mode(reason_ended)
+        return Changed(change.kind, _sentence(f"{change.text}."), number, self._live.version)
 
     def _as_unchanged(self, kind: str, text: str) -> Changed:
         """Return a `Changed` for a request that was fulfilled already; no event is recorded."""
-        return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._core.live.version)
+        return Changed(kind, _sentence(f"{text}; nothing changed."), None, self._live.version)
 
 
 def _check_baseline_settings(changes: Settings) -> None:

@@ -1,5 +1,6 @@
-"""`DecisionMaker` turns a trace into a `StoredDecision`: the model's decision, an id, a version and
-a time. `EngineCore` owns one and hands its results to the outbox.
+"""`DecisionMaker` converts a trace as the trace contract demands, turns it into a `StoredDecision`
+(the model's decision, an id, a version and a time) and hands it to the outbox. `engine.DataEngine`
+calls its methods in order.
 
 The functions below it check what a caller passes, a part's number and an id that was decided
 before, and make a VERIFY without a trace.
@@ -7,16 +8,17 @@ before, and make a VERIFY without a trace.
 
 import logging
 import uuid
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from itertools import count
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 
 from ..decision.decider import DecisionConditions, Verdict, decider_without_model
-from ..errors import TraceConflictError, TraceError, expect
+from ..errors import NotTakenError, StoreError, TraceConflictError, TraceError, expect
 from ..folds import part_hash
 from ..model.base import EngineModel
 from ..records import (
@@ -28,96 +30,229 @@ from ..records import (
     Reason,
     TraceArray,
     TraceSpec,
+    as_id,
     is_name,
 )
+from ..store.outbox import Outbox
 from ..store.records import StoredDecision
 from ..traces import convert_trace, infer_trace_spec
-from .settings import SettingsInForce
+from .guard import NOT_PRECOMPUTED, guarded
+from .labels import CellLabels, ProductLabels
+from .live_model import LiveModel
+from .settings import SettingsInForce, read_peers_trace_spec
 
 log = logging.getLogger("dengine")
 
 
 class DecisionMaker:
-    """Makes decisions under the settings in force, and gives them ids.
+    """Makes decisions under the settings in force, gives them ids, and records them.
 
     Parameters
     ----------
     settings : SettingsInForce
-        Read at each decision.
-    clock : callable
-        The store's clock, in seconds.
+        Read at each decision; the first sound trace sets the contract in them.
+    live : LiveModel
+        Answers.
+    labels : CellLabels or ProductLabels
+        Says whether anything was learned yet.
+    outbox : Outbox
+        Takes the decisions.
+
+    Attributes
+    ----------
+    has_seen_trace : bool
+        Whether a finite trace came since the engine was made or opened.
     """
 
-    def __init__(self, settings: SettingsInForce, clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        settings: SettingsInForce,
+        live: LiveModel,
+        labels: CellLabels | ProductLabels,
+        outbox: Outbox,
+    ) -> None:
+        self.has_seen_trace = False
         self._settings = settings
-        self._clock = clock
+        self._live = live
+        self._labels = labels
+        self._outbox = outbox
         self._first_conditions: DecisionConditions | None = None
         self._run = uuid.uuid4().hex[:12]
         self._count = count(1)
 
-    def infer_trace_spec(self, x: TraceArray, trace: Any) -> TraceSpec | None:
-        """Infer the trace contract from a first trace.
+    def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
+        """Set the trace contract (shape, rate and unit of all traces) and return the one in force.
 
-        It is also kept, so that this trace can be decided before a contract is set.
+        One that is set already stays, completed by what `spec` states and it does not. Where the
+        cell shares a product with others, a contract that these have set is taken in place of
+        `spec`, unless it cannot be read. `inferred` says that `spec` comes from a first trace. The
+        settings are saved in the store; where that fails, they are saved with a later trace. Raises
+        SettingError where the force limits do not fit the contract.
+        """
+        store = self._outbox.store
+        present = self._settings.now
+        agreed = present.trace
+        try:
+            if agreed is None and store.product is not None:
+                agreed = self._outbox.call_store(lambda: read_peers_trace_spec(store))
+        except StoreError:  # the cell's own first trace stands
+            log.exception("the product's contract of traces cannot be had")
+        spec = spec if agreed is None else agreed.completed(spec)
+        if spec != present.trace:
+            inferred = inferred or present.inferred
+            self._settings.change(replace(present, trace=spec, inferred=inferred))
+            self._settings.save()
+        return spec
 
-        Parameters
-        ----------
-        x : array of float32, shape (C, T)
-            The trace.
-        trace : object
-            The trace as the caller passed it; a DataFrame names the channels.
+    def convert(self, trace: ArrayLike) -> TraceArray:
+        """Return a trace as float32, shape (channels, samples), converted as the trace contract
+        demands.
 
-        Returns
-        -------
-        TraceSpec or None
-            None if the trace has a fault, so that a later one must set the contract.
+        Where none is set, the first trace without a fault sets it, or a contract that peers have
+        set is taken. The first finite trace also has an untrained model compute in advance.
+        Settings that could not be saved before are saved. Raises TraceError for a wrong shape, or
+        too few samples of a first trace, and SettingError where the force limits do not fit the
+        contract that it sets; a trace with NaN, or another fault, is returned like any other.
+        """
+        settings = self._settings.now
+        has_learned = self._live.version + self._labels.new_labels > 0
+        x = convert_trace(trace, settings.trace, settings.inferred and not has_learned)
+        spec = self._infer_trace_spec(x, trace) if settings.trace is None else None
+        if spec is not None:
+            if self.set_trace_spec(spec, inferred=True) != spec:  # a peer's trace came first
+                return convert_trace(trace, self._settings.now.trace, False)
+        elif self._settings.is_unsaved:
+            self._settings.save()
+        has_contract = self._settings.now.trace is not None
+        if not self.has_seen_trace and has_contract and np.isfinite(x).all():
+            self.has_seen_trace = True
+            if not self._live.version:  # what will answer is compiled before there is much to do
+                guarded(NOT_PRECOMPUTED, self._live.template.precompute, x[None])
+        return x
 
-        Raises
-        ------
-        TraceError
-            For a trace of fewer samples than a first trace must have.
+    def _infer_trace_spec(self, x: TraceArray, trace: Any) -> TraceSpec | None:
+        """Infer the trace contract from a first trace; return None if the trace has a fault.
+
+        The contract is also kept, so that a trace with a fault, after which a later one must set
+        it, can be decided. `trace` is `x` as the caller passed it; a DataFrame names the channels.
+        Raises TraceError for a trace of fewer samples than a first trace must have.
         """
         spec, is_sound = infer_trace_spec(x, trace)
         self._first_conditions = DecisionConditions(spec)
         return spec if is_sound else None
 
-    def decide(
+    def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
+        """Return the decision that a caller's id has already, or None for a new id.
+
+        An id that cannot be looked up gets a VERIFY, `Reason.NO_STORE`, which is logged and not
+        recorded, since the id may have a decision already. Raises TraceConflictError for an id of
+        another trace, and TraceError for a trace that the contract does not allow.
+        """
+        try:
+            earlier = self._outbox.find_earlier(decision_id)
+        except StoreError as error:
+            log.warning(
+                "whether %r was decided before cannot be looked up; it is verified: %s",
+                decision_id,
+                error,
+            )
+            return verify_decision(decision_id, part, self._live.version, Reason.NO_STORE)
+        if earlier is None:
+            return None
+        return check_same_trace(earlier, trace, self._settings.now.trace)
+
+    def record(
         self,
         x: TraceArray,
         part: str | None,
-        model: EngineModel | None,
-        version: int,
-        verify_reason: Reason | None = None,
         decision_id: str | None = None,
+        verify_reason: Reason | None = None,
     ) -> StoredDecision:
-        """Decide on one trace and return the record of it, which is not recorded yet; any thread
-        may call it.
+        """Decide on one trace and hand the decision to the outbox, without waiting for the disk.
 
-        A trace contract must be in force, or `infer_trace_spec` must have been called before.
+        Any thread may call it. A trace contract must be in force, or `convert` must have been
+        called before.
 
         Parameters
         ----------
         x : array of float32, shape (C, T)
-            The trace; the record holds a copy.
+            The trace, as `convert` returned it; the record holds a copy.
         part : str or None
             Number of the part.
-        model : EngineModel or None
-            The model that answers; None before the first training: then the decision is VERIFY,
-            `Reason.NO_MODEL`, unless the trace has a fault or is outside a force limit.
-        version : int
-            Number of the model's version.
-        verify_reason : Reason, optional
-            Verify for this reason, without asking the model and without force limits; a fault of
-            the trace comes before it.
         decision_id : str, optional
             An id of the caller's; None: a new one.
+        verify_reason : Reason, optional
+            Verify for this reason, without asking the model; see `_decide`. Where the store is
+            damaged or its journal cannot be written, it is `Reason.NO_STORE` whatever is passed.
 
         Returns
         -------
         StoredDecision
-            The record for the store, with number 0. It is quarantined if the trace has a fault. A
-            model that raises, or returns impossible bounds, is logged, and the decision is VERIFY
-            with `Reason.MODEL_ERROR`, unless the trace has a fault or is outside a force limit.
+            The record with its number, 0 where it could not be recorded. Before the first training
+            the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault or is outside a
+            force limit.
+        """
+        if self._outbox.verify_all_reason:
+            verify_reason = Reason.NO_STORE
+        item = self._decide(x, part, self._live.answering, verify_reason, decision_id)
+        return self._outbox.record_decision(item)
+
+    def sync(self, stored: StoredDecision) -> StoredDecision:
+        """Wait until a decision is on disk, and return the record that counts.
+
+        Where the disk does not answer in time, an ACCEPT or REJECT is replaced in the outbox by
+        VERIFY, `Reason.NO_STORE`, unless it has reached the disk by then. A VERIFY stays as it is.
+        """
+        decision = stored.decision
+        try:
+            self._outbox.sync()
+        except NotTakenError:
+            # A decision that lets a part go on unchecked must outlive this process, or its id would
+            # have two answers.
+            if decision.action is not Action.VERIFY:
+                item = self._decide(stored.trace, decision.part, None, Reason.NO_STORE, decision.id)
+                return self._outbox.replace_decision(item)
+        return stored
+
+    def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
+        """Record VERIFY, `Reason.LATE`, beside another call of the engine, and return it.
+
+        Any thread may call it. An id that has a decision already gets that one. It returns once the
+        decision is on disk, or when the store's time limit is over. With a store in memory, and
+        before the first trace, nothing is recorded: only the thread that uses the engine may do
+        that. Raises TraceError for a wrong part's number, an id of another trace, and a trace that
+        the contract does not allow, ReportError for what is no id, and StoreError for an engine
+        that is closed or only reads.
+        """
+        self._outbox.check_usable()
+        id_ = as_id(decision_id)
+        number = as_part(part)
+        earlier = self.find_earlier(id_, number, trace)
+        if earlier is not None:
+            return earlier
+        spec = self._settings.now.trace
+        if spec is None or self._outbox.store.wait is None:
+            return verify_decision(id_, number, self._live.version, Reason.LATE)
+        stored = self.record(convert_trace(trace, spec, False), number, id_, Reason.LATE)
+        with suppress(NotTakenError):
+            self._outbox.sync()
+        return check_same_trace(stored, trace, spec)
+
+    def _decide(
+        self,
+        x: TraceArray,
+        part: str | None,
+        model: EngineModel | None,
+        verify_reason: Reason | None = None,
+        decision_id: str | None = None,
+    ) -> StoredDecision:
+        """Decide on one trace by a model and return the record, which is not recorded yet.
+
+        Without a model, and for a `verify_reason`, the decision is VERIFY. With a reason the force
+        limits do not count; a fault of the trace comes before it. The record is quarantined if the
+        trace has a fault. A model that raises, or returns impossible bounds, is logged, and the
+        decision is VERIFY with `Reason.MODEL_ERROR`, unless the trace has a fault or is outside a
+        force limit.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         conditions = self._settings.conditions or self._first_conditions
@@ -151,25 +286,25 @@ class DecisionMaker:
             n_success=n_success,
             n_failure=n_failure,
             embedding=None if fault else tuple(map(tuple, embedding.tolist())) or None,
-            model_version=version,
+            model_version=self._live.version,
             reason=REASONS[reason],
             audit=action == 0 and predicted != 0,
             propensity=propensity,
             part=part,
         )
         # The caller may change his own array.
-        return StoredDecision(decision, x.copy(), part_hash_ or content, fault != 0, self._clock())
+        hash_ = part_hash_ or content
+        return StoredDecision(decision, x.copy(), hash_, fault != 0, self._outbox.store.clock())
 
-    def lost_accept(
-        self, x: TraceArray, part: str | None, version: int, decision_id: str
+    def record_lost_accept(
+        self, x: TraceArray, part: str | None, decision_id: str
     ) -> StoredDecision:
-        """Return the record of the ACCEPT behind a line stop whose decision was lost; nothing is
-        recorded.
+        """Record the ACCEPT behind a line stop whose decision was lost, and return the record.
 
         The decision has this id, `Reason.CERTAIN`, and no evidence: no labels and the bound (0, 1).
         Its propensity is the present audit rate, 1 in shadow mode.
         """
-        stored = self.decide(x, part, None, version, None, decision_id)
+        stored = self._decide(x, part, None, decision_id=decision_id)
         decision = replace(
             stored.decision,
             action=Action.ACCEPT,
@@ -177,7 +312,7 @@ class DecisionMaker:
             reason=Reason.CERTAIN,
             propensity=self._settings.audited_share,
         )
-        return replace(stored, decision=decision)
+        return self._outbox.record_decision(replace(stored, decision=decision))
 
 
 def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Verdict:

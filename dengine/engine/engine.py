@@ -1,5 +1,5 @@
-"""`DataEngine`, the public face of dengine (decide, report, retrain, run), and two blocks that keep
-Python's garbage collector away from decisions.
+"""`DataEngine`, the engine itself: it composes the objects that decide, learn and remember, and
+calls them in order for each decision, report and retrain.
 
 Source: the paper's section "Data engine".
 
@@ -7,28 +7,30 @@ engine = DataEngine(reducer="conv", policy=Policy(alpha=0.05, lower_bound=0.95),
 for cycle in engine.run(cell, cycles=1503):
     ...
 
-How a decision and a report walk through an engine is in `core.EngineCore`.
+`decide`, `report` and `retrain` name their steps in order. Users, `dengine serve` and the tests
+call the same methods.
 """
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
+import threading
 import time
 import weakref
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack, overload
 
+import torch
 from numpy.typing import ArrayLike
 
 from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import NotTakenError, StoreError, expect
+from ..errors import NotTakenError, StoreError, UnknownDecisionError, expect, listed
 from ..files import FilePath
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
@@ -40,6 +42,7 @@ from ..records import (
     Decision,
     Outcome,
     PartNumber,
+    Reason,
     RetrainReport,
     TraceSpec,
     as_id,
@@ -50,13 +53,22 @@ from ..records import (
 from ..reducers.base import Reducer
 from ..representation import to_html
 from ..store.opening import LONG_WAIT, opening
-from ..store.outbox import Outbox
+from ..store.outbox import CLOSE_SECONDS, Outbox
 from ..store.records import StoredDecision
 from ..traces import check_rate
-from .core import EngineCore
 from .corrections import Changed, Corrections
+from .decide import DecisionMaker, as_part
+from .exclusive import ExclusiveUse
+from .feedback import Feedback
+from .fleet import Peers
+from .garbage import frozen_objects, uncollected
+from .labels import CellLabels, ProductLabels
+from .learner import Learner
+from .live_model import LiveModel
 from .settings import (
     EngineSettings,
+    Settings,
+    SettingsInForce,
     agreed_trace_spec,
     check_model_settings,
     choose_recipe,
@@ -64,7 +76,8 @@ from .settings import (
     named_classes,
     read_peers_trace_spec,
 )
-from .trainer import Clock
+from .state import EngineState
+from .trainer import Clock, Limits, Retrainer, TrainingWindow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -76,41 +89,13 @@ if TYPE_CHECKING:
 log = logging.getLogger("dengine")
 
 
-@contextmanager
-def frozen_objects() -> Iterator[None]:
-    """Let Python's garbage collector ignore, until the block ends, all objects that exist now.
+class RunOptions(TypedDict, total=False):
+    """How an engine runs; nothing of it is stored, so it is given at every start."""
 
-    A collection would go through 420,000 objects of imported libraries in 250 ms and free nothing.
-    None is run when the block begins. The whole process is affected, and the end of the block
-    unfreezes what others froze, too: use it in the process that owns the loop.
-    """
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-
-
-@contextmanager
-def uncollected() -> Iterator[None]:
-    """Switch Python's garbage collector off until the block ends, then on again if it was on
-    before.
-    """
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
-
-
-def core_of(engine: DataEngine) -> EngineCore:
-    """Return the internal interface of an engine, which may change with any release.
-
-    `dengine serve` and the tests use it.
-    """
-    return engine._core
+    executor: Executor | None
+    replaying: bool
+    clock: Clock
+    on_safe_mode: Callable[[str], object] | None
 
 
 def _close_forgotten(outbox: Outbox) -> None:
@@ -170,6 +155,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     seed : int
     resumed : bool
         Whether the engine goes on with a used store.
+    state : EngineState
+        What only the running engine knows: new labels, faults, whether a retrain is under way.
 
     Raises
     ------
@@ -194,10 +181,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         *,
         recipe: Recipe | FilePath | None = None,
         model: Model | None = None,
-        executor: Executor | None = None,
-        replaying: bool = False,
-        clock: Clock = time.perf_counter,
-        on_safe_mode: Callable[[str], object] | None = None,
+        **options: Unpack[RunOptions],
     ) -> None:
         given = {
             "radius": radius,
@@ -206,55 +190,107 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             "budget": budget,
             "policy": policy,
         }
-        if model is not None:
-            check_model_settings(reducer, given)
-            if recipe is None:
-                # The schedule of conv is its own.
-                recipe = Recipe(retrain_every=Reducer.default_retrain_every)
-        settings = EngineSettings(choose_recipe(reducer, recipe, given), seed, trace=trace)
-        # Before a store is made: a wrong setting leaves none behind.
-        settings, template = settings.with_template(model)
-        n_traces = template.min_traces
-        window = f"a window of at least {n_traces} labelled traces, on which it trains first"
-        expect(settings.recipe.window >= n_traces, window, settings.recipe.window)
+        # Before a store is made: a wrong argument leaves none behind.
+        unknown = options.keys() - RunOptions.__annotations__.keys()
+        expect(not unknown, "arguments of DataEngine", listed(unknown))
+        settings, template = _new_settings(reducer, recipe, model, given, seed, trace)
         with opening(store) as opened:
             if settings.trace is None:
                 settings = replace(settings, trace=read_peers_trace_spec(opened))
-            self._start(
-                settings,
-                template,
-                opened,
-                executor=executor,
-                replaying=replaying,
-                clock=clock,
-                on_safe_mode=on_safe_mode,
-            )
+            self._compose(settings, template, opened, **options)
             with self._closed_on_failure():
                 if opened.settings():  # now that the cell is owned, nobody else begins it
                     raise StoreError(
                         "The store is not empty; use DataEngine.open(url) to go on with it, "
                         "or name another store."
                     )
-                self.store.save_settings(self._core.settings.now.to_store())
+                self.store.save_settings(settings.to_store())
                 if opened.product is not None:
-                    self._core.resume()  # with what its peers learned
+                    self._resume()  # with what its peers learned
 
-    def _start(
-        self, settings: EngineSettings, template: EngineModel, store: SqlStore, **options: Any
+    def _compose(
+        self,
+        settings: EngineSettings,
+        template: EngineModel,
+        store: SqlStore,
+        executor: Executor | None = None,
+        replaying: bool = False,
+        clock: Clock = time.perf_counter,
+        on_safe_mode: Callable[[str], object] | None = None,
+        reading: bool = False,
     ) -> None:
-        """Compose the engine's objects on an opened store.
+        """Make the engine's objects on an opened store, each from those that it knows.
 
-        The options are executor, replaying, clock, on_safe_mode and reading. It sets `store`,
-        `seed`, and `resumed` to False. From now on the store is closed when the engine is
-        garbage-collected. Raises SettingError for force limits in seconds at an unknown rate.
+        From now on the store is closed when the engine is garbage-collected. Modules that a retrain
+        imports are loaded, in a thread if there is an executor. Limits this thread to one torch
+        thread. Raises SettingError for force limits in seconds at an unknown rate.
         """
-        check_rate(settings.recipe.policy.windows, settings.trace)
+        recipe = settings.recipe
+        check_rate(recipe.policy.windows, settings.trace)
+        torch.set_num_threads(1)
+        self._retrains_in_line = executor is None and not reading
+        if self._retrains_in_line:
+            template.warm_up()  # or the first retrain would wait for it
         self.store = store
         self.seed = settings.seed
         self.resumed = False
-        self._core = EngineCore(settings, template, store, **options)
-        self._corrections = Corrections(self._core)
-        weakref.finalize(self, _close_forgotten, self._core.outbox)
+        self._clock = clock
+        self._exclusive = ExclusiveUse()
+        self._outbox = Outbox(store, recipe.window, not reading, replaying)
+        self._settings = SettingsInForce(settings, self._outbox)
+        window = TrainingWindow(recipe.window)
+        self._live = LiveModel(template, window, self._outbox, settings.evidence)
+        labels: CellLabels | ProductLabels = CellLabels(window)
+        peers = None
+        if store.product is not None:
+            labels = ProductLabels(window, self._live)
+            peers = Peers(self._outbox, self._live, window, labels, clock)
+        self._feedback = Feedback(self._outbox, self._live, labels, self._settings, on_safe_mode)
+        limits = Limits(None if replaying else recipe.budget, recipe.max_steps)
+        retrainer = Retrainer(window, limits, executor, clock)
+        self._learner = Learner(
+            self._outbox, self._live, window, labels, self._feedback, peers, retrainer, clock
+        )
+        self._maker = DecisionMaker(self._settings, self._live, labels, self._outbox)
+        self._corrections = Corrections(
+            self._outbox, self._settings, self._live, self._learner, self._feedback
+        )
+        self.state = EngineState(self._live, self._learner, self._outbox)
+        self._warm_up = threading.Thread(target=template.warm_up, name="dengine-warm-up")
+        if executor is not None:
+            self._warm_up.start()
+        weakref.finalize(self, _close_forgotten, self._outbox)
+
+    def _resume(self) -> None:
+        """Restore what the store holds: version, references, rule, labels and pending checks.
+
+        The engine then decides bit for bit as before it was closed. In a new cell it decides as the
+        other cells of its product do. It is called once, before the first decision, and waits for
+        the store without a time limit. Where retrains run in the calling thread, it also waits
+        until the first one can begin at once.
+        """
+        settings = self._settings.now
+        self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
+        self._feedback.resume()
+        if self._retrains_in_line:
+            self._wait_until_warm()
+
+    def _wait_until_warm(self) -> None:
+        """Wait until the first retrain can begin at once.
+
+        When it returns, the modules that a retrain imports are loaded, and the features of stored
+        traces that a retrain would compute first are computed. If there are labels but no version,
+        the computation begins here, and the code for decisions is compiled where it can be.
+        """
+        self._join_warm_up()
+        if self.state.new_labels and not self.version:
+            self._learner.precompute()
+        self._learner.wait_until_precomputed()
+
+    def _join_warm_up(self) -> None:
+        """Wait until what a retrain imports is loaded."""
+        if self._warm_up.ident is not None:
+            self._warm_up.join()
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
@@ -264,7 +300,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         try:
             yield
         except BaseException:
-            self._core.outbox.close()
+            self._outbox.close()
             raise
 
     @classmethod
@@ -277,7 +313,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         trace: TraceSpec | None = None,
         wait: float | None = None,
         allow_import: bool | Collection[str] = False,
-        **options: Any,
+        reading: bool = False,
+        **options: Unpack[RunOptions],
     ) -> Self:
         """Open a used store, and go on with the same version and the same decisions, bit for bit.
 
@@ -294,10 +331,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         allow_import : bool or collection of str
             Whether a `module:Class` that the store names is imported, or which of them. A class
             that `reducer` names is allowed.
+        reading : bool
+            Neither decide nor learn; another engine may own the store. To export from it, for one.
         **options
-            executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With
-            reading=True the engine neither decides nor learns, and another engine may own the
-            store: to export from it, for one.
+            executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With an
+            executor the ids of all decisions are read before this returns (a second for a million),
+            so that `decide` looks up no new id in the store.
 
         Returns
         -------
@@ -319,11 +358,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             stored = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
             settings = replace(stored, trace=agreed_trace_spec(store, trace))
             settings.check_request({"trace": trace})
-            engine._start(*settings.with_template(model), store, **options)
+            engine._compose(*settings.with_template(model), store, reading=reading, **options)
             with engine._closed_on_failure():
-                engine._core.resume()
-                if settings.trace != stored.trace and not options.get("reading"):
-                    engine._core.settings.save()
+                engine._resume()
+                if settings.trace != stored.trace and not reading:
+                    engine._settings.save()
+                if options.get("executor") is not None:
+                    engine._outbox.load_ids()
         engine.resumed = True
         return engine
 
@@ -384,7 +425,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 reducer = recipe.reducer
             engine = cls.open(opened, reducer=reducer, allow_import=allowed, **options)
             with engine._closed_on_failure():
-                engine._core.settings.now.check_request(settings | {"seed": seed})
+                engine._settings.now.check_request(settings | {"seed": seed})
             return engine
 
     def close(self) -> None:
@@ -394,20 +435,55 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         take is given up, and an error is logged; no report on it was acknowledged. Raises
         StoreError while another thread uses the engine.
         """
-        self._core.close()
+        with self._exclusive:
+            if self._outbox.is_usable:
+                self._feedback.store_pending()
+                self._learner.advance(to_the_end=True, wait=CLOSE_SECONDS)
+            self._outbox.close()
 
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        Raises NotTakenError after `wait` seconds; None: the store's own limit.
+        Labels of silently confirmed parts, which wait in memory, are recorded first. Afterwards
+        labels that the store has numbered are in the training window. Raises NotTakenError after
+        `wait` seconds; None: the store's own limit.
         """
-        self._core.flush(wait)
+        self._feedback.store_pending()
+        self._outbox.flush(wait)
+        self._learner.catch_up()
 
     # Decisions
 
+    @overload
     def decide(
-        self, trace: ArrayLike, part: PartNumber = None, *, decision_id: str | None = None
-    ) -> Decision:
+        self,
+        trace: ArrayLike,
+        part: PartNumber = None,
+        *,
+        decision_id: str | None = None,
+        timed_out: bool = False,
+    ) -> Decision: ...
+
+    @overload
+    def decide(
+        self,
+        trace: ArrayLike,
+        part: PartNumber = None,
+        *,
+        decision_id: str | None = None,
+        timed_out: bool = False,
+        wait: bool,
+    ) -> Decision | None: ...
+
+    def decide(
+        self,
+        trace: ArrayLike,
+        part: PartNumber = None,
+        *,
+        decision_id: str | None = None,
+        timed_out: bool = False,
+        wait: bool = True,
+    ) -> Decision | None:
         """Decide on one trace, and record the decision.
 
         Parameters
@@ -419,12 +495,26 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         decision_id : str, optional
             An id of the caller's. The same id and trace have the same decision for ever, and an
             ACCEPT or REJECT is on disk when this returns.
+        timed_out : bool, default False
+            Whoever asked, with an id, has given up waiting and verifies the part. Record that,
+            VERIFY with `Reason.LATE`, without asking the model; a fault of the trace, or of the
+            store, is the reason instead.
+        wait : bool, default True
+            False is for a server that answers by a deadline. The call does not wait for another
+            call of the engine, nor for the disk; any thread may make it, and has one torch thread
+            from then on. It returns None, and changes nothing, where that cannot be: with an id,
+            before the first trace, while something is to be stored or rebuilt first, and where the
+            model is a baseline, uses classes of the user's or is not compiled. A trained version is
+            swapped in, and a safe mode announced, only by a later call of `poll`. No other thread
+            may use the engine meanwhile. With `timed_out` one may: the VERIFY is then recorded
+            beside its call, and waits for the disk, but not with a store in memory or before the
+            first trace; then ask for it again, with `wait`, in the engine's thread.
 
         Returns
         -------
-        Decision
-            VERIFY where anything else than the errors below fails. Where an id cannot be looked up,
-            the VERIFY is not recorded.
+        Decision or None
+            None only with wait=False. VERIFY where anything else than the errors below fails. Where
+            an id cannot be looked up, the VERIFY is not recorded.
 
         Raises
         ------
@@ -438,7 +528,60 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             For an engine that is closed, was opened for reading, or is in use by another thread.
         """
-        return self._core.decide(trace, part, decision_id)
+        if not wait and timed_out:
+            return self._maker.record_timeout(trace, part, decision_id)
+        if not wait:
+            return self._decide_at_once(trace, part, decision_id)
+        self._outbox.check_usable()
+        with self._exclusive:
+            id_ = None if decision_id is None else as_id(decision_id)
+            number = as_part(part)
+            if id_ is not None:  # it has one answer for ever
+                earlier = self._maker.find_earlier(id_, number, trace)
+                if earlier is not None:
+                    return earlier
+            self._learner.advance()  # the newest version is to answer
+            decision = self._decide(trace, number, id_, Reason.LATE if timed_out else None)
+            self._feedback.announce_safe_mode()  # last: a user's function may fail
+        return decision
+
+    def _decide(
+        self, trace: ArrayLike, part: str | None, decision_id: str | None, reason: Reason | None
+    ) -> Decision:
+        """Decide on one trace by the model, or verify for a reason, and record that.
+
+        The steps are in this order because each needs the one before: a wrong trace must confirm
+        nothing; a rule that lacks a correction must not decide; this trace is the next one after
+        parts that nobody reported, which may change the rule; with an id the decision must be on
+        disk before the caller acts on it; and what the disk did not take is another decision.
+        """
+        x = self._maker.convert(trace)
+        self._learner.catch_up()
+        self._feedback.confirm_silent()
+        stored = self._maker.record(x, part, decision_id, reason)
+        if decision_id is not None:
+            stored = self._maker.sync(stored)
+        self._feedback.record_decision(stored)
+        return stored.decision
+
+    def _decide_at_once(
+        self, trace: ArrayLike, part: PartNumber, decision_id: str | None
+    ) -> Decision | None:
+        """Decide if nothing has to be waited for, in any thread; else return None.
+
+        While it decides it holds the outbox's lock, so that nothing that it records waits.
+        """
+        self._outbox.check_usable()
+        with self._outbox.try_lock() as is_free, self._exclusive:
+            newest = self._live.newest
+            is_own_code = newest.keeps_references and not self.recipe.user_classes
+            is_quick = newest.is_compiled or not self.version
+            has_work = self._settings.is_unsaved or self._feedback.remedy is not None
+            has_work = has_work or not self._maker.has_seen_trace
+            if has_work or decision_id is not None or not (is_free and is_own_code and is_quick):
+                return None
+            torch.set_num_threads(1)  # it holds for the present thread only
+            return self._decide(trace, as_part(part), None, None)
 
     def report(
         self,
@@ -448,6 +591,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         part: PartNumber = None,
     ) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
+
+        It sets off what follows from the label: safe mode may begin or end, and a retrain that is
+        due is done in this thread, or begun in the executor. The label of a trace with a fault is
+        stored, and sets off no retrain. If a part was confirmed wrongly before, the call also waits
+        for the store, so that the rule is put right now; where the store does not answer, that
+        happens later.
 
         Parameters
         ----------
@@ -472,10 +621,50 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         TraceError
             For a wrong trace or part's number of a lost decision.
         StoreError
-            Where the label is not known to be on disk: report the same again. Also for an engine
-            that is closed, was opened for reading, or is in use by another thread.
+            Where the label is not known to be on disk: it is learned all the same, and the same
+            report may come again. Also for an engine that is closed, was opened for reading, or is
+            in use by another thread.
         """
-        return self._core.report(decision_id, success, trace, part)
+        label = as_success(success)  # refused before anything is written
+        id_ = as_id(decision_id)
+        self._outbox.check_usable()
+        with self._exclusive:
+            self._learner.advance()  # so that a version that is ready learns the label as well
+            stored = self._outbox.find_decision(id_, unsynced=True)
+            if stored is None:
+                stored = self._record_lost_accept(id_, label, trace, part)
+            confirmed_wrongly = self._feedback.take_in(stored, label)
+            self._outbox.sync()  # before anything else: nobody may hear of a label that can be lost
+            self._feedback.note_synced(id_)
+            if confirmed_wrongly:
+                with suppress(StoreError):  # then the rule is put right when the store is back
+                    self._outbox.drain()
+            self._learner.catch_up()  # the rule is put right, the label enters the window
+            self._feedback.announce_safe_mode()  # a user's function that fails costs no label
+            if stored.quarantined:
+                return None
+            # Last, since it may take its budget.
+            return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
+
+    def _record_lost_accept(
+        self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
+    ) -> StoredDecision:
+        """Record an ACCEPT under this id for a line stop whose decision was lost; return the
+        record.
+
+        Raises UnknownDecisionError if `trace` is None or `success` is True, and TraceError for a
+        wrong trace or part's number; then nothing is recorded.
+        """
+        if trace is None or success:
+            raise UnknownDecisionError(
+                f"Expected the id of a decision of this cell, got {decision_id!r}, which is "
+                "unknown; "
+                "a system stop whose decision was lost can be reported with its trace."
+            )
+        x = self._maker.convert(trace)
+        stored = self._maker.record_lost_accept(x, as_part(part), decision_id)
+        self._feedback.record_decision(stored)
+        return stored
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a cell, and yield a record of each cycle as it happens.
@@ -514,10 +703,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         From then on the garbage collector ignores the objects that exist, until the end. Raises
         NotTakenError where the disk does not take everything in time.
         """
-        self._core.wait_until_warm()
+        self._wait_until_warm()
         spec = getattr(cell, "spec", None)
         if isinstance(spec, TraceSpec):
-            self._core.set_trace_spec(spec)
+            self._outbox.check_usable()
+            with self._exclusive:
+                self._maker.set_trace_spec(spec)
         with ExitStack() as ending:
             ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
             ending.enter_context(frozen_objects())
@@ -533,10 +724,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         trace = cell.insert()
         with uncollected():
-            begin = self._core.clock()
+            begin = self._clock()
             # A cell may know its parts' numbers.
             decision = self.decide(trace, getattr(cell, "part", None))
-            seconds = self._core.clock() - begin
+            seconds = self._clock() - begin
         outcome = None
         success = None
         source = None
@@ -555,21 +746,76 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             except NotTakenError as error:
                 # The label waits for the disk, and every part is verified until that is well.
                 log.warning("the label of %s: %s", decision.id, error)
-        retrain = self._core.process_retrains()
+        retrain = self.poll()
         return Cycle(index, decision, outcome, success, source, seconds, retrain, self.safe_mode)
 
     # Learning
 
-    def retrain(self) -> RetrainReport:
+    @overload
+    def retrain(self) -> RetrainReport: ...
+
+    @overload
+    def retrain(self, wait: bool) -> RetrainReport | None: ...
+
+    def retrain(self, wait: bool = True) -> RetrainReport | None:
         """Retrain now, in this thread, and return the report; the new version is not pinned.
 
-        It first waits for the imports that began with the engine, some two seconds after its start.
         A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
         Raises StoreError where the labels before it cannot be stored.
+
+        Parameters
+        ----------
+        wait : bool, default True
+            False: begin to retrain in the executor, and return None, also if a retrain is under
+            way; `poll` brings it to its end. Without an executor it is the same as True. True ends
+            what is under way, and first waits for the imports that began with the engine, some two
+            seconds after its start.
+
+        Returns
+        -------
+        RetrainReport or None
         """
-        if self._core.live.pinned:
-            self._corrections.release()
-        return self._core.retrain()
+        if self._live.pinned:
+            self.release()
+        self._outbox.check_usable()
+        with self._exclusive:
+            if wait:
+                self._join_warm_up()  # its time is no part of the retrain's
+                self._learner.end_training()  # what it would give lacks the newest labels
+            else:
+                self._learner.advance()
+            return self._learner.retrain(wait)
+
+    def poll(self, brief: bool = False) -> RetrainReport | None:
+        """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
+
+        `run` does so after each part. In a loop of your own, `decide` and `report` do all of it as
+        well, but for a version that the executor has trained only a step each.
+
+        Parameters
+        ----------
+        brief : bool, default False
+            A version that the executor has trained comes one step further, a few milliseconds;
+            else to its end, so that it answers or is dropped. Where cells share a product it always
+            comes to its end.
+
+        Returns
+        -------
+        RetrainReport or None
+            The newest report, of a retrain that was accepted or dropped, a rollback or a new
+            policy; None if this method has returned it before. `report` and `retrain` may have
+            returned it, too.
+
+        Raises
+        ------
+        StoreError
+            While another thread uses the engine.
+        """
+        with self._exclusive:
+            self._learner.advance(to_the_end=not brief)
+            self._learner.retrain_if_due(self.recipe.retrain_every, once=True)
+            self._feedback.announce_safe_mode()
+            return self._learner.take_report()
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Correct a wrong label, or let a forgotten one count again; see `Corrections.correct`."""
@@ -595,7 +841,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     @property
     def policy(self) -> Policy:
         """The policy in force; `set_policy` changes it."""
-        return self._core.settings.now.recipe.policy
+        return self._settings.now.recipe.policy
 
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on; see `Corrections.set_policy`."""
@@ -613,7 +859,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         self.flush()
         policy = self.policy
-        since = self._core.settings.now.policy_since
+        since = self._settings.now.policy_since
         tally = self.store.tally(since_version=since, within=policy.label_within)
         return policy.certificate(tally.outcomes)
 
@@ -622,30 +868,30 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     @property
     def recipe(self) -> Recipe:
         """Every setting in force; all but the policy are fixed once the engine is made."""
-        return self._core.settings.now.recipe
+        return self._settings.now.recipe
 
     @property
     def trace(self) -> TraceSpec | None:
         """The contract of traces; None before the first sound trace."""
-        return self._core.settings.now.trace
+        return self._settings.now.trace
 
     @property
     def model(self) -> Any:
         """The model that answers (of a baseline, the user's own object); None before a first
         retrain.
         """
-        answering = self._core.live.answering
+        answering = self._live.answering
         return None if answering is None else answering.user_model
 
     @property
     def version(self) -> int:
         """Number of the version that answers; 0 before the first retrain."""
-        return self._core.live.version
+        return self._live.version
 
     @property
     def safe_mode(self) -> str:
         """Why every part is verified until fresh evidence keeps the tolerance; "" if none is."""
-        return self._core.live.newest.safe_mode
+        return self._live.newest.safe_mode
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision with its trace, and with its label where it has one; None for an
@@ -653,7 +899,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         Raises StoreError where the id cannot be looked up, and ReportError for what is no id.
         """
-        return self._core.outbox.find_decision(as_id(decision_id))
+        return self._outbox.find_decision(as_id(decision_id))
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """Flush, and return how the engine is doing; arguments and errors as of
@@ -663,7 +909,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         with suppress(NotTakenError):
             self.flush()
-        return self._core.complete_status(status(self.store, last, watching))
+        return self.state.complete(status(self.store, last, watching))
 
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
         """Yield the decisions so far, newest last.
@@ -689,7 +935,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             parts.append("no trace yet")
         else:
             parts.append(f"traces {self.trace.channels} x {self.trace.samples}")
-        parts.append(f"{self._core.new_labels} new labels")
+        parts.append(f"{self.state.new_labels} new labels")
         if self.safe_mode:
             parts.append("safe mode")
         elif self.policy.shadow:
@@ -700,3 +946,29 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _new_settings(
+    reducer: Any,
+    recipe: Any,
+    model: Model | None,
+    given: Settings,
+    seed: int,
+    trace: TraceSpec | None,
+) -> tuple[EngineSettings, EngineModel]:
+    """Return the settings of a new engine, and the untrained model that they describe.
+
+    `given` are the settings that stand beside the recipe, by name. Raises SettingError for settings
+    that are out of range or contradict each other.
+    """
+    if model is not None:
+        check_model_settings(reducer, given)
+        if recipe is None:
+            # The schedule of conv is its own.
+            recipe = Recipe(retrain_every=Reducer.default_retrain_every)
+    chosen = EngineSettings(choose_recipe(reducer, recipe, given), seed, trace=trace)
+    settings, template = chosen.with_template(model)
+    n_traces = template.min_traces
+    window = f"a window of at least {n_traces} labelled traces, on which it trains first"
+    expect(settings.recipe.window >= n_traces, window, settings.recipe.window)
+    return settings, template

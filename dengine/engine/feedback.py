@@ -1,5 +1,5 @@
 """`Feedback` collects the outcomes of decided parts: it updates the decision rule and the
-references with them, and turns them into stored labels. `core.EngineCore` calls it for each
+references with them, and turns them into stored labels. `engine.DataEngine` calls it for each
 decision, `learner.Learner` for each report.
 
 With `Policy(stops="all")` a bad part stops the system before the next decision, so the next
@@ -296,7 +296,8 @@ class Feedback:
         while pending and next(iter(pending.values())).number <= overdue_to:
             _, stored = pending.popitem(last=False)
             self._live.count_overdue(stored.decision)
-        self._live.mark_examined_to(overdue_to)
+        if overdue_to > self._live.overdue_to:
+            self._live.mark_examined_to(overdue_to)
 
     def take_remedy(self) -> Remedy | None:
         """Return what must be put right, once; None where there is nothing."""

@@ -15,7 +15,7 @@ import numpy as np
 from ..errors import StoreError
 from ..store.outbox import Outbox
 from ..store.records import ModelVersion, ProductNews, without_rule
-from .guard import GuardedModel
+from .guard import NOT_READY, guarded
 from .labels import ProductLabels
 from .live_model import LiveModel
 from .resume import add_labels_since, newest_reference, restore_model
@@ -43,6 +43,7 @@ class Peers:
 
     Attributes
     ----------
+    labels : ProductLabels
     is_lost : bool
         The last question for news failed.
     """
@@ -58,7 +59,7 @@ class Peers:
         self._outbox = outbox
         self._live = live
         self._window = window
-        self._labels = labels
+        self.labels = labels
         self._clock = clock
         self.is_lost = False
         self._asked = -np.inf  # when news was asked for, by the clock
@@ -103,12 +104,6 @@ class Peers:
         self.is_lost = True
         self._asked = self._clock()
 
-    def note_connection(self) -> None:
-        """Note that news was had: clear `is_lost`, and log it if it was set."""
-        if self.is_lost:
-            log.warning("news of product %s comes again", self._outbox.store.product)
-        self.is_lost = False
-
     def take_in(self, news: ProductNews) -> None:
         """Add the labels of the news to the window, in their order, and count them for the next
         retrain; a peer's label becomes a reference of the answering model, unless it is one
@@ -117,13 +112,17 @@ class Peers:
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)
         for trace, label, hash_, seq in rows:
-            self._labels.admit(trace, int(label), int(hash_), int(seq))
+            self.labels.admit(trace, int(label), int(hash_), int(seq))
 
     def note_taken(self, n_labels: int) -> None:
-        """Note how many labels were taken in.
+        """Note that news was had and how many labels were taken in: clear `is_lost`.
 
-        Where more may be waiting, the next cycle asks again at once.
+        It is logged if `is_lost` was set. Where more labels may be waiting, the next cycle asks
+        again at once.
         """
+        if self.is_lost:
+            log.warning("news of product %s comes again", self._outbox.store.product)
+        self.is_lost = False
         self._asked = self._clock() if n_labels < MOST else -np.inf
 
     def take_over(self, version: ModelVersion) -> None:
@@ -149,6 +148,6 @@ class Peers:
             if not isinstance(error, StoreError):
                 self._refused = version.version
             return
-        GuardedModel(model).prepare(self._live.newest)
-        self._labels.take_over(model, newest_reference(version), trained_on.counts_from)
+        guarded(NOT_READY, model.prepare, self._live.newest)
+        self.labels.take_over(model, newest_reference(version), trained_on.counts_from)
         self._live.swap_in(model, version.version, trained_on)

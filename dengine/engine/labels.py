@@ -13,7 +13,7 @@ import numpy as np
 from ..model.base import EngineModel
 from ..records import TraceArray
 from ..reducers.base import State
-from .guard import GuardedModel
+from .guard import NO_REFERENCE, guarded
 from .live_model import LiveModel
 from .trainer import TrainingWindow
 
@@ -31,12 +31,6 @@ class CellLabels:
     new_labels : int
         Labels since the last retrain began.
     """
-
-    last_to_read: int | None = (
-        None  # of the store's labels, when the window is filled anew; None: all of them
-    )
-
-    has_gaps = False  # no label waits for one of a peer
 
     def __init__(self, window: TrainingWindow) -> None:
         self._window = window
@@ -76,13 +70,6 @@ class CellLabels:
         """
         self.new_labels += n_labels
 
-    def add_missing_references(self, model: EngineModel) -> None:
-        """Do nothing: a trained version has every label of the window, and there are no others."""
-
-    def get_state(self) -> State:
-        """Return what a stored version must know of these labels: nothing."""
-        return {}
-
 
 class ProductLabels:
     """Labels of all cells of a product, added to the window in the order of the store.
@@ -105,9 +92,8 @@ class ProductLabels:
         # Labels since the newest retrain began: number, and whether the label is this cell's.
         self._since: list[tuple[int, bool]] = []
         self._trained_to = 0  # number of the newest label that the newest retrain had
-        self._updated_to = (
-            0  # number of this cell's newest label; the rule was updated with all until there
-        )
+        # Number of this cell's newest label; the rule was updated with all until there.
+        self._updated_to = 0
         # The references of a version that was taken over hold every label up to this number; the
         # window may not yet.
         self._references_to = 0
@@ -116,14 +102,6 @@ class ProductLabels:
     def new_labels(self) -> int:
         """Labels of all cells since the newest retrain began."""
         return len(self._since)
-
-    @property
-    def last_to_read(self) -> int:
-        """Number of the last label to read when the window is filled anew.
-
-        Later ones come as the peers' news.
-        """
-        return self._window.newest_seq
 
     @property
     def has_gaps(self) -> bool:
@@ -177,7 +155,7 @@ class ProductLabels:
             self._since.append((seq, is_own))
         model = self._live.answering
         if not is_own and seq > self._references_to and model is not None:
-            GuardedModel(model).add_reference(trace, label, hash_, seq)
+            guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq)
 
     def is_due(self, retrain_every: int) -> bool:
         """Return whether a retrain is due and this cell is the one to do it.
@@ -193,9 +171,6 @@ class ProductLabels:
         """Count from zero, because a retrain on every label of the window begins."""
         self._trained_to = self._window.newest_seq
         self._since = []
-
-    def give_back(self, n_labels: int) -> None:
-        """Do nothing after a dropped retrain: the next one is the turn of whichever cell is due."""
 
     def add_missing_references(self, model: EngineModel) -> None:
         """Add this cell's labels that wait for peers' labels to a version that it trained, as
@@ -219,11 +194,10 @@ class ProductLabels:
         """Add this cell's waiting labels to a version as references, except those that it has
         already.
         """
-        guarded = GuardedModel(model)
         for seq, (trace, label, hash_) in self._waiting.items():
             if seq > self._references_to:
-                guarded.add_reference(trace, label, hash_, seq)
+                guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq)
 
     def get_state(self) -> State:
-        """Return, for the store, the number of the newest label that updated the rule."""
+        """Return, for a stored version, the number of the newest label that updated the rule."""
         return {"rule_last_seq": np.array(self._updated_to)}

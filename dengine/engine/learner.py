@@ -1,5 +1,5 @@
 """`Learner` calls, in the right order, all that an engine learns with: store labels, update the
-rule, train, swap, take in peers' news. `core.EngineCore` calls it once per decision, report and
+rule, train, swap, take in peers' news. `engine.DataEngine` calls it once per decision, report and
 cycle.
 
 It is the only object that calls the others in this order. `Feedback` turns outcomes into labels,
@@ -10,25 +10,25 @@ product made; none of them knows the learner.
 from __future__ import annotations
 
 import logging
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 
 from ..decision.policy import Policy
 from ..errors import StoreError
 from ..model.base import EngineModel
-from ..recipe import Recipe
 from ..records import RetrainReport
 from ..store.outbox import Outbox
-from ..store.records import Change, StoredDecision, without_rule
+from ..store.records import Change, ModelVersion, without_rule
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
 from .fleet import MOST, ROUNDS, Peers
-from .guard import GuardedModel, logged_failure
+from .guard import NOT_PRECOMPUTED, NOT_READY, guarded
 from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .resume import add_labels_since, find_clean_start, refit
@@ -36,7 +36,6 @@ from .settings import EvidenceWindow
 from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
 log = logging.getLogger("dengine")
-STEP = 0.0005  # seconds of catching up in one step: a label or two
 # So many labels without any retrain were imported, and the first training is worth preparing.
 IMPORTED = 500
 
@@ -85,6 +84,7 @@ class Learner:
         self._retrainer = retrainer
         self._clock = clock
         self._candidate: Candidate | None = None
+        self._steps: Iterator[Callable[[], object] | None] = iter(())  # of the candidate
         self._report: RetrainReport | None = None  # of the newest retrain, until it is taken
         self._was_accepted = True  # the last retrain
         self._precomputed: Future[None] | None = None  # what the next retrain begins with
@@ -127,30 +127,12 @@ class Learner:
         labelled = self._window.snapshot()
         start = self._choose_start()
         pool = ThreadPoolExecutor(1, "dengine-precompute", torch.set_num_threads, (1,))
-        model = GuardedModel(start)
-        self._precomputed = pool.submit(model.precompute, labelled.traces, labelled.seq)
+        self._precomputed = pool.submit(
+            guarded, NOT_PRECOMPUTED, start.precompute, labelled.traces, labelled.seq
+        )
         pool.shutdown(wait=False)
 
-    # One outcome
-
-    def report(self, stored: StoredDecision, success: bool) -> None:
-        """Learn a reported label, and return once it is on disk.
-
-        If silence had confirmed the part before, it also waits for the store, so that the rule is
-        put right now; where the store does not answer, that happens later. A safe mode that began
-        or ended is announced. Raises ReportError for a second label, except that a line stop may
-        follow a confirmation, and NotTakenError where the label is not known to be on disk: it is
-        learned all the same, and the same report may come again.
-        """
-        self.catch_up()
-        confirmed_wrongly = self._feedback.take_in(stored, success)
-        self._outbox.sync()
-        self._feedback.note_synced(stored.decision.id)
-        if confirmed_wrongly:
-            with suppress(StoreError):  # then it is put right when the store is back
-                self._outbox.drain()
-        self.catch_up()
-        self._feedback.announce_safe_mode()
+    # Labels
 
     def catch_up(self) -> None:
         """Add labels that the store has numbered to the window, and do what `Feedback.remedy` asks
@@ -164,7 +146,7 @@ class Learner:
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
-        # A rule that is rebuilt from the store would forget labels that are pending.
+        # A rule that is rebuilt from the store would forget labels that wait in memory.
         if self._feedback.store_pending() and not self._outbox.is_drained:
             return
         remedy = self._feedback.take_remedy()
@@ -183,7 +165,8 @@ class Learner:
     def store_labels(self) -> None:
         """Wait until every label is in the store and has its number.
 
-        That includes labels of silently confirmed parts. Raises StoreError where the store is away.
+        That includes labels of silently confirmed parts. Raises StoreError where the store is
+        unavailable.
         """
         self._feedback.store_pending()
         self._drain_labels()
@@ -191,7 +174,7 @@ class Learner:
     def _drain_labels(self) -> None:
         """Wait until the store has the labels that are in the journal, then catch up.
 
-        Raises StoreError where it is away.
+        Raises StoreError where it is unavailable.
         """
         if self._outbox.request_label_drain():
             self._outbox.drain()
@@ -199,74 +182,72 @@ class Learner:
 
     # A retrain
 
-    def retrain(self) -> RetrainReport:
-        """Train a version in this thread, let it answer, and return the report.
+    def retrain(self, wait: bool) -> RetrainReport | None:
+        """Train a version here, let it answer and return the report; or begin in the executor.
 
-        A retrain under way in the executor is ended first, and news of peers is taken in. A version
-        that fails or cannot be stored is dropped, and the report says so. A version that is stored,
-        while labels that came since cannot be, answers at a later call; its report is returned all
-        the same. Raises StoreError where the labels before it cannot be stored.
+        The steps, in this order: every label is stored, since a version is trained on numbered
+        labels alone; what was computed in advance is waited for, and news of peers is taken in,
+        since either may change what the training starts from; then new labels count from zero, and
+        the training begins.
+
+        With `wait`, and without an executor that takes work, it is done in this thread. Else None
+        is returned, and `advance` brings the version to its end. Nothing begins while a training is
+        under way. Where the executor still works on one that was discarded, or something is
+        computed in advance, the training begins later, by `retrain_if_due`.
+
+        A version that fails or cannot be stored is dropped, and the report says so. A version that
+        is stored, while labels that came since cannot be, answers at a later call; its report is
+        returned all the same. Raises StoreError where the labels before it cannot be stored.
         """
-        self.end_training()
+        if not wait:
+            if self.is_at_work:
+                return None
+            is_preparing = self._precomputed is not None and not self._precomputed.done()
+            has_executor = self._retrainer.executor is not None
+            if has_executor and (is_preparing or self._retrainer.is_occupied):
+                self._is_requested = True
+                return None
         self.store_labels()
         begin = self._clock()
-        self._begin_retrain()
-        trained = self._retrainer.train(self._choose_start(), begin)
-        candidate = self._as_candidate_of(trained)
-        self._candidate = candidate
+        self.wait_until_precomputed()
+        self._take_in_all_news()
+        self.labels.begin_retrain()
+        self._is_requested = False
+        start = self._choose_start()
+        if not wait and self._retrainer.start(start):
+            return None
         self._report = None
-        self._advance(to_the_end=True)
+        candidate = self._make_candidate(self._retrainer.train(start, begin))
+        self._advance(candidate, to_the_end=True)
         # A version that is stored may still wait for labels that came since.
         return self._report or candidate.report
 
-    def start_retrain(self) -> RetrainReport | None:
-        """Begin to train in the executor and return None.
-
-        A training under way comes a step further, and a new one begins only if that ended it.
-        Before a new one, labels are stored, and news of peers is taken in. While the executor works
-        on a training that was discarded, or what a retrain begins with is computed, it begins
-        later, by `retrain_if_due`. Without an executor that takes work, retrain in this thread and
-        return the report. Raises StoreError where the labels before it cannot be stored.
-        """
-        self.collect()
-        if self._is_at_work:
-            return None
-        if self._retrainer.executor is not None:
-            precomputed = self._precomputed
-            is_preparing = precomputed is not None and not precomputed.done()
-            if is_preparing or self._retrainer.is_occupied:
-                self._is_requested = True
-                return None
-            self.store_labels()
-            self._begin_retrain()
-            if self._retrainer.start(self._choose_start()):
-                return None
-        return self.retrain()
-
-    def retrain_if_due(self, recipe: Recipe, once: bool = False) -> RetrainReport | None:
+    def retrain_if_due(self, retrain_every: int, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
         There must be as many labels as the model's `min_traces`, unless it was asked for and could
         not begin then. News of peers is taken in first, so another version may answer even if none
         is trained here. A pinned version stays. With `once` a version that lacks steps is not
         trained on until the report of its last retrain was taken.
-        Returns the report of a retrain in this thread; else None: none is due, the store is away, a
-        training or its preparation is under way, or it was begun in the executor.
+        Returns the report of a retrain in this thread; else None: none is due, the store is
+        unavailable, a training or its preparation is under way, or it was begun in the executor.
         """
-        is_due = self._is_due_after_news(recipe.retrain_every)
+        is_due = self._is_due_after_news(retrain_every)
         if self.live.pinned:
             self._is_requested = False
             return None
+        if is_due:
+            n_labels = max(self.labels.new_labels, len(self._window))
+            is_due = n_labels >= self.live.newest.min_traces
         lacks_steps = self._lacks_steps and not (once and self._report is not None)
-        n_labels = max(self.labels.new_labels, len(self._window))
-        has_enough = n_labels >= self.live.newest.min_traces
-        if not (is_due and has_enough) and not lacks_steps and not self._is_requested:
+        if not (is_due or lacks_steps or self._is_requested):
+            return None
+        if self._outbox.fault:
             return None
         try:
-            self.store_labels()
+            return self.retrain(wait=False)
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
-        return None if self._outbox.fault else self.start_retrain()
 
     @property
     def _lacks_steps(self) -> bool:
@@ -288,14 +269,14 @@ class Learner:
         return self._candidate is not None
 
     @property
-    def _is_at_work(self) -> bool:
+    def is_at_work(self) -> bool:
         """Whether a training is under way in the executor, or its version is being swapped in."""
-        return self._retrainer.future is not None or self.is_swapping
+        return self._retrainer.future is not None or self._candidate is not None
 
     @property
     def is_busy(self) -> bool:
         """Whether a retrain is under way, or waits until it can begin."""
-        return self._is_at_work or self._is_requested
+        return self.is_at_work or self._is_requested
 
     def end_training(self) -> None:
         """End what is under way without waiting for a training, before a change that it lacks.
@@ -303,7 +284,7 @@ class Learner:
         A version that is trained answers, or is dropped. A training that is not done is discarded,
         and another begins as soon as it can, after the change.
         """
-        self.collect(to_the_end=True)
+        self.advance(to_the_end=True)
         self._discard_training()
 
     def _discard_training(self) -> None:
@@ -312,36 +293,40 @@ class Learner:
             log.info("a training was discarded for a change; another one begins")
             self._is_requested = True
 
-    def collect(self, wait: float = 0.0, to_the_end: bool = False) -> None:
-        """Take a training's outcome from the executor, and bring its version closer to answering.
+    def advance(self, to_the_end: bool = False, wait: float = 0.0) -> None:
+        """Take a training's outcome from the executor, or bring its version a step further.
 
-        Each call does one short step: take the outcome, catch up on labels, store the version, or
-        swap it in. With `to_the_end`, with `wait` above 0, and always where cells share a product,
-        it does all steps of a training that is done, and blocks for the store. `wait` is also how
-        many seconds to wait for a training that is not done; then that is given up, as is one that
-        hangs. Nothing happens while one is not done, or where there is none.
+        With `to_the_end`, and always where cells share a product, it does all steps of a training
+        that is done, and blocks for the store. `wait` is how many seconds to wait for a training
+        that is not done; then it is given up, as is one that hangs. Nothing happens while one is
+        not done, or where there is none.
         """
-        if not self._is_at_work:
+        if self._candidate is None and self._retrainer.future is None:
             return
         if self._peers is not None:
             if self._retrainer.is_done:
                 self._take_in_all_news()  # a correction or a pinned version discards the training
             to_the_end = True  # no version or correction of a peer comes in between two steps
-        trained = self._retrainer.collect(wait)
-        if trained is not None:
-            self._candidate = self._as_candidate_of(trained)
-        to_the_end = to_the_end or wait > 0.0
-        if self._candidate is not None and (to_the_end or trained is None):  # taking it was a step
-            self._advance(to_the_end)
+        candidate = self._candidate
+        if candidate is None:
+            trained = self._retrainer.collect(wait)
+            if trained is None:
+                return
+            candidate = self._make_candidate(trained)
+            if not to_the_end:  # taking it was a step
+                return
+        self._advance(candidate, to_the_end)
 
-    def _as_candidate_of(self, trained: Trained) -> Candidate:
-        """Return the outcome of a training as a candidate that takes over the answering model's
+    def _make_candidate(self, trained: Trained) -> Candidate:
+        """Make the outcome of a training the candidate, which takes over the answering model's
         rule.
         """
         note = self._start[2] if self._start is not None else ""
         if note:
             trained = replace(trained, reason=f"{trained.reason}; {note}")
-        return Candidate(trained, self.live.newest, self.live.version, self._clock)
+        self._candidate = Candidate(trained, self.live.newest, self.live.version, self._clock)
+        self._steps = self._see_through(self._candidate)
+        return self._candidate
 
     def _choose_start(self) -> EngineModel:
         """Return the model that the next training starts from, as `find_clean_start` does.
@@ -354,10 +339,15 @@ class Learner:
             return live.newest
         key = (live.version, live.corrected_to)
         if self._start is None or self._start[0] != key:
-            start = live.template, "from initial weights"
-            with logged_failure("weights before the forgotten labels cannot be searched for"):
-                start = find_clean_start(self._store, live.template, live.newest, live.trained_on)
-            self._start = key, *start
+            start = guarded(
+                "weights before the forgotten labels cannot be searched for",
+                find_clean_start,
+                self._store,
+                live.template,
+                live.newest,
+                live.trained_on,
+            )
+            self._start = key, *(start or (live.template, "from initial weights"))
         return self._start[1]
 
     def wait_until_precomputed(self) -> None:
@@ -369,66 +359,66 @@ class Learner:
             self._precomputed.result()
             self._precomputed = None
 
-    def _begin_retrain(self) -> None:
-        """Prepare for a training: wait for what is computed in advance, take in the peers' news if
-        the store answers, and count new labels from zero.
-        """
-        self.wait_until_precomputed()
-        self._take_in_all_news()
-        self.labels.begin_retrain()
-        self._is_requested = False
+    # A candidate
 
-    def _advance(self, to_the_end: bool) -> None:
-        """Bring the candidate further: check it, catch up on labels, store it, catch up again, swap
-        it in.
+    def _advance(self, candidate: Candidate, to_the_end: bool) -> None:
+        """Bring the candidate a step further, or with `to_the_end` through all steps.
 
-        It takes one step, or all steps with `to_the_end`; without a candidate none. A candidate
-        that cannot be stored is dropped. One that is stored waits for a later call where the newest
-        labels cannot be stored; that is logged.
+        A candidate that cannot be stored is dropped. One that is stored waits for a later call
+        where the newest labels cannot be stored; that is logged.
         """
-        candidate = self._candidate
-        if candidate is None:
-            return
+        candidate.begin_work()
         try:
-            is_stored = self._store_candidate(candidate, to_the_end)
-        except StoreError as error:  # a version that is not stored would be gone with the process
-            self._drop(candidate, error)
-            return
-        if not is_stored or self._waits_for_labels(candidate, to_the_end):
-            return
-        try:
-            self.store_labels()  # what was confirmed since is to be among its references
+            for wait in self._steps:
+                if not to_the_end:
+                    break
+                if wait is not None:
+                    wait()
         except StoreError as error:
+            if not candidate.is_stored:  # it would be gone with the process
+                self._drop(candidate, error)
+                return
             version = candidate.report.version
             log.warning(
                 "version %d is stored, and answers once the labels since are: %s", version, error
             )
-            return
-        candidate.catch_up(self._window)
-        self._candidate = None
+        candidate.end_work()
+
+    def _see_through(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
+        """See a candidate through from its training to its first answer.
+
+        The order has reasons. A model that does not answer as it was trained costs no commit, so it
+        is compared first. A version is stored with every label that came until then. It is stored
+        before it answers, since it would otherwise be gone with the process while its decisions
+        stay. While it is stored more labels may come, so it catches up once more.
+
+        Yields after each step: None, or, where the store has not done its part yet, a function that
+        waits for it. Raises StoreError where the version cannot be stored; nothing after that.
+        """
+        yield from candidate.check()
+        yield from self._catch_up_candidate(candidate)
+        storing = self._begin_storing(candidate)
+        deadline = time.monotonic() + self._outbox.limit  # to begin; a commit that runs may go on
+        while not storing.done() and (storing.running() or time.monotonic() < deadline):
+            yield partial(self._outbox.wait_for_result, storing)
+        candidate.end_storing(self._outbox.wait_for_result(storing))
+        yield from self._catch_up_candidate(candidate)
         self._swap(candidate)
 
-    def _store_candidate(self, candidate: Candidate, to_the_end: bool) -> bool:
-        """Store the candidate, set the number that the store gave it, and return True.
+    def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
+        """Make the candidate's references complete: a label with each step, once all are stored.
 
-        Returns False if another step is needed: labels are missing, or the commit is under way.
-        With `to_the_end` it blocks for both instead; without, it blocks only for labels that
-        `PATIENCE` steps did not bring. Raises StoreError where it cannot be stored.
+        Yields as `_see_through` does. It ends when no label is on its way to the store or missing.
         """
-        if candidate.storing is None:
-            if not candidate.check(np.inf if to_the_end else STEP):
-                return False
-            if not candidate.catch_up(self._window, np.inf if to_the_end else STEP):
-                return False
-            if self._waits_for_labels(candidate, to_the_end):
-                return False
-            self.store_labels()
-            candidate.catch_up(self._window)
-            candidate.begin_storing(self._begin_storing(candidate), self._outbox.limit)
-        if candidate.storing is None or (not to_the_end and candidate.may_go_on_storing()):
-            return False
-        candidate.set_version(self._outbox.wait_for_result(candidate.storing))
-        return True
+        is_missing = True
+        while is_missing:
+            self._feedback.store_pending()
+            while self._outbox.request_label_drain():
+                yield self._outbox.drain
+            self._feedback.number_labels()
+            is_missing = candidate.learn_next(self._window)
+            if is_missing:
+                yield None
 
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
         """Complete the candidate's report, and submit report and model to the thread that stores
@@ -448,16 +438,8 @@ class Learner:
 
     def _state_of(self, model: EngineModel, trained_on: TrainedOn) -> dict[str, Any]:
         """Return the arrays of this model as a version, by name, for the store."""
-        return self.live.get_state(model, trained_on) | self.labels.get_state()
-
-    def _waits_for_labels(self, candidate: Candidate, to_the_end: bool) -> bool:
-        """Return whether the candidate should wait another step for labels to be stored.
-
-        It asks the outbox to store them at once. False with `to_the_end`, and when the candidate
-        has waited for `PATIENCE` steps.
-        """
-        has_lost_patience = candidate.lose_patience()
-        return not to_the_end and not has_lost_patience and self._outbox.request_label_drain()
+        state = self.live.get_state(model, trained_on)
+        return state if self._peers is None else state | self._peers.labels.get_state()
 
     def _swap(self, candidate: Candidate) -> None:
         """Let a stored candidate answer, with the present rule, and keep its report for
@@ -466,15 +448,17 @@ class Learner:
         Without a model, when the training was dropped, the old version goes on answering; the
         report is kept, and its reason added to `dropped`.
         """
+        self._candidate = None
         self._report = candidate.report
         self._was_accepted = candidate.model is not None
         self._note_outcome(candidate.report)
         if candidate.model is not None:
             self._start = None  # lets go of the previous model
             # An update of the rule may have failed since the candidate took it over.
-            GuardedModel(candidate.model).prepare(self.live.newest)
+            guarded(NOT_READY, candidate.model.prepare, self.live.newest)
             self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
-            self.labels.add_missing_references(candidate.model)
+            if self._peers is not None:
+                self._peers.labels.add_missing_references(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
         """Drop a candidate that could not be stored, and keep a report that says so, in memory
@@ -485,7 +469,8 @@ class Learner:
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
         self._was_accepted = False
-        self.labels.give_back(candidate.report.n_traces)
+        if isinstance(self.labels, CellLabels):  # in a product it is the turn of whichever is due
+            self.labels.give_back(candidate.report.n_traces)
         self._report = replace(
             candidate.report,
             version=self.live.version,
@@ -550,7 +535,6 @@ class Learner:
         except StoreError as error:
             peers.note_loss(error)
             return 0
-        peers.note_connection()
         if version is not None:
             peers.take_over(version)
             if self.live.pinned:
@@ -579,7 +563,8 @@ class Learner:
         self.end_training()
         self.store_labels()
         self._take_in_all_news()
-        if self._peers is not None and (self._peers.is_lost or self.labels.has_gaps):
+        peers = self._peers
+        if peers is not None and (peers.is_lost or peers.labels.has_gaps):
             raise StoreError(
                 f"News of product {self._store.product!r} cannot be had now; try it again."
             )
@@ -593,7 +578,8 @@ class Learner:
         away.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
-        last = self.labels.last_to_read
+        # In a product, labels after the window's newest come as news.
+        last = None if self._peers is None else self._window.newest_seq
         self._window.refill(self._store.labelled(self._window.capacity, last=last))
         is_done = self.live.apply_corrections()
         self.labels.recount(self.live.trained_on.counts_from)
@@ -606,7 +592,7 @@ class Learner:
             text = f"version {version} is fitted again, to labels as they count now"
             self.roll_back(version, Change("rollback", text))
         else:
-            self.retrain()
+            self.retrain(wait=True)
 
     def _prepare_start(self) -> None:
         """Compute in advance for the next training, where it does not start from what answers.
@@ -635,39 +621,51 @@ class Learner:
         return event
 
     def roll_back(self, number: int, event: Change) -> None:
-        """Let the earlier version `number` answer again, as a new version, pin it, and store it
-        with `event`.
+        """Let the earlier version `number` answer again, as a new version that is pinned, and store
+        it with `event`.
 
-        Later labels, up to the window's capacity, become its references, and the present rule goes
-        on. Afterwards news of peers is taken in, and new labels count from zero. Raises StoreError
-        for a version that is not kept, where a trace is damaged that the model must be fitted on
-        again, and where it cannot be stored.
+        The order has reasons. Until the version is stored nothing changes, so all that can fail
+        comes before: reading it, restoring it, and adding the later labels, up to the window's
+        capacity, as its references. Once it answers, news of peers is taken in, which become its
+        references as well, and only then new labels count from zero: none that it knows is new.
+
+        Raises StoreError for a version that is not kept, where a trace is damaged that the model
+        must be fitted on again, and where it cannot be stored.
         """
-        self._outbox.check_integrity()
         begin = self._clock()
+        self._outbox.check_integrity()
         version = self._store.load_version(number)
-        state = without_rule(version.state)  # the present rule goes on
-        model = self.live.template.successor()
-        trained_on = TrainedOn.from_state(version.state)
-        if not model.keeps_references:
-            # A baseline cannot take a label back: it is trained on the same traces as they are
-            # labelled now.
-            trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
-        if model.needs_refit(state) and not refit(model, self._outbox, trained_on):
-            raise StoreError(
-                f"Expected the traces that version {number} was fitted on as they were stored, "
-                "some have changed; see `dengine verify`, and restore the store from a copy."
-            )
-        model.set_state(state)
-        GuardedModel(model).prepare(self.live.newest)
+        model, trained_on = self._restore_with_rule_in_force(version)
         add_labels_since(model, self._store, version, self._window)
         trained_on = replace(trained_on, counts_from=self._window.newest_seq, pinned=number)
         reason = f"rolled back to version {number}"
         self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
-        self._is_requested = False
+        self._is_requested = False  # what was asked for was to replace another version
         self._take_in_all_news()
         self.labels.begin_retrain()
         self._prepare_start()
+
+    def _restore_with_rule_in_force(self, version: ModelVersion) -> tuple[EngineModel, TrainedOn]:
+        """Return the model of a stored version with the rule in force, and what it was trained on.
+
+        A model that is stored by its traces is fitted on them again, a baseline with the labels as
+        they count now, since it cannot take a label back. Raises StoreError where one of these
+        traces has changed.
+        """
+        state = without_rule(version.state)
+        trained_on = TrainedOn.from_state(version.state)
+        model = self.live.template.successor()
+        if not model.keeps_references:
+            trained_on = replace(trained_on, corrected_to=self.live.corrected_to)
+        if model.needs_refit(state) and not refit(model, self._outbox, trained_on):
+            raise StoreError(
+                f"Expected the traces that version {version.version} was fitted on as they were "
+                "stored, some have changed; see `dengine verify`, and restore the store from a "
+                "copy."
+            )
+        model.set_state(state)
+        guarded(NOT_READY, model.prepare, self.live.newest)
+        return model, trained_on
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
         """Go on under another policy, as a new version of the same model, and store it with

@@ -23,7 +23,7 @@ from ..store.records import (
     without_rule,
 )
 from ..store.rule_progress import read_rule_progress
-from .guard import GuardedModel
+from .guard import NO_REFERENCE, NOT_READY, RULE_MISSED, guarded
 from .resume import add_labels_since, apply_correction, restore_model
 from .settings import EvidenceWindow
 from .trainer import TrainedOn, TrainingWindow
@@ -149,7 +149,7 @@ class LiveModel:
             self.corrected_to = max(numbers, default=0)
             return
         self.swap_in(model, version.version, TrainedOn.from_state(version.state))
-        GuardedModel(model).prepare(self.template)
+        guarded(NOT_READY, model.prepare, self.template)
         self.corrected_to = add_labels_since(model, store, version, self.window)
         if past.last_seq:
             _update_rule(model, lambda: self._read_outcomes(past.last_seq))
@@ -159,7 +159,7 @@ class LiveModel:
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
         """Let a model answer from now on, as the version of this number; nothing is stored.
 
-        The caller hands the rule in force over to it (`GuardedModel.prepare`), before or after.
+        The caller hands the rule in force over to it (`EngineModel.prepare`), before or after.
         """
         self.answering = model
         self.version = version
@@ -177,7 +177,9 @@ class LiveModel:
         """
         decision = stored.decision
         if unobserved is not None and decision.model_version >= self.evidence.since:
-            GuardedModel(self.newest).update_rule(
+            guarded(
+                RULE_MISSED,
+                self.newest.update_rule,
                 decision.lower,
                 decision.upper,
                 success,
@@ -193,8 +195,14 @@ class LiveModel:
             return None
         # An embedding that this very version computed for the decision is not computed again.
         embedding = decision.embedding if decision.model_version == self.version else None
-        point = GuardedModel(model).add_reference(
-            stored.trace, int(success), stored.content_hash, number, embedding
+        point = guarded(
+            NO_REFERENCE,
+            model.add_reference,
+            stored.trace,
+            int(success),
+            stored.content_hash,
+            number,
+            embedding=embedding,
         )
         return point if model.keeps_references else None
 
@@ -231,11 +239,11 @@ class LiveModel:
             return
         for outcome in overdue_outcomes(decision):
             self.overdue.add(decision.id)
-            GuardedModel(self.newest).update_rule(*outcome[1:])
+            guarded(RULE_MISSED, self.newest.update_rule, *outcome[1:])
 
     def mark_examined_to(self, number: int) -> None:
-        """Note that decisions up to this number were examined for overdue checks."""
-        self.overdue_to = max(number, self.overdue_to)
+        """Note that decisions up to this number, a larger one, were examined for overdue checks."""
+        self.overdue_to = number
 
     def clear_overdue(self, decision_id: str) -> bool:
         """Count a decision as overdue no more, because its check was reported.
@@ -305,7 +313,7 @@ class LiveModel:
         if self.answering is None:
             return template, None
         model = self.answering.with_policy(policy)
-        GuardedModel(model).prepare(template)
+        guarded(NOT_READY, model.prepare, template)
         return template, model
 
     def change_evidence(self, template: EngineModel, evidence: EvidenceWindow) -> None:
@@ -337,6 +345,5 @@ def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRec
     """
     if not model.rule_learns:
         return
-    guarded = GuardedModel(model)
     for outcome in read_outcomes():
-        guarded.update_rule(*outcome[1:])
+        guarded(RULE_MISSED, model.update_rule, *outcome[1:])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..errors import StoreError
 from ..model.base import EngineModel
 from ..store.records import Correction, ModelVersion, without_rule
-from .guard import GuardedModel
+from .guard import NO_REFERENCE, guarded
 from .trainer import TrainedOn, TrainingWindow
 
 if TYPE_CHECKING:
@@ -145,13 +145,13 @@ def add_labels_since(
         for label in store.past_labels(version.last_seq)
         if label.model_version == version.version
     }
-    guarded = GuardedModel(model)
     rows = zip(since.seq.tolist(), since.traces, since.labels, since.hashes.tolist(), strict=True)
     for seq, trace, label, hash_ in rows:
         while corrections and corrections[0].newest_seq < seq:
             apply_correction(model, store, corrections.popleft())
         # The point is unknown where an earlier version answered the decision.
-        guarded.add_reference(trace, int(label), hash_, seq, point=points.get(seq))
+        point = points.get(seq)
+        guarded(NO_REFERENCE, model.add_reference, trace, int(label), hash_, seq, point=point)
     for correction in corrections:
         apply_correction(model, store, correction)
     return newest
@@ -181,5 +181,6 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     if correction.was is not None or label is None:
         return model.change_reference(correction.seq, hash_, label)
     if len(data.seq):
-        GuardedModel(model).add_reference(data.traces[0], label, hash_, correction.seq)
+        trace = data.traces[0]
+        guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, correction.seq)
     return True

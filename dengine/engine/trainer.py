@@ -118,7 +118,7 @@ class TrainingWindow:
 
         The arrays never change, and are not to be written to.
         """
-        return LabelledTraces(*(column[self._first : self._end] for column in self._block))
+        return LabelledTraces(*[column[self._first : self._end] for column in self._block])
 
     def newer(self, seq: int) -> list[int]:
         """Return the sequence numbers of the window's labels after this one, in ascending order."""

@@ -23,7 +23,7 @@ import re
 import secrets
 import time
 import zipfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +37,10 @@ from ..decision.intervals import SCALAR_BOUNDS
 from ..decision.members import SAFE_MODES
 from ..decision.policy import RULES
 from ..decision.scripting import reason_of
-from ..engine.engine import DataEngine, core_of
+from ..engine.engine import DataEngine
 from ..errors import ExportError, instead
 from ..files import UNREADABLE, FilePath, check_output, read_key, write_output
-from ..model.base import Exportable
+from ..model.base import N_EXAMPLES, NOT_TRAINED, Exportable
 from ..model.neighbours import compare_points
 from ..records import Action, Reason, TraceSpec
 from .decision import FIELDS, DecisionModule
@@ -135,14 +135,7 @@ def prepare_export(
         If `path`, its checksum or its signature must not be written; this is checked first.
     """
     _check_outputs(path, force)
-    is_engine = isinstance(engine_or_model, DataEngine)
-    exporter = core_of(engine_or_model) if is_engine else engine_or_model
-    try:
-        source: Exportable = exporter.exported(trace)
-    except AttributeError as error:
-        actual = type(engine_or_model).__name__
-        wanted = "Expected a DataEngine or a ModelPrediction to export"
-        raise ExportError(f"{wanted}, got {actual}; a baseline stays in Python.") from error
+    source = exportable(engine_or_model, trace)
     model = source.model
     encoder = model.spaces.module()
     if not model.rule.scriptable:
@@ -173,6 +166,44 @@ def prepare_export(
     if defect:
         raise ExportError(f"{model.name} cannot be exported: {defect}.")
     return source, DecisionModule(source.trace, decider, shape, source.stops_all)
+
+
+def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:
+    """Return the model that answers, with the engine's settings, as an exporter takes it.
+
+    It is no copy: the model goes on learning. `trace` replaces the trace contract of the engine or
+    the model. Raises ExportError before the first training, for a baseline, and where the engine's
+    store was changed from outside.
+    """
+    engine = engine_or_model if isinstance(engine_or_model, DataEngine) else None
+    model = engine_or_model
+    if engine is not None:
+        error = engine.state.integrity_error
+        if error:
+            raise ExportError(f"Expected a store as it was written, to export from: {error}")
+        trace = trace or engine.trace
+        model = engine.model
+        if model is None:
+            raise ExportError(NOT_TRAINED)
+    try:
+        source: Exportable = model.exported(trace)
+    except AttributeError as error:
+        actual = type(model).__name__
+        wanted = "Expected a DataEngine or a ModelPrediction to export"
+        raise ExportError(f"{wanted}, got {actual}; a baseline stays in Python.") from error
+    if engine is None:
+        return source
+    return replace(
+        source,
+        audit_rate=engine.policy.audited_share,
+        seed=engine.seed,
+        stops_all=engine.policy.stops == "all",
+        windows=engine.policy.limits,
+        model_version=engine.version,
+        recipe=engine.recipe.to_toml(),
+        examples=engine.store.labelled(N_EXAMPLES).traces,
+        note=engine.store.put_event,
+    )
 
 
 def describe(source: Exportable) -> Metadata:

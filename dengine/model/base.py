@@ -3,7 +3,7 @@ holds `Prediction`, what a model answers; `BaselineAdapter`, by which `as_engine
 `EngineModel` of a baseline; and `Exportable`, what a model hands to an exporter. dengine's own
 `neighbours.ModelPrediction` implements both contracts.
 
-Calls that must not raise into the cell go through `engine.guard.GuardedModel`.
+Calls that must not raise into the cell go through `engine.guard.guarded`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from ..decision.decider import Decider, DecisionConditions, Predicted, Verdict
 from ..decision.policy import Policy
-from ..errors import ExportError, SettingError, shortened
+from ..errors import SettingError, shortened
 from ..limits import ForceLimits
 from ..recipe import Recipe
 from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
@@ -29,6 +29,7 @@ from ..reducers.base import Arrays, FitReport, Floats, Ints, State, StopRule
 from ..traces import clip_extremes
 
 Embedding = tuple[tuple[float, ...], ...]  # (K, d)
+NOT_TRAINED = "Nothing was trained yet; report labels until the first retrain, then export."
 N_EXAMPLES = 8  # traces on which the answers of a version are compared with what was trained
 NO_TRACES: Floats = np.zeros((0, 1, 1), np.float32)
 
@@ -342,16 +343,6 @@ class EngineModel(ABC):
     def needs_refit(self, state: Arrays) -> bool:
         """Return whether `set_state` needs a model that was trained on the state's own traces."""
         return True
-
-    def exported(self, trace: TraceSpec | None) -> Exportable:
-        """Return what an exporter starts from, with the trace contract `trace`, or the model's own.
-
-        The default always raises ExportError: a baseline stays in Python.
-        """
-        raise ExportError(
-            f"{self.name} is a baseline and stays in Python; "
-            "only dengine's own model can be exported."
-        )
 
 
 class PythonPredictor(nn.Module):

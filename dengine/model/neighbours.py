@@ -64,7 +64,15 @@ from ..reducers.base import (
     space_scale,
 )
 from ..traces import ForceLimitsGate, as_labels, as_traces, clip_extremes
-from .base import N_EXAMPLES, NO_TRACES, Embedding, EngineModel, Exportable, Prediction
+from .base import (
+    N_EXAMPLES,
+    NO_TRACES,
+    NOT_TRAINED,
+    Embedding,
+    EngineModel,
+    Exportable,
+    Prediction,
+)
 
 log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
@@ -186,27 +194,36 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     `compiled` sets. The classes themselves are part of it, not their names: a notebook cell that is
     run again defines another class.
     """
-    return tuple(
+    parts = [
         (path, type(module), _as_key(attributes_of(module)))
         for path, module in eager.named_modules(remove_duplicate=False)
         if not isinstance(module, ForceLimitsGate)  # limits may change in number
-    )
+    ]
+    return tuple(parts)
 
 
 def _as_key(value: object) -> object:
-    """Return what an attribute is compared by: its text, its shape or a function itself.
+    """Return what a function or a container among the attributes is compared by, else None.
 
-    A function may get the address of an earlier one. An attribute of a type that TorchScript does
-    not take gives None.
+    That is the function itself, since another may get its address later, or the type of a list,
+    tuple or dict with its items: of a constant its text, of a tensor its shape. TorchScript does
+    not take anything else.
     """
     if isinstance(value, FUNCTIONS):
         return value
-    if isinstance(value, Tensor):
-        return tuple(value.shape)
-    if isinstance(value, list | tuple | dict):
-        items = value.items() if isinstance(value, dict) else enumerate(value)
-        return (type(value), *sorted((repr(key), _as_key(item)) for key, item in items))
-    return repr(value) if isinstance(value, CONSTANTS) else None
+    if not isinstance(value, list | tuple | dict):
+        return None
+    keys: list[tuple[str, object]] = []
+    for name, item in value.items() if isinstance(value, dict) else enumerate(value):
+        key: object
+        if isinstance(item, CONSTANTS):
+            key = repr(item)
+        elif isinstance(item, Tensor):
+            key = tuple(item.shape)
+        else:
+            key = _as_key(item)
+        keys.append((repr(name), key))
+    return (type(value), *sorted(keys))
 
 
 def _is_code_unchanged(*modules: nn.Module) -> bool:
@@ -235,7 +252,8 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     submodules = dict(module.named_modules(remove_duplicate=False))
     for path, submodule in eager.named_modules(remove_duplicate=False):
         for name, value in attributes_of(submodule).items():
-            if has_tensor(value):
+            is_container = isinstance(value, list | tuple | dict)
+            if isinstance(value, Tensor) or (is_container and has_tensor(value)):
                 setattr(submodules[path], name, value)
     return module
 
@@ -544,8 +562,7 @@ class ModelPrediction(EngineModel):
         ValueError
             If nothing was fitted.
         """
-        unlimited = DecisionConditions(self.trace_spec)
-        conditions = conditions or unlimited
+        conditions = conditions or DecisionConditions(self.trace_spec)
         encoder = self.spaces.module()
         neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
         scale = torch.from_numpy(self.scale)
@@ -610,14 +627,14 @@ class ModelPrediction(EngineModel):
         row of `embedding` for that space, else computed. A full index drops its oldest reference.
         Returns the point, float32 (d,), scaled.
         """
+        # The fold of a hash is also the space of its reference.
+        fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
         if point is None:
             if embedding is None:
                 with torch.inference_mode():
                     embedding = self.predictor.embed(torch.from_numpy(x)).numpy()
-            point = np.array(embedding[self._fold(hash_)], dtype=np.float32)
-        self.index.add_one(
-            torch.from_numpy(np.array(point)), float(y), self._fold(hash_), hash_, number
-        )
+            point = np.array(embedding[fold], dtype=np.float32)
+        self.index.add_one(torch.from_numpy(np.array(point)), float(y), fold, hash_, number)
         return point
 
     def renumber_reference(self, old: int, new: int) -> None:
@@ -625,10 +642,6 @@ class ModelPrediction(EngineModel):
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
         return self.index.relabel(number, hash_, y)
-
-    def _fold(self, hash_: int) -> int:
-        """Return the fold of a hash, which is also the space of its reference."""
-        return int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
 
     def update_rule(
         self,
@@ -802,7 +815,7 @@ class ModelPrediction(EngineModel):
 
     def check_answers(self) -> Iterator[str]:
         decider = self.decider(self._conditions)
-        yield from compare_points(decider, self.examples, self._example_points)
+        return compare_points(decider, self.examples, self._example_points)
 
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
@@ -859,9 +872,7 @@ class ModelPrediction(EngineModel):
         ExportError before the first training.
         """
         if "trace_shape" not in vars(self):
-            raise ExportError(
-                "Nothing was trained yet; report labels until the first retrain, then export."
-            )
+            raise ExportError(NOT_TRAINED)
         return Exportable(self, trace or self.trace_spec, examples=self.examples)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -258,7 +258,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     def restore_shape(self, state: Arrays) -> tuple[int, int]:
         """Restore the shape of traces from the array "shape" of a state; return it, (C, T)."""
-        channels, samples = (int(value) for value in state["shape"])
+        channels, samples = map(int, state["shape"])
         self.trace_shape_ = (channels, samples)
         self.n_features_in_ = channels * samples
         return channels, samples

@@ -206,17 +206,17 @@ def weigh_towers(
 ) -> tuple[list[Tensor], Tensor]:
     """Choose for each head the shares by which the logits of towers are mixed to one logit.
 
-    Tower by tower, the mix becomes 1 - s of the mix before it and s of the tower. s is that of
-    eleven values from 0 to 1 with the smallest penalised log loss on the rows outside fold k, so
-    that labels of fold k do not reach head k.
+    Tower by tower, the towers before keep a share of the mix, and the tower gets the rest. The kept
+    share is that of eleven values from 0 to 1 with the smallest penalised log loss on the rows
+    outside fold k, so that labels of fold k do not reach head k.
 
     Parameters
     ----------
     left_out : list of Tensor of float64, shape (K, n)
         Leave-one-out logits of each tower.
     penalties : list of float
-        Nats that a tower's logit with s = 1 must save over all rows, with a smaller s that part of
-        them; that of the first tower is not read.
+        Nats that a tower must save over all rows if nothing of the towers before is kept, and that
+        part of them if it gets a part of the mix. That of the first tower is not read.
     y : Tensor of int64, shape (n,)
         Labels.
     outside : Tensor of bool, shape (K, n)
@@ -232,16 +232,16 @@ def weigh_towers(
     n_heads = len(outside)
     n_rows = outside.sum(1)
     mask = outside.double()
-    candidates = torch.linspace(0.0, 1.0, N_SHARES).double()  # share of the towers before
+    kept_shares = torch.linspace(0.0, 1.0, N_SHARES).double()
     mixed = left_out[0]
     shares = [torch.ones(n_heads)]
     for logits, penalty in zip(left_out[1:], penalties[1:], strict=True):
-        losses = masked_loss(logits + candidates[:, None, None] * (mixed - logits), y, mask)
-        penalised = losses + penalty * (1.0 - candidates)[:, None] / n_rows
-        share = candidates[penalised.argmin(0)]
-        mixed = logits + share[:, None] * (mixed - logits)
-        shares = [share.float() * earlier for earlier in shares]
-        shares.append(1.0 - share.float())
+        losses = masked_loss(logits + kept_shares[:, None, None] * (mixed - logits), y, mask)
+        penalised = losses + penalty * (1.0 - kept_shares)[:, None] / n_rows
+        kept = kept_shares[penalised.argmin(0)]
+        mixed = logits + kept[:, None] * (mixed - logits)
+        shares = [kept.float() * share for share in shares]
+        shares.append(1.0 - kept.float())
     return shares, masked_loss(mixed, y, mask)
 
 
@@ -677,12 +677,12 @@ class RocketReducer(Reducer):
         are not those of the parameters.
         """
         channels, samples = self.restore_shape(state)
-        average, n_fits, n_component_traces, n_iter = (int(value) for value in state["counts"])
+        average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
         self.build(channels, samples, average)
         restore(self.net_, arrays_with_prefix(state, "net."))
         fields = [arrays_with_prefix(state, f"{name}.").values() for name in Tower._fields]
         for arrays in zip(*fields, strict=True):
-            self.towers_.append(Tower(*(torch.from_numpy(np.array(array)) for array in arrays)))
+            self.towers_.append(Tower(*map(torch.from_numpy, map(np.array, arrays))))
         self.n_fits_ = n_fits
         self.n_component_traces_ = n_component_traces
         self.n_iter_ = n_iter

@@ -81,7 +81,7 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
             except BusyError:  # a robot would verify the part, or report it again
                 continue
             await asyncio.sleep(next_start - loop.time())
-            while cycle < N_FAST and service.core.is_retraining:
+            while cycle < N_FAST and service.engine.state.is_retraining:
                 await asyncio.sleep(POLL_SECONDS)
         log.info("all parts of the recording are through; the page stays until Ctrl-C")
     except Exception:

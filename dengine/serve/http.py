@@ -32,7 +32,7 @@ from starlette.staticfiles import StaticFiles
 from .. import __version__
 from ..decision.policy import Policy
 from ..engine.corrections import Changed
-from ..engine.engine import DataEngine, core_of
+from ..engine.engine import DataEngine
 from ..errors import expect
 from ..history.explain import explain, find_decision_id
 from ..history.map import part_map
@@ -285,14 +285,12 @@ class HttpApi:
 
         def begin(engine: DataEngine, by: str) -> Changed:
             """Start the retrain, record as an event who asked for it, and return what changed."""
-            core = core_of(engine)
-            if core.is_retraining:
+            if engine.state.is_retraining:
                 text = "A retrain is under way already; nothing changed."
                 return Changed("retrain", text, None, engine.version)
-            if core.live.pinned:
-                engine.release(by)
+            engine.release(by)
             engine.store.put_event("retrain", "asked for by hand", author=by)
-            core.start_retrain()
+            engine.retrain(wait=False)
             event = engine.store.events(1)[-1]
             return Changed("retrain", "The retrain has begun.", event.number, engine.version)
 
@@ -307,7 +305,9 @@ class HttpApi:
 
         def copy_model(engine: DataEngine) -> Exportable:
             """Return the exportable model as a copy, which later learning does not change."""
-            exported = core_of(engine).exported()
+            from ..export.bundle import exportable
+
+            exported = exportable(engine)
             # The engine goes on learning while the copy is exported.
             return replace(exported, model=copy.deepcopy(exported.model))
 
@@ -452,9 +452,9 @@ class HttpApi:
         Degraded: the store cannot be written, or retrains are dropped again and again. Down: the
         engine's thread has ended, or was busy with one thing for a minute.
         """
-        core = self.service.core
+        running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
-        faults = (core.store_fault, core.retrain_fault)
+        faults = (running.store_fault, running.retrain_fault)
         state = "degraded" if any(faults) else "ok"
         if not is_alive:
             state = "down"

@@ -96,7 +96,7 @@ class Metrics:
         """
         service = self._service
         engine = service.engine
-        core = service.core
+        state = engine.state
         gauges = (
             (
                 "model_version",
@@ -108,15 +108,15 @@ class Metrics:
             (
                 "store_fault",
                 "1 if the store or its journal cannot be written.",
-                bool(core.store_fault),
+                bool(state.store_fault),
             ),
             (
                 "store_lag_seconds",
                 "Age of the oldest record that is not in the store yet; 0 without one.",
-                core.store_lag,
+                state.store_lag,
             ),
-            ("retraining", "1 during a retrain.", core.is_retraining),
-            ("new_labels", "Labels since the last retrain began.", core.new_labels),
+            ("retraining", "1 during a retrain.", state.is_retraining),
+            ("new_labels", "Labels since the last retrain began.", state.new_labels),
             ("waiting", "Requests in the queue.", service.waiting),
         )
         for name, description, value in gauges:

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from numpy.typing import ArrayLike
 
-from ..engine.engine import DataEngine, core_of
+from ..engine.engine import DataEngine
 from ..errors import BusyError, NotTakenError
 from ..files import FilePath
 from ..history.status import NEWEST, Status, status
@@ -184,7 +184,6 @@ class CellService:
         )
         self._thread.start()
         self.engine = opened.result()
-        self.core = core_of(self.engine)
         self.read_store = self.engine.store
         if store is not None:
             try:
@@ -232,7 +231,7 @@ class CellService:
         is_idle = not (self.waiting or self._closing)
         if request is None and is_idle and self._in_use.acquire(blocking=False):
             try:
-                decision_now = self.core.try_decide(trace, part)
+                decision_now = self.engine.decide(trace, part, wait=False)
             finally:
                 self._in_use.release()
             if decision_now is not None:
@@ -246,7 +245,7 @@ class CellService:
         def work(engine: DataEngine, late: bool) -> Decision:
             """Decide in the engine's thread; `late` says that the caller has timed out."""
             decision_id = id_ if late or request is not None else None
-            return core_of(engine).decide(trace, part, decision_id, timed_out=late)
+            return engine.decide(trace, part, decision_id=decision_id, timed_out=late)
 
         future = self._enqueue(work)
         pending = asyncio.wrap_future(future)
@@ -254,9 +253,13 @@ class CellService:
         if pending.done() or not future.cancel():
             decision = await pending
         else:
-            record = partial(self.core.record_timeout, trace, part, decision_id=id_)
+            record = partial(
+                self.engine.decide, trace, part, decision_id=id_, timed_out=True, wait=False
+            )
             loop = asyncio.get_running_loop()
-            decision = await loop.run_in_executor(self._timeout_threads, record)
+            recorded = await loop.run_in_executor(self._timeout_threads, record)
+            assert recorded is not None  # of a timeout there is always a decision
+            decision = recorded
             self.late += 1
         response = ServiceResponse(decision, time.monotonic() - begin)
         return self._notify_observers(response)
@@ -353,7 +356,7 @@ class CellService:
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """Return the status, as `DataEngine.status`; the engine's thread only flushes for it."""
         stored = await self.read(lambda store: status(store, last, watching))
-        return self.core.complete_status(stored)
+        return self.engine.state.complete(stored)
 
     @property
     def waiting(self) -> int:
@@ -454,11 +457,6 @@ class CellService:
         """
         try:
             engine = make()
-            try:
-                core_of(engine).load_decision_ids()
-            except BaseException:
-                engine.close()
-                raise
         except BaseException as error:
             opened.set_exception(error)
             return
@@ -478,7 +476,6 @@ class CellService:
         new version is swapped in by steps, and safe mode is announced. A finished retrain is passed
         to the observers, and the listeners are notified. Errors of that are logged.
         """
-        core = core_of(engine)
         # The time right after a response is best for other work: the next part is farthest away.
         timeout = SHORT_WAIT
         while True:
@@ -487,13 +484,13 @@ class CellService:
                 return self._jobs.get(timeout=timeout)
             try:
                 with self._in_use:
-                    report = core.process_retrains(brief=True)
+                    report = engine.poll(brief=True)
                 if report is not None:
                     self._notify_observers(report)
                     self._notify_listeners()
             except Exception:  # the next request must still be answered
                 log.exception("what the engine does between requests failed")
-            timeout = SHORT_WAIT if core.is_swapping else IDLE_WAIT
+            timeout = SHORT_WAIT if engine.state.is_swapping else IDLE_WAIT
 
     def _notify_listeners(self) -> None:
         """Wake every iteration over `changes`, in its event loop."""

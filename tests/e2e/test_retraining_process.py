@@ -17,7 +17,6 @@ import torch
 
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.engine import trainer
-from dengine.engine.engine import core_of
 from dengine.serve.retraining import RetrainingProcess
 from tests.support.driving import learn
 
@@ -73,8 +72,8 @@ def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
 
 
 def settle(engine: DataEngine) -> None:
-    while core_of(engine).is_retraining:
-        core_of(engine).process_retrains()
+    while engine.state.is_retraining:
+        engine.poll()
         time.sleep(0.01)
 
 
@@ -152,7 +151,7 @@ def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_ta
             learn(engine, data, range(40))
             engine.set_policy(replace(engine.policy, alpha=0.2))
             engine.forget(next(engine.history()).decision.id)
-            assert core_of(engine).is_retraining
+            assert engine.state.is_retraining
             assert not process.ready.done()  # to be ready takes it seconds
         settle(engine)
         assert (engine.version, engine.policy.alpha) == (1, 0.2)
@@ -177,14 +176,14 @@ def test_a_process_that_was_given_up_is_started_again_and_retrains(
             process.submit(time.sleep, 600)
             learn(engine, data, range(40))
             monkeypatch.setattr(trainer, "HUNG", 0.0)
-            core_of(engine).process_retrains()
+            engine.poll()
             assert not engine.store.retrains()[-1].accepted
-            core_of(engine).start_retrain()
+            engine.retrain(wait=False)
             monkeypatch.undo()
         settle(engine)
         assert engine.version == 1
         assert process.ready.result(300) is None
         assert process.submit(os.getpid).result(300) != first.pid
-        assert core_of(engine).start_retrain() is None  # there
+        assert engine.retrain(wait=False) is None  # there
         settle(engine)
         assert engine.version == 2

@@ -358,7 +358,7 @@ def test_limits_in_seconds_are_refused_in_one_sentence_while_the_rate_is_unknown
         asked = {"windows": ["0.01:0.02:-5:"], "author": "Kim"}
         problem = must_be_problem(client.post("/policy", json=asked), 422)
         assert "or start with --samples ..., --rate-hz ..." in problem["detail"]
-        assert service.core.settings.now.recipe.policy.windows == ()
+        assert service.engine.policy.windows == ()
 
 
 def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(

@@ -40,7 +40,6 @@ from dengine import (
     load_exported,
     replay,
 )
-from dengine.engine.engine import core_of
 
 CYCLES = 250
 ASKED = 100  # parts that an exported file is asked about and told of
@@ -176,7 +175,7 @@ class Late(Story):
                     engine.report(due.id, bool(data.y[i - LATE]))
                 if i == CYCLES - 40:
                     engine.retrain()
-                retrains.append(core_of(engine).process_retrains())
+                retrains.append(engine.poll())
         return of_decisions(decisions) | of_retrains(retrains)
 
 

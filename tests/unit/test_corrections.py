@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import Action, DataEngine, Dataset, Reason, Recipe
-from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError
+from dengine.export.bundle import exportable
 from dengine.folds import fold_of
 from tests.support.driving import RECIPE, Counting, evidence, make
 from tests.support.driving import drive as play
@@ -48,7 +48,7 @@ def state(engine: DataEngine) -> tuple:
     return (
         (
             engine.version,
-            core_of(engine).new_labels,
+            engine.state.new_labels,
             engine.safe_mode,
             engine.policy,
             engine.certificate(),
@@ -305,7 +305,7 @@ def test_a_late_stop_leaves_the_same_references_as_a_reopened_engine_has(data: D
     play(engine, data, 0, 120, confirm=True)
     accepted = [d for d in (engine.decide(x) for x in data.X[120:150]) if d.action is Action.ACCEPT]
     engine.report(accepted[3].id, False)
-    core_of(engine).process_retrains()
+    engine.poll()
     reopened = again(engine, Path())
     assert asked(reopened, data) == asked(engine, data)
 
@@ -338,7 +338,7 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     assert engine.store.events(1)[0].data == {"to": number, "was": version, "now": version + 1}
     assert engine.model.spaces is not old
     assert len(engine.model.index) == len(engine.store.labelled().seq)
-    assert core_of(engine).new_labels == 0
+    assert engine.state.new_labels == 0
     assert engine.decide(data.X[199]).model_version == version + 1
     first = engine.store.load_version(number).state
     np.testing.assert_array_equal(engine.model.get_state()["scale"], first["scale"])
@@ -361,8 +361,8 @@ def test_a_version_that_was_rolled_back_to_stays_until_somebody_ends_that(
         play(made, data, 100, 130, confirm=True)
     with DataEngine.open(tmp_path / "engine.db", replaying=True) as engine:
         cycles += play(engine, data, 130, 190, confirm=True)
-        assert (engine.version, core_of(engine).new_labels) == (pinned, len(engine.model.index) - n)
-        assert core_of(engine).new_labels > 2 * RECIPE.retrain_every
+        assert (engine.version, engine.state.new_labels) == (pinned, len(engine.model.index) - n)
+        assert engine.state.new_labels > 2 * RECIPE.retrain_every
         unseen = next(c for c in cycles[::-1] if c.success is not None).decision.id
         assert "pinned" not in engine.forget(unseen).text  # the version was not trained with it
         engine.set_policy(replace(engine.policy, lower_bound=0.85))
@@ -373,7 +373,7 @@ def test_a_version_that_was_rolled_back_to_stays_until_somebody_ends_that(
         else:
             change = engine.forget(cycles[0].decision.id) if end == "forget" else engine.release()
             assert "is pinned no more" in change.text.replace("which learned from this, ", "")
-            assert core_of(engine).process_retrains() is not None  # that is due
+            assert engine.poll() is not None  # that is due
             assert engine.version == pinned + 3
         assert engine.status().pinned == 0
 
@@ -448,8 +448,8 @@ def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bou
         0.001,
         "kim",
     )
-    assert core_of(engine).exported().recipe == engine.recipe.to_toml()
-    assert "alpha = 0.001" in core_of(engine).exported().recipe
+    assert exportable(engine).recipe == engine.recipe.to_toml()
+    assert "alpha = 0.001" in exportable(engine).recipe
 
 
 def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data: Dataset) -> None:

@@ -32,7 +32,6 @@ from dengine import (
 )
 from dengine.datasets.importing import import_labelled
 from dengine.decision.scripting import script
-from dengine.engine.engine import core_of
 from dengine.errors import ReportError, SettingError, StoreError
 from dengine.folds import COIN_BITS, audit_salt, content_hash, toss
 from dengine.store import SqlStore
@@ -220,7 +219,7 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(
     limit = None if reason is Reason.TOO_LARGE else 150.0
     engine = make(trace=TraceSpec(samples=100, limit=limit))
     play(engine, data, 0, 100)
-    before = engine.version, core_of(engine).new_labels, len(engine.model.index)
+    before = engine.version, engine.state.new_labels, len(engine.model.index)
     x = damage(good(data).astype(np.float64))
     decision = engine.decide(x)
     assert (decision.action, decision.reason, decision.embedding) == (Action.VERIFY, reason, None)
@@ -228,7 +227,7 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(
     stored = engine.store.get_decision(decision.id)
     assert (stored.quarantined, stored.success) == (True, True)
     np.testing.assert_array_equal(stored.trace[0], x.astype(np.float32))
-    assert (engine.version, core_of(engine).new_labels, len(engine.model.index)) == before
+    assert (engine.version, engine.state.new_labels, len(engine.model.index)) == before
     assert content_hash(x[None])[0] not in engine.store.labelled().hashes
 
 
@@ -358,17 +357,17 @@ def test_retrains_that_are_dropped_three_times_in_a_row_are_an_alarm_until_one_i
     texts = []
     for _ in range(3):
         assert not engine.retrain().accepted
-        texts.append((core_of(engine).retrain_fault, engine.status().alarm))
+        texts.append((engine.state.retrain_fault, engine.status().alarm))
     alarm = "The last 3 retrains were dropped, so nothing new is learned; the last was dropped: PCA needs more than 500 traces"
     assert texts[:2] == [("", ""), ("", "")]
     assert texts[2][0] == texts[2][1]
     assert texts[2][0].startswith(alarm)
     engine.close()
     with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
-        assert (core_of(engine).retrain_fault, engine.status().alarm) == texts[2]
+        assert (engine.state.retrain_fault, engine.status().alarm) == texts[2]
         assert engine.model.spaces.n_components == sound
         assert engine.retrain().accepted
-        assert (core_of(engine).retrain_fault, engine.status().alarm) == ("", "")
+        assert (engine.state.retrain_fault, engine.status().alarm) == ("", "")
 
 
 @pytest.mark.parametrize("second", [True, False])
@@ -379,7 +378,7 @@ def test_a_second_report_is_an_error_and_the_first_stands(
     assert decision.action is Action.VERIFY
     trained.report(decision.id, True)
     counts, labels, count = (
-        core_of(trained).new_labels,
+        trained.state.new_labels,
         len(trained.store.labelled().labels),
         len(trained.model.index),
     )
@@ -389,7 +388,7 @@ def test_a_second_report_is_an_error_and_the_first_stands(
         trained.report(decision.id, second)
     assert trained.store.get_decision(decision.id).success is True
     n_labels = len(trained.store.labelled().labels)
-    assert (core_of(trained).new_labels, n_labels, len(trained.model.index)) == (
+    assert (trained.state.new_labels, n_labels, len(trained.model.index)) == (
         counts,
         labels,
         count,
@@ -497,7 +496,7 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: 
     )
     with pool:
         beside = learn(make(recipe, executor=pool))
-    core_of(beside).process_retrains()  # swaps in what the pool has finished
+    beside.poll()  # swaps in what the pool has finished
     assert inline.version == beside.version == 1
     assert len(beside.model.index) == 100
     assert [evidence(beside.decide(x)) for x in data.X[100:]] == [

@@ -25,7 +25,6 @@ from dengine import (
     load_dataset,
 )
 from dengine.engine import feedback
-from dengine.engine.engine import core_of
 from dengine.errors import ReportError, StoreError
 from dengine.folds import content_hash, fold_of, part_hash
 from dengine.history.status import status
@@ -131,7 +130,7 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
         )
     engine.report(stopped.id, False)
     monkeypatch.undo()
-    while core_of(engine).store_fault:
+    while engine.state.store_fault:
         time.sleep(0.01)
     engine.decide(stream.X[1])
     engine.flush()
@@ -222,7 +221,7 @@ def learned(engine: DataEngine, probes: np.ndarray) -> tuple:
         rule,
         engine.model.predict_many(probes),
         engine.safe_mode,
-        core_of(engine).new_labels,
+        engine.state.new_labels,
         engine.version,
     )
 
@@ -378,7 +377,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
     play(engine, stream)
     for x in stream.X[stream.y == 1][:12]:
         engine.decide(x + np.float32(0.02))
-    core_of(engine).start_retrain()
+    engine.retrain(wait=False)
     assert beyond(engine) == [0, 0]
     assert engine.store.last_version().last_seq == engine.store.outcomes_since(0)[-1].seq
 
@@ -407,9 +406,9 @@ def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(
         replace(POOLED, stops="some", audit_rate=0.5, label_within=2), on_safe_mode=heard.append
     )
     play(engine, stream)
-    assert all(core_of(engine).try_decide(x) for x in spoiled(stream).X)  # their audits are owed
+    assert all(engine.decide(x, wait=False) for x in spoiled(stream).X)  # their audits are owed
     assert (bool(engine.safe_mode), heard) == (True, [])
-    core_of(engine).process_retrains()
+    engine.poll()
     assert heard == [engine.safe_mode]
 
 
@@ -541,14 +540,14 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         bad = replace(stream, X=stream.X + np.float32(0.001))
         result = rejected(engine, bad)
         assert len(result) > 3
-        core_of(engine).process_retrains()
+        engine.poll()
         engine.flush()
         before = told(engine)
-        n, labels = engine.store.status()["labels"], core_of(engine).new_labels
+        n, labels = engine.store.status()["labels"], engine.state.new_labels
         engine.report(result[0].id, True)
         engine.report(result[1].id, False)
         assert told(engine) == before
-        assert core_of(engine).new_labels == labels + 2
+        assert engine.state.new_labels == labels + 2
         status = engine.status()
         assert (status.sources["inspection"], status.labels, status.ever.false_rejects) == (
             2,

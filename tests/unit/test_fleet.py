@@ -15,7 +15,6 @@ import pytest
 from sklearn.decomposition import PCA
 
 from dengine import Action, DataEngine, Dataset, Recipe, SqlStore
-from dengine.engine.engine import core_of
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.records import RetrainReport
 from dengine.store import verify_history
@@ -105,7 +104,7 @@ def taught(
     for i in range(n):
         learn(cells[i % 2], parts, [i])
     for engine in cells:
-        core_of(engine).process_retrains()
+        engine.poll()
     return cells
 
 
@@ -129,7 +128,7 @@ def test_one_retrain_serves_all(
     for i in range(90):
         learn(cells[i % 3], parts, [i])
     for engine in cells:
-        core_of(engine).process_retrains()
+        engine.poll()
     labels = sum(engine.store.status()["labels"] for engine in cells)
     retrains = cells[0].store.retrains()
     assert [report.version for report in retrains] == list(range(1, labels // EVERY + 1))
@@ -138,7 +137,7 @@ def test_one_retrain_serves_all(
         predictions(cells[0], probe) == predictions(cells[1], probe) == predictions(cells[2], probe)
     )
     assert {len(engine.model.index) for engine in cells} == {labels}
-    assert {core_of(engine).new_labels for engine in cells} == {labels - EVERY * len(retrains)}
+    assert {engine.state.new_labels for engine in cells} == {labels - EVERY * len(retrains)}
 
 
 def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_not(
@@ -165,12 +164,12 @@ def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
     with ThreadPoolExecutor(1) as executor:
         first, second = fleet.engine("a", executor=executor), fleet.engine("b")
         learn(first, parts, range(30))
-        core_of(first).start_retrain()
+        first.retrain(wait=False)
         learn(second, parts, range(30, 40))
         learn(first, parts, range(40, 45))
         executor.shutdown(wait=True)
         for engine in (first, second, first, second):
-            core_of(engine).process_retrains()
+            engine.poll()
         assert first.version == second.version
         assert counts(first, probe) == counts(second, probe)
         assert (
@@ -188,7 +187,7 @@ def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(
     )
     learn(first, parts, range(50))
     learn(second, parts, range(50, 55))
-    core_of(first).process_retrains()
+    first.poll()
     assert second.version == first.version > 0
     np.testing.assert_array_equal(counts(first, probe), counts(second, probe))
 
@@ -196,12 +195,12 @@ def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(
 def test_a_trace_that_came_in_two_cells_votes_once(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a"), fleet.engine("b")
     learn(first, parts, range(30))
-    core_of(second).process_retrains()
+    second.poll()
     (before,) = counts(second, parts.X[100][None, None] + np.float32(0.01))
     for engine in (first, second):
         learn(engine, parts, [100])
-        core_of(engine).process_retrains()
-    core_of(first).process_retrains()
+        engine.poll()
+    first.poll()
     for engine in (first, second):
         (after,) = counts(engine, parts.X[100][None, None] + np.float32(0.01))
         assert sum(after) == sum(before) + 1
@@ -214,7 +213,7 @@ def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_g
     for i in range(60, 70):
         first.report(first.decide(np.full(100, np.nan)).id, False)
         learn((first, second)[i % 2], parts, [i])
-    core_of(first).process_retrains(), core_of(second).process_retrains()
+    first.poll(), second.poll()
     newest = first.store.labelled(30)
     np.testing.assert_array_equal(newest.seq, second.store.labelled(30).seq)
     assert len(newest.seq) == len(first.model.index) == len(second.model.index) == 30
@@ -238,10 +237,10 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     learn(first, parts, range(15))
     reports.append(second.retrain())
     assert [report.version for report in reports] == [1, 2]
-    core_of(first).process_retrains()
+    first.poll()
     assert first.version == second.version == 2
     learn(first, parts, range(15, 20))
-    core_of(second).process_retrains()
+    second.poll()
     assert predictions(first, probe) == predictions(second, probe)
 
 
@@ -252,17 +251,17 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
     wrong, *gone = [past.decision.id for past in first.history() if past.success is not None][20:24]
     first.correct(wrong, not first.store.get_decision(wrong).success)
     first.forget(*gone)
-    core_of(second).process_retrains()
+    second.poll()
     assert first.version == second.version > 0
     assert counts(first, probe) == counts(second, probe)
     assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
-    assert core_of(second).new_labels == core_of(first).new_labels
+    assert second.state.new_labels == first.state.new_labels
     results = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
     assert [report.faults for report in results] == [(), ()]
     assert results[0].cells[0].digest != results[1].cells[0].digest  # each has a ledger of its own
     newest = first.version
     second.rollback(1)
-    core_of(first).process_retrains()
+    first.poll()
     assert first.version == second.version == newest + 1
     assert counts(first, probe) == counts(second, probe)
     before = counts(second, probe), rule(second)
@@ -276,7 +275,7 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
     first, second = taught(fleet, parts, 90)
     with ThreadPoolExecutor(1) as executor:
         third = fleet.engine("c", executor=executor)
-        core_of(third).learner.start_retrain()  # it does not know of the rollback
+        third.retrain(wait=False)  # it does not know of the rollback
         first.rollback(1)
         executor.shutdown()
     pinned = first.version
@@ -285,14 +284,14 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
         (second, range(91, 140)),
         (first, range(140, 190)),
     ):
-        core_of(engine).process_retrains()
+        engine.poll()
         learn(engine, parts, rows)
     for engine in (first, second, third):
-        core_of(engine).process_retrains()
+        engine.poll()
         assert (engine.version, engine.status().pinned) == (pinned, 1)
     second.release()
     for engine in (first, second, third):
-        core_of(engine).process_retrains()
+        engine.poll()
         assert (engine.version > pinned, engine.status().pinned) == (True, 0)
 
 
@@ -314,11 +313,11 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
 def test_a_peers_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(60))
-    core_of(second).process_retrains()
+    second.poll()
     learn(second, parts, range(60, 75))
     custom = rule(second)
     first.retrain()
-    core_of(second).process_retrains()
+    second.poll()
     assert second.version == first.version
     assert rule(second) == custom
 
@@ -335,19 +334,19 @@ def test_a_reopened_cell_decides_the_same_bit_for_bit(
     recipe: Recipe, fleet: Fleet, parts: Dataset, probe
 ) -> None:
     for engine in taught(fleet, parts, 130, recipe):
-        core_of(engine).process_retrains()
+        engine.poll()
         before = (
             predictions(engine, probe),
             rule(engine),
             engine.version,
-            core_of(engine).new_labels,
+            engine.state.new_labels,
         )
         again = fleet.engine("", recipe=None, store=reopened(fleet, engine))
         assert (
             predictions(again, probe),
             rule(again),
             again.version,
-            core_of(again).new_labels,
+            again.state.new_labels,
         ) == before
 
 
@@ -363,7 +362,7 @@ def test_nothing_is_mixed_between_products_and_cells_without(
         if name == "d":
             learn(alone, parts, [i])
     for engine in cells.values():
-        core_of(engine).process_retrains()
+        engine.poll()
     assert predictions(cells["d"], probe) == predictions(alone, probe)
     rows = {name: np.arange(i, 120, 4) for i, name in enumerate("abcd")}
     for name, kin in {"a": "ab", "b": "ab", "c": "c", "d": "d"}.items():
@@ -411,7 +410,7 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
     shaky = fleet.store("b", kind=ShakyStore)
     first, second = fleet.engine("a"), fleet.engine("b", store=shaky)
     learn(first, parts, range(30))
-    core_of(second).process_retrains()
+    second.poll()
     asked = shaky.asked
     for x in parts.X[:10]:
         second.decide(x)
@@ -419,12 +418,12 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
     shaky.lost = True
     for i in range(40):
         learn((first, second)[i % 2], parts, [100 + i])
-        core_of(second).process_retrains()
+        second.poll()
     second.retrain()
     assert [r.levelname for r in caplog.records if "news" in r.message] == ["WARNING"]
     shaky.lost = False
     for engine in (second, first, second):
-        core_of(engine).process_retrains()
+        engine.poll()
     assert "comes again" in caplog.text
     assert first.version == second.version
     assert counts(first, probe) == counts(second, probe)

@@ -10,19 +10,17 @@ import numpy as np
 import pytest
 
 from dengine import DataEngine, Dataset
-from dengine.engine.engine import core_of
-from dengine.engine.learner import STEP
 from tests.support.driving import RECIPE, Counting, evidence, learn
 
 
 class Slow(Counting):
-    """Needs half a step for each label, by a clock of its own."""
+    """Needs a second for each label, by a clock of its own."""
 
     now = 0.0
 
     def add(self, x, y):
         super().add(x, y)
-        Slow.now += STEP / 2
+        Slow.now += 1.0
 
 
 def answers(engine: DataEngine, probe: np.ndarray) -> list[tuple]:
@@ -46,30 +44,33 @@ def engine(data: Dataset) -> DataEngine:
     pool = Held()
     engine = DataEngine(model=Slow(), recipe=RECIPE, executor=pool, clock=lambda: Slow.now)
     learn(engine, data, range(56))
-    assert core_of(engine).is_retraining
-    assert not core_of(engine).is_swapping
+    assert engine.state.is_retraining
+    assert not engine.state.is_swapping
     pool.go.set()
     pool.shutdown(wait=True)
     return engine
 
 
-def test_a_decision_brings_a_version_in_by_one_step_of_a_few_labels(
+def test_a_decision_brings_a_version_in_by_one_step_of_one_label_at_most(
     engine: DataEngine, data: Dataset
 ) -> None:
-    before = Slow.now
-    decisions = [engine.decide(x) for x in data.X[100:109]]
-    assert [d.model_version for d in decisions] == [0] * 8 + [
-        1
-    ]  # it is taken; then sixteen labels, two a step
-    assert (decisions[-1].n_success, decisions[-1].n_failure) == (40, 16)
-    assert Slow.now - before == pytest.approx(16 * STEP / 2)
-    assert not core_of(engine).is_swapping
+    # It is taken and made ready, sixteen labels come in, and it is stored and answers.
+    seconds, versions = [], []
+    for x in data.X[100:119]:
+        before = Slow.now
+        decision = engine.decide(x)
+        seconds.append(Slow.now - before)
+        versions.append(decision.model_version)
+    assert seconds == [0.0] * 2 + [1.0] * 16 + [0.0]
+    assert versions == [0] * 18 + [1]
+    assert (decision.n_success, decision.n_failure) == (40, 16)
+    assert not engine.state.is_swapping
 
 
 def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(engine: DataEngine) -> None:
-    assert core_of(engine).process_retrains(brief=True) is None
-    assert core_of(engine).is_swapping
-    report = core_of(engine).process_retrains()
+    assert engine.poll(brief=True) is None
+    assert engine.state.is_swapping
+    report = engine.poll()
     assert (report.version, report.n_traces, report.accepted, engine.version) == (1, 40, True, 1)
 
 
@@ -82,7 +83,7 @@ def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides
             engine = DataEngine(recipe=RECIPE, executor=pool, store=tmp_path / f"{n}.db")
             for i in range(n):
                 learn(engine, data, [i])
-                core_of(engine).process_retrains(brief=True)
+                engine.poll(brief=True)
             engine.close()
         with DataEngine.open(tmp_path / f"{n}.db") as first:
             expected = answers(first, probe)

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from dengine import Action, DataEngine, Reason, ReplayCell
-from dengine.engine.engine import core_of
 from dengine.errors import ReportError, TraceError, shortened
 from dengine.records import LONGEST, as_success
 
@@ -190,4 +189,4 @@ def test_a_baseline_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(
             engine.report(decision.id, y)
         assert (decision.action, decision.reason) == (Action.VERIFY, Reason.MODEL_ERROR)
         assert engine.store.status()["labels"] == 6
-        assert core_of(engine).store_fault == ""
+        assert engine.state.store_fault == ""

@@ -13,7 +13,6 @@ from sklearn.metrics import roc_auc_score
 from dengine import DataEngine, Dataset, Recipe, RocketReducer
 from dengine.datasets.importing import import_labelled
 from dengine.decision.scripting import script
-from dengine.engine.engine import core_of
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.folds import content_fold
 from dengine.model.base import N_EXAMPLES
@@ -384,7 +383,7 @@ def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(
         with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
             for x, good in zip(X, y, strict=True):
                 engine.report(engine.decide(x).id, bool(good))
-                core_of(engine).process_retrains()
+                engine.poll()
     else:
         import_labelled(url, Dataset(X[:, 0], y), recipe)
     where, raw = set(), RocketEncoder.raw_features

@@ -13,7 +13,6 @@ from torch import nn
 from dengine import ConvReducer, DataEngine, Dataset, Recipe, RocketReducer, TorchReducer
 from dengine.datasets.importing import import_labelled
 from dengine.decision.scripting import script
-from dengine.engine.engine import core_of
 from dengine.errors import SettingError, StoreError
 from dengine.folds import content_fold
 from dengine.reducers import torch_reducer
@@ -524,7 +523,7 @@ def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps
         for x, good in zip(X[100:], y[100:], strict=True):
             left.append(engine.model.report.n_steps_left)
             engine.report(engine.decide(x).id, bool(good))
-            core_of(engine).process_retrains()
+            engine.poll()
     assert left[:4] == [12, 4, 0, 0]
     assert set(left[3:]) == {0}
 

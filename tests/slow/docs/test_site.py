@@ -53,7 +53,7 @@ def test_a_page_asks_nothing_of_the_network(site: Path) -> None:
 
 # What public methods return, and the methods that robots call: documented, not exported.
 RETURNED = {
-    *("BackupReport", "Changed", "Corrections", "Explanation", "ExportedDecision"),
+    *("BackupReport", "Changed", "Corrections", "EngineState", "Explanation", "ExportedDecision"),
     *("ExportedModel", "HistoryFilter", "HistoryReport", "RobotCalls", "Status", "StoredDecision"),
 }
 

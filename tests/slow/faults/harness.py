@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from dengine import Action, DataEngine, Dataset, Policy, Recipe, RetrainReport, load_dataset
-from dengine.engine.engine import core_of
 from dengine.store import SqlStore
 from dengine.store.journal import HEADER
 
@@ -119,7 +118,7 @@ class Cell:
     def until_back(self) -> None:
         """Wait until the store is there again, and holds what its journal held."""
         end = time.monotonic() + PATIENCE
-        while (fault := core_of(self.engine).store_fault) and time.monotonic() < end:
+        while (fault := self.engine.state.store_fault) and time.monotonic() < end:
             time.sleep(0.02)
         self.outcome.must(not fault, fault)
 

@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,6 @@ import sqlalchemy as sa
 
 from dengine import Action, DataEngine, Decision, Reason, ReplayCell, load_dataset
 from dengine.engine import trainer
-from dengine.engine.engine import core_of
 from dengine.errors import DataError, ReportError, StoreError, TraceError
 from dengine.store import StoredDecision, verify_history
 from dengine.store.journal import HEADER, RESERVE, journal_path
@@ -65,7 +64,7 @@ def during(cell: Cell, fault: Any, away: bool = False) -> None:
                 "verified, though the journal is well",
             )
             cell.outcome.must(
-                bool(core_of(cell.engine).store_fault), "nobody was told that the store is away"
+                bool(cell.engine.state.store_fault), "nobody was told that the store is away"
             )
     cell.until_back()
     cell.play(AFTER)
@@ -166,7 +165,7 @@ def lost_file(outcome: Outcome, place: Place) -> None:
         cell.acknowledged.clear()  # they went with the file; what is acknowledged after must be in the journal
         cell.play(DURING)
         outcome.must(
-            "deleted, moved or replaced" in core_of(cell.engine).store_fault,
+            "deleted, moved or replaced" in cell.engine.state.store_fault,
             "a lost file was not noticed",
         )
         cell.engine.close()
@@ -302,7 +301,7 @@ def hung_disk(outcome: Outcome, place: Place, do: str = "hang") -> None:
     cell, data = _before_a_disk(outcome, place, full=do == "hang"), stream()
     with _syncs(do):
         answer = {i: _unsynced(cell, i) for i in range(60, 63)}
-        fault = cell.timed(lambda: core_of(cell.engine).store_fault)
+        fault = cell.timed(lambda: cell.engine.state.store_fault)
     outcome.must(bool(fault), "the engine says that its disk is well")
     cell.until_back()
     for i, item in answer.items():
@@ -495,7 +494,7 @@ def changed(outcome: Outcome, place: Place) -> None:
             )
             again.report(texts[0].id, True)
             outcome.must(
-                "see `dengine verify`" in core_of(again).store_fault, f"nobody was told of: {sql}"
+                "see `dengine verify`" in again.state.store_fault, f"nobody was told of: {sql}"
             )
             outcome.lost += missing(again.store, {texts[0].id: True})
         outcome.must(not verify_history(other.url).ok, f"verified: {sql}")
@@ -516,7 +515,7 @@ def changed_long_ago(outcome: Outcome, place: Place) -> None:
         name, good = cell.acknowledged.popitem()
         again.correct(name, not good)
         outcome.must(
-            "see `dengine verify`" in core_of(again).store_fault,
+            "see `dengine verify`" in again.state.store_fault,
             "the rule was told what was changed",
         )
 
@@ -544,7 +543,7 @@ def flipped_store(outcome: Outcome, place: Place) -> None:
             DataEngine.open(other.store()) as again,
         ):  # else it is refused, and said
             same = bounds(again) == before and not missing(again.store, cell.acknowledged)
-            answer = core_of(again).store_fault or any(
+            answer = again.state.store_fault or any(
                 event.kind == "damaged" for event in again.store.events()
             )
             outcome.must(same or bool(answer), f"flip {i}: nobody is told of it")
@@ -626,8 +625,8 @@ def asked_again(outcome: Outcome, place: Place, stored: int = 0) -> None:
         for i in range(IDS)
     ]
     cell.engine.close()
-    cell.engine = engine = DataEngine.open(place.store())  # which has none of them by heart
-    core_of(engine).load_decision_ids()
+    # It has none of them by heart, and with an executor reads the ids before it returns.
+    cell.engine = engine = DataEngine.open(place.store(), executor=ThreadPoolExecutor(1))
     with away(place):
         outcome.injected += 1
         cell.play(1)

@@ -18,7 +18,6 @@ import pytest
 import sqlalchemy as sa
 
 from dengine import Action, DataEngine, Decision, Reason, Source
-from dengine.engine.engine import core_of
 from dengine.errors import StoreError
 from dengine.store import Event, NewLabel, StoredDecision
 from dengine.store.journal import FRAME, Journal, decode_record, encode_record
@@ -117,11 +116,11 @@ def test_a_forgotten_engine_gives_its_cell_free(place: Place) -> None:
 def test_closing_does_not_wait_for_a_hung_retrain(
     place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("dengine.engine.core.CLOSE_SECONDS", 0.1)
+    monkeypatch.setattr("dengine.engine.engine.CLOSE_SECONDS", 0.1)
     cell = Cell(place, Outcome(), executor=Hung())
     cell.play(60)
     cell.engine.close()
-    assert not core_of(cell.engine).is_retraining
+    assert not cell.engine.state.is_retraining
 
 
 def test_an_executor_that_was_shut_down_is_replaced_by_retrains_in_line(place: Place) -> None:

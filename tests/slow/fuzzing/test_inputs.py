@@ -23,7 +23,6 @@ from dengine import (
     open_store,
 )
 from dengine.datasets.importing import import_labelled
-from dengine.engine.engine import core_of
 from dengine.export.cell_journal import read_journal
 from dengine.testing import toy_traces
 from tests.support.command_line import dengine
@@ -135,11 +134,11 @@ def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
     engines, value: Any, x: np.ndarray
 ) -> None:
     engine = engines[0]
-    id_, before = engine.decide(x * -3.0).id, core_of(engine).new_labels
+    id_, before = engine.decide(x * -3.0).id, engine.state.new_labels
     try:
         engine.report(id_, value)
     except DengineError:
-        assert (engine.find(id_).success, core_of(engine).new_labels) == (None, before)
+        assert (engine.find(id_).success, engine.state.new_labels) == (None, before)
     else:
         assert isinstance(value, bool | int | float | np.generic | np.ndarray)
         assert value in (0, 1)

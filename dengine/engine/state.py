@@ -1,0 +1,73 @@
+"""`EngineState`: what only the running engine knows, for a server, a page or a watching loop."""
+
+from dataclasses import replace
+
+from ..history.status import Status, retrain_fault
+from ..store.outbox import Outbox
+from .learner import Learner
+from .live_model import LiveModel
+
+
+class EngineState:
+    """What only the running engine knows; any thread may read it at any time, and nothing waits.
+
+    Parameters
+    ----------
+    live : LiveModel
+    learner : Learner
+    outbox : Outbox
+    """
+
+    def __init__(self, live: LiveModel, learner: Learner, outbox: Outbox) -> None:
+        self._live = live
+        self._learner = learner
+        self._outbox = outbox
+
+    @property
+    def new_labels(self) -> int:
+        """Labels since the last retrain began."""
+        return self._learner.labels.new_labels
+
+    @property
+    def is_retraining(self) -> bool:
+        """Whether a retrain is under way in the executor, or its version waits to be swapped in."""
+        return self._learner.is_busy
+
+    @property
+    def is_swapping(self) -> bool:
+        """Whether a trained version is being swapped in, one step with each call of the engine."""
+        return self._learner.is_swapping
+
+    @property
+    def retrain_fault(self) -> str:
+        """What is wrong if retrains are dropped again and again; "" if they are not."""
+        return retrain_fault(self._learner.dropped, self._live.version)
+
+    @property
+    def integrity_error(self) -> str:
+        """What in the store is not as it was written, so that every part is verified; "" if
+        nothing is.
+        """
+        return self._outbox.integrity_error
+
+    @property
+    def store_fault(self) -> str:
+        """Why the store, or its journal, cannot be written at present; "" where both can."""
+        return self._outbox.fault
+
+    @property
+    def store_lag(self) -> float:
+        """Age in seconds of the oldest journal record that is not in the store; 0.0 if none."""
+        return self._outbox.lag
+
+    def complete(self, status: Status) -> Status:
+        """Return a copy of a status read from the store, with what only the engine knows put in."""
+        return replace(
+            status,
+            version=self._live.version,
+            safe_mode=self._live.newest.safe_mode,
+            new_labels=self.new_labels,
+            store_fault=self.store_fault,
+            store_lag=self.store_lag,
+            retraining=self.is_retraining,
+        )
