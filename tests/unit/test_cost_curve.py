@@ -475,31 +475,3 @@ def test_the_verb_names_a_price_that_is_no_number(recordings: Path) -> None:
     assert "'0.5 EUR' is not a valid float" in " ".join(result.output.split())
     refused = " ".join(dengine(*WORDS, "--alpha", "0.1").output.split())
     assert "but a list is tried here: use --alphas" in refused
-
-
-def test_the_verb_says_that_recordings_come_twice(recordings: Path, data: Dataset) -> None:
-    twice = np.r_[0:60, 0:30]
-    np.savez(recordings / "mine.npz", X=data.X[twice], y=data.y[twice])
-    text = " ".join(succeed(*WORDS).split())
-    assert "Of the recordings 30 repeat another: the interval is too narrow." in text
-
-
-def test_after_an_error_in_one_replay_the_verb_shows_what_was_finished(
-    recordings: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from dengine.experiments import grid
-
-    play = grid._play
-
-    def fail_late(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
-        if task.seed == 3:
-            raise SettingError("a sensor is missing")
-        return play(data, i, task, on_cycle)
-
-    monkeypatch.setattr(grid, "_play", fail_late)
-    result = dengine(*WORDS, "--lower-bounds", "0.7,0.8")
-    text = " ".join(result.output.split())
-    assert result.exit_code == 1
-    assert "these shuffles also chose the policy" in text
-    assert "Interrupted: what was finished is shown. " in text
-    assert "a sensor is missing" in text

@@ -80,33 +80,24 @@ def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(
 
 
 def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_path: Path) -> None:
-    task, kept, rng = (
-        Task(Contender.load(RECIPE), seed=1, cycles=50),
-        KeptReplays(tmp_path, data),
-        np.random.default_rng(0),
-    )
-    played = replay(data, RECIPE, seed=1, cycles=50)
+    task, rng = Task(Contender.load(RECIPE), seed=1, cycles=50), np.random.default_rng(0)
+    kept, played = KeptReplays(tmp_path, data), replay(data, RECIPE, seed=1, cycles=50)
     kept.put(task, played)
-    file = kept.path(task).read_bytes()
+    path, whole = kept.path(task), kept.path(task).read_bytes()
+    same(kept.get(task), played)
     results = []
-    for size in [1, 1, 3, 50] * 75:
-        damaged = np.frombuffer(file, dtype=np.uint8).copy()
+    for size in [1, 1, 3, 50] * 25:
+        damaged = np.frombuffer(whole, dtype=np.uint8).copy()
         damaged[rng.integers(len(damaged), size=size)] = rng.integers(256, size=size)
-        kept.path(task).write_bytes(damaged.tobytes())
+        path.write_bytes(damaged.tobytes())
         results.append(kept.get(task))
-    assert results.count(None) > 200
+    assert results.count(None) > 60
     for back in filter(None, results):  # what was hit is nothing that is read
         np.testing.assert_array_equal(back.action, played.action)
-    kept.path(task).write_bytes(b"")
+    path.write_bytes(b"")
     (again,) = iterate_replays(data, [task], keep=tmp_path)
     assert not again.kept
-    back = kept.get(task)
-    same(back, played)
-    assert (back.retrains, back.seconds, back.recipe) == (
-        again.replay.retrains,
-        again.replay.seconds,
-        played.recipe,
-    )
+    assert kept.get(task).retrains == again.replay.retrains
 
 
 def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: Path) -> None:

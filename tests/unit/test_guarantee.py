@@ -15,7 +15,6 @@ from dengine.decision.members import (
     N_RECENT,
     SAFE_MODES,
     MemberEvidence,
-    max_recent_errors,
 )
 from dengine.decision.rule import DecisionRule
 from dengine.decision.scripting import script
@@ -65,17 +64,6 @@ def test_what_came_before_a_level_was_aimed_at_is_no_evidence_for_it() -> None:
     assert rule.action(0.5, 1.0) == ACCEPT
     tell(rule, 0.5, *[False] * 8)
     assert rule.action(0.5, 1.0) == VERIFY
-
-
-def test_the_newest_of_a_level_may_hold_so_many_wrong_ones_and_no_more() -> None:
-    rule, most = pooled(), max_recent_errors(0.1)
-    tell(rule, 0.9, *[True] * 1000)
-    for n_wrong in range(1, most + 2):
-        tell(rule, 0.6, False, *[True] * 4)  # not so many that the detector would notice
-        assert rule.action(0.6, 1.0) == (ACCEPT if n_wrong <= most else VERIFY)
-    assert (rule.safe_mode(), rule.action(0.9, 1.0)) == (0, ACCEPT)  # the stricter level goes on
-    tell(rule, 0.6, *[True] * N_RECENT)
-    assert rule.action(0.6, 1.0) == ACCEPT
 
 
 def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_audits_weigh_by_their_propensity() -> (
@@ -145,14 +133,6 @@ def test_an_adversary_who_sees_the_levels_makes_a_false_claim_no_more_often_than
         )  # it is an adversary
 
 
-def test_a_level_that_its_members_contradict_stays_shut_below_the_ones_that_hold() -> None:
-    rule = pooled()
-    tell(rule, 0.9, *[True] * 150)
-    tell(rule, 0.7, *[False, True, True, True, True] * 20)
-    assert rule.action(0.9, 1.0) == ACCEPT
-    assert rule.action(0.7, 1.0) == VERIFY
-
-
 def priced(inclusion_probability: float = 1.0) -> PricedRule:
     return PricedRule(0.1, 0.9, "wilson", (5 / 120, 5 / 47.5), inclusion_probability)
 
@@ -180,17 +160,6 @@ def test_by_costs_nothing_passes_that_is_expected_to_cost_more_than_its_check() 
     tell(rule, 0.0, *[False] * 100, upper=0.0)
     assert [rule.action(1 - p, 1.0) for p in (0.041, 0.043)] == [ACCEPT, VERIFY]
     assert [rule.action(0.0, p) for p in (0.105, 0.106)] == [REJECT, VERIFY]
-
-
-def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_that_came_unasked_for_none() -> (
-    None
-):
-    rule = priced(inclusion_probability=0.1)
-    tell(rule, 1.0, *[True] * 30)
-    rule.update(1.0, 1.0, False, predicted=1, inclusion_probability=0.0)
-    assert rule.action(1.0, 1.0) == ACCEPT
-    rule.update(1.0, 1.0, False, predicted=1, inclusion_probability=0.1)  # ten escapes
-    assert rule.action(1.0, 1.0) == VERIFY
 
 
 def test_after_an_alarm_costs_open_when_the_account_since_then_is_even_over_25_members_or_more() -> (
@@ -233,15 +202,6 @@ def test_prices_that_give_no_tolerance_below_one_half_are_refused(prices: object
         match="prices of a check, an escape and a false reject, errors above two checks",
     ):
         Policy(prices=prices)
-
-
-def test_a_part_that_both_sides_claim_is_verified() -> None:
-    rule = pooled()
-    tell(rule, 0.9, *[True] * 60)
-    tell(rule, 0.0, *[False] * 60, upper=0.1)
-    assert rule.action(0.95, 1.0) == ACCEPT
-    assert rule.action(0.0, 0.05) == REJECT
-    assert rule.action(0.4, 0.6) == VERIFY
 
 
 @pytest.mark.parametrize("kind", [PooledRule, WatchedRule])
@@ -345,22 +305,6 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, st
         assert torch.equal(value, scripted.state_dict()[name]), name
     counts = [(n, k) for n in range(0, 60, 7) for k in range(0, 10, 3)]
     assert [eager(*count) for count in counts] == [scripted(*count) for count in counts]
-
-
-@pytest.mark.parametrize("first", [0, 1])
-def test_after_safe_mode_each_side_opens_by_its_own_evidence(first: int) -> None:
-    rule = WatchedRule(0.1, 0.9)
-    shown = [
-        lambda n: tell(rule, 0.95, *[True] * n),
-        lambda n: tell(rule, 0.0, *[False] * n, upper=0.02),
-    ]
-    tell(rule, 0.95, *[True] * 100, *[False] * 6)
-    assert rule.safe_mode() != 0
-    shown[first](100)
-    assert (rule.safe_mode() == 0) is (first == 0)  # accepted parts had failed
-    assert rule.action(*[(0.95, 1.0), (0.0, 0.02)][1 - first]) == VERIFY
-    shown[1 - first](100)
-    assert (rule.action(0.95, 1.0), rule.action(0.0, 0.02), rule.safe_mode()) == (ACCEPT, REJECT, 0)
 
 
 @pytest.mark.parametrize("kind", ["watched", "pooled", "priced"])

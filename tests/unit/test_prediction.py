@@ -21,7 +21,6 @@ from dengine import (
 )
 from dengine.decision.decider import DecisionConditions, trace_gate
 from dengine.folds import content_fold, content_hash
-from dengine.model import neighbours
 from dengine.records import ACTIONS, REASONS
 
 
@@ -172,48 +171,6 @@ def test_a_successor_learns_without_disturbing_its_parent(data: Dataset) -> None
     child.add(data.X[0], 1)
     assert parent.predict_many(data.X[100:]) == before
     assert child.predict_many(data.X[100:]) != before
-
-
-def fitted(name: str, data: Dataset) -> ModelPrediction:
-    reducers = {"pca": "pca", "lda": LinearDiscriminantAnalysis()}
-    model = ModelPrediction(reducers[name], classifier()).fit(data.X[:120], data.y[:120])
-    for x, y in zip(data.X[120:150], data.y[120:150], strict=True):
-        model.add(x, y)
-    return model
-
-
-def test_a_state_restores_every_judgement_bit_for_bit(data: Dataset) -> None:
-    model = fitted("pca", data)
-    state = model.get_state()
-    assert all(isinstance(v, np.ndarray) and not v.dtype.hasobject for v in state.values())
-    restored = ModelPrediction("pca", classifier()).set_state(state)
-    assert restored.predict_many(data.X) == model.predict_many(data.X)
-    restored.add(data.X[160], 1)
-    model.add(data.X[160], 1)
-    assert restored.predict_many(data.X) == model.predict_many(data.X)
-
-
-def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements(
-    data: Dataset,
-) -> None:
-    model = fitted("lda", data)
-    state = model.get_state()
-    assert not any(name.startswith("reducer.") for name in state)
-    restored = lda().fit(data.X[:120], data.y[:120]).set_state(state)
-    assert restored.predict_many(data.X) == model.predict_many(data.X)
-
-
-def test_what_will_answer_is_compiled_before_there_is_anything_to_learn(
-    data: Dataset, monkeypatch
-) -> None:
-    with DataEngine("conv", replaying=True) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-            monkeypatch.setattr(
-                neighbours, "script", None
-            )  # in a retrain there is no time for that
-        assert engine.retrain().accepted
-        assert isinstance(engine.model.predictor, torch.jit.ScriptModule)
 
 
 def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_are_few(

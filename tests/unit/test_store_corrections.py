@@ -35,31 +35,6 @@ def correct(store: SqlStore, success: bool | None, *names: str, author: str = "k
     )
 
 
-def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) -> None:
-    fill(store)
-    correct(store, None, "1", "3")
-    labelled = store.labelled()
-    assert (labelled.seq.tolist(), labelled.labels.tolist(), labelled.hashes.tolist()) == (
-        [1, 3, 5],
-        [1, 1, 1],
-        [100, 102, 104],
-    )
-    np.testing.assert_array_equal(labelled.traces, np.stack([trace(i) for i in (0, 2, 4)]))
-    assert store.labelled(2).seq.tolist() == [3, 5]
-    assert [item.seq for item in store.outcomes_since(0)] == [1, 3, 5]
-    stored = store.get_decision("1")
-    assert (stored.success, stored.source, stored.trace.tolist()) == (
-        None,
-        Source.VERIFICATION,
-        trace(1).tolist(),
-    )
-    assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (
-        3,
-        2,
-        0,
-    )
-
-
 def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(
     store: SqlStore,
 ) -> None:

@@ -1,6 +1,5 @@
 """UMAP in PyTorch agrees with umap-learn, goes on from training to training, and is restored."""
 
-import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from torch import Tensor
 
 from dengine import (
     Action,
-    DataEngine,
     Dataset,
     ModelPrediction,
     UmapLearnReducer,
@@ -146,13 +144,6 @@ def test_places_that_were_trained_warm_are_as_good_as_those_of_one_fit(
     assert label_agreement(places, y) > label_agreement(fitted.embedding_.numpy(), y) - 0.02
 
 
-def test_frames_keep_the_neighbours_of_whole_traces(insertion: Traces, fitted: UmapReducer) -> None:
-    rows = insertion[0][:, 0]
-    whole = NearestNeighbors(n_neighbors=14).fit(rows).kneighbors(return_distance=False)
-    pairs = zip(whole.tolist(), fitted.neighbors_.indices.tolist(), strict=True)
-    assert np.mean([len(set(pair) & set(other)) / 14 for pair, other in pairs]) > 0.95
-
-
 @pytest.mark.parametrize(
     ("samples", "n_frames"),
     [(1, 1), (2, 2), (99, 99), (101, 101), (250, 125), (404, 101), (1000, 100)],
@@ -234,17 +225,6 @@ def test_state_is_restored_bit_for_bit_over_further_trainings(insertion: Traces)
         numbers = NUMBERS[first:last]
         np.testing.assert_array_equal(train(restored, X, numbers), train(reducer, X, numbers))
         np.testing.assert_array_equal(restored.transform(X), reducer.transform(X))
-
-
-def test_places_repeat_exactly_with_a_random_state_and_differ_between_two(
-    insertion: Traces,
-) -> None:
-    X, _ = insertion
-    first, same, other = (
-        UmapReducer(random_state=seed).fit(X[:100]).embedding_ for seed in (1, 1, 2)
-    )
-    assert torch.equal(first, same)
-    assert not torch.equal(first, other)
 
 
 def test_the_scripted_module_is_the_eager_one_bit_for_bit(
@@ -479,23 +459,6 @@ def test_negative_samples_are_other_places_each_drawn_equally_often() -> None:
     assert (torch.bincount(samples.flatten().long()) == 16).all()
 
 
-def test_an_engine_with_umap_is_opened_without_a_refit(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    X, y = toy_traces(120)
-    url = str(tmp_path / "engine.db")
-    with DataEngine("umap", store=url, replaying=True) as engine:
-        for x, label in zip(X, y, strict=True):
-            engine.report(engine.decide(x).id, bool(label))
-        version = engine.version
-    assert version
-    monkeypatch.setattr(UmapReducer, "_train", None)
-    with DataEngine.open(url) as engine:
-        assert engine.version == version
-        assert engine.decide(X[0]).embedding is not None
-
-
 def test_points_of_another_umap_are_not_counted_with_this_one() -> None:
     X, y = toy_traces(120)
     state = ModelPrediction("umap").fit(X, y).get_state()
@@ -503,11 +466,3 @@ def test_points_of_another_umap_are_not_counted_with_this_one() -> None:
     refitted = ModelPrediction("umap").fit(X, y)
     with pytest.raises(StoreError, match=r"whose UmapReducer has no state; .*dengine train"):
         refitted.set_state(stateless)
-
-
-def test_a_fitted_reducer_travels_between_processes(insertion: Traces) -> None:
-    X, _ = insertion
-    reducer = UmapReducer()
-    train(reducer, X, NUMBERS[:100])
-    received = pickle.loads(pickle.dumps(reducer))
-    np.testing.assert_array_equal(train(received, X, NUMBERS), train(reducer, X, NUMBERS))

@@ -17,7 +17,7 @@ from dengine.errors import DataError
 from dengine.export import import_journal
 from dengine.export.cell_journal import read_journal
 from dengine.records import Action, Reason
-from tests.support.exports import SAMPLES, cell_journal, fitted, trained, wild_traces
+from tests.support.exports import SAMPLES, cell_journal, trained, wild_traces
 from tests.support.programs import Program, must_agree
 
 
@@ -69,15 +69,6 @@ def test_it_takes_the_engines_decisions(
         Reason.CONSTANT,
         Reason.SATURATED,
     }
-
-
-def test_several_channels_come_one_after_the_other(
-    programs: Path, make_data, tmp_path: Path
-) -> None:
-    data = make_data(150, 40, 3)
-    path = export_torchscript(fitted(data), tmp_path / "model.ts")
-    with Program(programs, path) as cell:
-        must_agree([cell.decide(x) for x in data.X], load_exported(path).decide_many(data.X))
 
 
 @pytest.mark.parametrize("fit", ["cut", "pad", "resample"])
