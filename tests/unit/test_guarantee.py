@@ -12,8 +12,6 @@ from dengine.decision.member_rules import LOWEST_LEVEL, PooledRule, PricedRule, 
 from dengine.decision.members import (
     BET,
     FALSE_ALARMS,
-    N_RECENT,
-    SAFE_MODES,
     MemberEvidence,
 )
 from dengine.decision.rule import DecisionRule
@@ -64,26 +62,6 @@ def test_what_came_before_a_level_was_aimed_at_is_no_evidence_for_it() -> None:
     assert rule.action(0.5, 1.0) == ACCEPT
     tell(rule, 0.5, *[False] * 8)
     assert rule.action(0.5, 1.0) == VERIFY
-
-
-def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_audits_weigh_by_their_propensity() -> (
-    None
-):
-    rule = PooledRule(0.1, 0.9, inclusion_probability=0.1)
-    for _ in range(5000):
-        rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
-    assert rule.action(0.95, 1.0) == VERIFY
-    n = 0
-    while rule.action(0.95, 1.0) == VERIFY:
-        rule.update(0.95, 1.0, True, predicted=0, inclusion_probability=1.0)
-        n += 1
-    assert (
-        9 * enough(0.1, 0.1) < n < 11 * enough(0.1, 0.1)
-    )  # what is to come is looked at in one of ten
-    for _ in range(100):
-        rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
-    rule.update(0.95, 1.0, False, predicted=1, inclusion_probability=0.1)  # it stands for ten
-    assert rule.action(0.95, 1.0) == VERIFY
 
 
 def test_a_pooled_guarantee_of_which_nobody_hears_is_refused() -> None:
@@ -137,47 +115,6 @@ def priced(inclusion_probability: float = 1.0) -> PricedRule:
     return PricedRule(0.1, 0.9, "wilson", (5 / 120, 5 / 47.5), inclusion_probability)
 
 
-@pytest.mark.parametrize("share_bad", [0.02, 0.06, 0.3])
-def test_by_costs_a_part_passes_only_while_the_members_had_cost_at_most_one_escape_beyond_their_checks(
-    share_bad,
-) -> None:
-    for seed in range(20):
-        rule, rng, cost, passed = priced(), np.random.default_rng(seed), 0.0, 0
-        for _ in range(400):
-            if rule.action(1.0, 1.0) == ACCEPT:
-                passed += 1
-                assert cost <= 120 + 1e-6
-            good = bool(rng.random() >= share_bad)
-            rule.update(1.0, 1.0, good)
-            cost += 0 if good else 120
-            cost -= 5
-        assert passed > 0
-
-
-def test_by_costs_nothing_passes_that_is_expected_to_cost_more_than_its_check() -> None:
-    rule = priced()
-    tell(rule, 1.0, *[True] * 100)
-    tell(rule, 0.0, *[False] * 100, upper=0.0)
-    assert [rule.action(1 - p, 1.0) for p in (0.041, 0.043)] == [ACCEPT, VERIFY]
-    assert [rule.action(0.0, p) for p in (0.105, 0.106)] == [REJECT, VERIFY]
-
-
-def test_after_an_alarm_costs_open_when_the_account_since_then_is_even_over_25_members_or_more() -> (
-    None
-):
-    rule = priced()
-    tell(rule, 1.0, *[True] * 400)
-    n_bad = 0
-    while rule.safe_mode() == 0:
-        tell(rule, 1.0, False)
-        n_bad += 1
-    assert (400 + n_bad) * 5 > n_bad * 120  # by the account of all members it could go on
-    tell(rule, 1.0, *[True] * 23)
-    assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (1, VERIFY)
-    tell(rule, 1.0, *[True] * N_RECENT)  # and the newest of the level hold few bad ones again
-    assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (0, ACCEPT)
-
-
 def test_a_doubled_share_of_bad_parts_ends_a_safe_mode_of_the_local_rule_in_at_most_alpha() -> None:
     n_ended = {0.1: 0, 0.2: 0}
     for rate in n_ended:
@@ -204,29 +141,6 @@ def test_prices_that_give_no_tolerance_below_one_half_are_refused(prices: object
         Policy(prices=prices)
 
 
-@pytest.mark.parametrize("kind", [PooledRule, WatchedRule])
-def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts_and_verified_until_fresh_evidence(
-    kind,
-) -> None:
-    rule = kind(0.1, 0.9)
-    tell(rule, 0.95, *[True] * 500)
-    bad = fresh = 0
-    while rule.action(0.95, 1.0) == ACCEPT:
-        tell(rule, 0.95, False)
-        bad += 1
-    assert bad <= 6
-    assert SAFE_MODES[rule.safe_mode()] == "accepted parts failed more often than the tolerance"
-    while rule.safe_mode() != 0:
-        assert rule.action(1.0, 1.0) == VERIFY
-        assert rule.action(0.0, 0.0) == VERIFY
-        tell(rule, 0.95, True)
-        fresh += 1
-    likely = math.log(10) / math.log(0.9 / 0.8)  # by the ratio to twice the tolerance
-    # What was known before the alarm does not count.
-    assert fresh >= (likely if kind is WatchedRule else enough(0.1, 0.1))
-    assert rule.action(0.95, 1.0) == ACCEPT
-
-
 @pytest.mark.parametrize(("alpha", "lower_bound", "soon"), [(0.1, 0.9, 106), (0.05, 0.95, 441)])
 def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever(
     alpha, lower_bound, soon: int
@@ -241,44 +155,6 @@ def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever
         mean.append(n / len(rules))
     assert mean[0] > 0.7 * FALSE_ALARMS / alpha  # of 20; exactly, it is beyond that
     assert mean[1] < soon
-
-
-def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> None:
-    silent, answer = pooled(), pooled()
-    for rule in (silent, answer):
-        tell(rule, 0.95, *[True] * 100)
-    before = {
-        name: value.clone() for name, value in silent.state_dict().items() if "counts" in name
-    }
-    silent.observe(50, False)
-    assert all(torch.equal(silent.state_dict()[name], value) for name, value in before.items())
-    for _ in range(50):
-        answer.observe(1, False)
-    torch.testing.assert_close(
-        silent.evidence.detector_sums[0], answer.evidence.detector_sums[0]
-    )  # fifty at once, or one by one
-    # Every twentieth accepted part stops the system: within the tolerance, though no success is
-    # ever heard of.
-    watched = WatchedRule(0.1, 0.9)
-    for _ in range(30):
-        watched.observe(19, False)
-        watched.update(0.95, 1.0, False)
-    assert watched.safe_mode() == 0
-
-
-def test_too_many_novel_traces_start_safe_mode_and_a_few_do_not() -> None:
-    few, many = pooled(), pooled()
-    for i in range(300):
-        few.observe(0, i % 10 == 0)
-        many.observe(0, i % 2 == 0)
-    assert few.safe_mode() == 0
-    assert SAFE_MODES[many.safe_mode()] == "too many traces were novel"
-    for every in (2, 1000):  # as many as ever, and few
-        assert many.safe_mode() == 3
-        for i in range(1, 300):
-            many.observe(0, i % every == 0)
-            tell(many, 0.95, True)
-    assert many.safe_mode() == 0
 
 
 @pytest.mark.parametrize(

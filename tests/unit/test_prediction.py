@@ -36,41 +36,18 @@ def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_
     data = make_data(120, samples=40)
     model = ModelPrediction("conv", WilsonRadiusClassifier(radius=0.05), 5).fit(data.X, data.y)
     conditions = DecisionConditions(TraceSpec(40))
-    queries = [
-        *data.X[100:, None],
-        *make_data(20, samples=40, seed=9).X[:, None],
-        np.ones((1, 40), np.float32),
-    ]
-    for x in queries:
-        result = trace_gate(*x.shape)(torch.from_numpy(x))
+    queries = [*data.X[100:], *make_data(20, samples=40, seed=9).X, np.ones(40, np.float32)]
+    for x in (query[None] for query in queries):
+        gate = trace_gate(*x.shape)(torch.from_numpy(x))
         for part in (0, 7):
-            (
-                fault,
-                content,
-                action,
-                predicted,
-                reason,
-                lower,
-                upper,
-                n_success,
-                n_failure,
-                z,
-                propensity,
-            ) = model.decide_one(x, part, conditions)
-            assert (fault, content) == result
-            if not fault:  # without a vote on itself
-                embedding = tuple(map(tuple, z.tolist()))
-                text = (
-                    ACTIONS[action],
-                    lower,
-                    upper,
-                    n_success,
-                    n_failure,
-                    embedding,
-                    REASONS[reason],
-                )
-                assert model.predict_one(x, part or content) == text
+            decided = model.decide_one(x, part, conditions)
+            fault, content, action, predicted, reason, *evidence, z, propensity = decided
+            assert (fault, content) == gate
             assert (action, propensity) == (predicted, 0.0 if action else 1.0)
+            if not fault:  # without a vote on itself
+                points = tuple(map(tuple, z.tolist()))
+                text = (ACTIONS[action], *evidence, points, REASONS[reason])
+                assert model.predict_one(x, part or content) == text
 
 
 @pytest.mark.parametrize("folds", [2, 3])

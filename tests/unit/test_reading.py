@@ -24,7 +24,6 @@ from dengine.datasets.description import (
     Clock,
     LabelSource,
     PartSource,
-    RowWords,
     TextForm,
     TraceForm,
 )
@@ -617,20 +616,6 @@ def test_a_listing_names_parts_once_and_is_no_recording(tmp_path: Path) -> None:
     assert words(data.part) == ["0", "1", "4"]
     assert [fault.source for fault in data.faults] == ["part_2_OK.csv", "part_3_OK.csv"]
     assert "1 of 5 rows of part_list.csv name no recording: 9." in data.notes
-
-
-def test_rows_are_kept_or_lost_by_the_words_of_a_column(tmp_path: Path) -> None:
-    written = write(tmp_path, "files text", *some(), PLAIN)
-    for i, path in enumerate(sorted(tmp_path.glob("*.csv"))):
-        head, *lines = path.read_text().splitlines()
-        words = ["bad" if row == 7 else "odd" if (row, i) == (9, 2) else "ok" for row in range(N)]
-        rows = [f"{line},{word}" for line, word in zip(lines, words, strict=True)]
-        other = ["x,OK,lost,1,,off"]
-        path.write_text("\n".join([f"{head},Status", *other, *rows]))
-    about = {"Status": RowWords(keep=("ok",), drop=("off",), invalid=("bad",))}
-    written.X[:, :, 7] = np.nan
-    written = replace(written, description=replace(written.description, rows=about))
-    assert_only_fault(written, [12], "Status")
 
 
 # Descriptions.

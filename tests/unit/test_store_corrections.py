@@ -35,19 +35,6 @@ def correct(store: SqlStore, success: bool | None, *names: str, author: str = "k
     )
 
 
-def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(
-    store: SqlStore,
-) -> None:
-    fill(store)
-    correct(store, False, "0")
-    correct(store, None, "0", "2")
-    assert store.labelled(corrected_to=0).labels.tolist() == [1, 0, 1, 0, 1]
-    assert store.labelled(corrected_to=1).labels.tolist() == [0, 0, 1, 0, 1]
-    assert store.labelled(corrected_to=2).seq.tolist() == [2, 3, 4, 5]
-    assert store.labelled(first=2, last=4).seq.tolist() == [2, 4]
-    assert store.labelled(1, first=2, last=4, corrected_to=0).seq.tolist() == [4]
-
-
 def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: SqlStore) -> None:
     fill(store, 3)
     store.put_event("note", "before")

@@ -416,29 +416,6 @@ def test_attraction_is_the_gradient_of_the_cross_entropy(fitted: UmapReducer) ->
     assert (stiffness > 0.0).all()
 
 
-def test_a_new_trace_lies_where_the_attraction_of_its_neighbours_nearly_balances(
-    insertion: Traces,
-) -> None:
-    X, _ = insertion
-    reducer = UmapReducer().fit(X[:300])
-    encoder = reducer.encoder_
-    frames = encoder.make_frames(torch.from_numpy(X[300:]))
-    distances, nearest = torch.cdist(frames, encoder.references[:300]).topk(15, largest=False)
-    strengths = encoder.strengths(distances)
-    neighbors = reducer.embedding_[nearest]  # (100, 15, 2)
-    a, b = find_ab_params(0.1)
-
-    def net_attraction(point: Tensor) -> Tensor:
-        offsets = neighbors - point[:, None]
-        squared = offsets.square().sum(2) + 1e-3
-        coefficients = strengths * squared ** (b - 1) / (1 + a * squared**b)
-        return (coefficients[:, :, None] * offsets).sum(1).norm(dim=1)
-
-    start = (strengths[:, :, None] * neighbors).sum(1) / strengths.sum(1, keepdim=True)
-    placed = torch.from_numpy(reducer.embed(X[300:])[:, 0])
-    assert net_attraction(placed).mean() < 0.2 * net_attraction(start).mean()
-
-
 def test_repulsion_is_the_gradient_of_the_cross_entropy_of_places_that_are_apart() -> None:
     a, b = find_ab_params(0.1)
     places = torch.zeros(2, 1, requires_grad=True)
