@@ -10,7 +10,6 @@ import pytest
 
 from dengine import DataEngine, Dataset, Description, describe, load_dataset
 from dengine.errors import DataError
-from dengine.experiments.figures import data_picture
 from dengine.experiments.survey import survey_dataset
 from tests.support.command_line import dengine, document, well
 from training.make_recordings import write_plants, write_recordings
@@ -173,12 +172,3 @@ def test_drift_is_seen_where_there_is_some_and_only_there(
     flat = survey_dataset(replace(data, y=np.ones(300, dtype=np.int8))).drift[0]
     assert np.isnan([flat.rho, flat.p]).all()
     assert flat.tenths == (1.0,) * 10
-
-
-@pytest.mark.parametrize(("n", "channels"), [(1, 1), (6, 4), (60, 4)])
-def test_a_picture_is_drawn_of_any_data(
-    make_data: Callable[..., Dataset], n: int, channels: int
-) -> None:
-    data = make_data(n, samples=40, channels=channels)
-    data.X[0, ..., 3] = np.nan
-    assert len(data_picture(data, "x").axes) == min(channels, 3) + 2

@@ -86,29 +86,19 @@ def a_stream(
 def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fields(
     file: Path, many: np.ndarray, repo: Path
 ) -> None:
-    plain, other, exported = (
-        torch.jit.load(str(file)),
-        torch.jit.load(str(file)),
-        load_exported(file),
-    )
+    plain, exported = torch.jit.load(str(file)), load_exported(file)
     for x in many[:40]:
-        called = plain(torch.from_numpy(x))
-        assert str(called) == str(other.decide(torch.from_numpy(x), 0))
+        called, expected = plain(torch.from_numpy(x)), exported.decide(x)
         fields = dict(zip(FIELDS, called, strict=True))
-        expected = exported.decide(x)
-        assert (ACTIONS[fields["action"]], REASONS[fields["reason"]]) == (
-            expected.action,
-            expected.reason,
-        )
-        assert tuple(called[2:6]) == expected[2:6]
+        named = ACTIONS[fields["action"]], REASONS[fields["reason"]]
+        assert (*named, *called[2:6]) == (expected.action, expected.reason, *expected[2:6])
+    assert [name for name in METHODS if not hasattr(plain, name)] == []
     page = (repo / "docs" / "howto" / "controller.md").read_text("utf-8")
     table = page.partition("### By torch alone")[2].partition("\n## ")[0]
     assert [name for name in (*FIELDS, *METHODS) if f"`{name}" not in table] == []
-    assert [name for name in METHODS if not hasattr(plain, name)] == []
-    for expected in (ACTIONS, REASONS):
-        assert ", ".join(f"{i} {item}" for i, item in enumerate(expected)) in " ".join(
-            table.split()
-        )
+    for names in (ACTIONS, REASONS):
+        numbered = ", ".join(f"{i} {name}" for i, name in enumerate(names))
+        assert numbered in " ".join(table.split())
 
 
 @pytest.mark.parametrize(
@@ -259,25 +249,26 @@ def test_the_file_says_what_it_is_without_being_loaded(
 ) -> None:
     monkeypatch.setattr(torch.jit, "load", lambda *a, **k: pytest.fail("the code was loaded"))
     metadata = read_metadata(file)
-    assert metadata["schema"] == 2
-    assert (metadata["guarantee"], metadata["stops"], metadata["novelty"]) == (
-        "local",
-        "some",
-        audited.recipe.novelty,
-    )
-    assert metadata["safe_modes"] == list(SAFE_MODES)
-    assert metadata["trace"] == asdict(TraceSpec(SAMPLES, 500.0, limit=LIMIT)) | {"columns": []}
-    assert (metadata["alpha"], metadata["lower_bound"], metadata["audit_rate"]) == (0.1, 0.9, 0.3)
-    assert metadata["model_version"] == audited.version
-    assert metadata["references"] == len(audited.model.index)
+    expected = {
+        "schema": 2,
+        "guarantee": "local",
+        "stops": "some",
+        "novelty": audited.recipe.novelty,
+        "safe_modes": list(SAFE_MODES),
+        "trace": asdict(TraceSpec(SAMPLES, 500.0, limit=LIMIT)) | {"columns": []},
+        "alpha": 0.1,
+        "lower_bound": 0.9,
+        "audit_rate": 0.3,
+        "model_version": audited.version,
+        "references": len(audited.model.index),
+        "torch": torch.__version__,
+    }
+    assert {name: metadata[name] for name in expected} == expected
     assert Recipe.from_toml(metadata["recipe"]) == audited.recipe
-    assert metadata["torch"] == torch.__version__
     assert len(metadata["references_sha256"]) == 64
     assert set(metadata) >= {"dengine", "created", "golden", "fields"}
-    content = file.with_name("model.ts.sha256").read_text()
-    assert (
-        content == f"{hashlib.sha256(file.read_bytes()).hexdigest()}  model.ts\n"
-    )  # as sha256sum reads it
+    digest = hashlib.sha256(file.read_bytes()).hexdigest()  # as sha256sum reads it
+    assert file.with_name("model.ts.sha256").read_text() == f"{digest}  model.ts\n"
 
 
 def test_loading_unpickles_nothing_in_python(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

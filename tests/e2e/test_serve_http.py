@@ -254,6 +254,15 @@ def test_a_part_that_comes_back_is_named_by_its_number_unless_it_has_several_dec
             must_be_problem(client.post(f"/{path}", json=asked | both), 422)
 
 
+CHANGES = [
+    ("correct", {"id": "wrong-0", "success": False}),
+    ("forget", {"ids": ["wrong-1", "wrong-2"], "reason": "a dirty sensor"}),
+    ("policy", {"alpha": 0.2, "audit_rate": 0.1}),
+    ("policy", {"windows": ["-100:100:-5::along=0"]}),
+    ("policy", {"shadow": True}),
+]
+
+
 def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
     stream: Dataset,
 ) -> None:
@@ -261,34 +270,20 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
         for i in range(3):
             client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"wrong-{i}"})
             client.post("/report", json={"id": f"wrong-{i}", "success": True})
-        for path, asked in (
-            ("correct", {"id": "wrong-0", "success": False}),
-            ("forget", {"ids": ["wrong-1", "wrong-2"], "reason": "a dirty sensor"}),
-            ("policy", {"alpha": 0.2, "audit_rate": 0.1}),
-            ("policy", {"windows": ["-100:100:-5::along=0"]}),
-            ("policy", {"shadow": True}),
-        ):
+        for path, asked in CHANGES:
             changed = client.post(f"/{path}", json=asked | {"author": " Kim  Lee "}).json()
             validate(changed, "Changed", client)
             assert changed["event"] is not None
-            assert (
-                client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()["event"] is None
-            )
+            again = client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()
+            assert again["event"] is None
         events = client.get("/events").json()["events"]
-        assert [event["kind"] for event in events] == [
-            "shadow",
-            "policy",
-            "policy",
-            "forget",
-            "correct",
+        kinds = ["shadow", "policy", "policy", "forget", "correct"]
+        assert [(item["kind"], item["author"]) for item in events] == [
+            (kind, "Kim Lee") for kind in kinds
         ]
-        assert {event["author"] for event in events} == {"Kim Lee"}
         assert (service.engine.policy.alpha, service.engine.policy.shadow) == (0.2, True)
-        assert [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)] == [
-            False,
-            None,
-            None,
-        ]
+        labels = [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)]
+        assert labels == [False, None, None]
 
 
 NOT_PUT_RIGHT = [

@@ -77,28 +77,19 @@ def call(name: str, *arguments: object) -> bytes:
 
 
 def test_a_cell_over_xml_rpc_learns_and_accepts(cell: Cell, stream: Dataset) -> None:
-    robot = cell.robot()
-    answers = [
-        robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(stream.X[50:90])
-    ]
-    assert (
-        robot.decide(stream.X[50].tolist(), "order-0", "P0") == answers[0]
-    )  # asked again, the same answer
+    robot, traces = cell.robot(), stream.X[50:90]
+    answers = [robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(traces)]
+    assert robot.decide(traces[0].tolist(), "order-0", "P0") == answers[0]  # asked again
     with pytest.raises(xmlrpc.client.Fault, match="got another"):
         robot.decide(stream.X[1].tolist(), "order-0", "P0")
     assert cell.service.engine.version >= 1
     assert ACCEPT in {answer["action"] for answer in answers}
     for i, answer in enumerate(answers):
-        assert (answer["id"], type(answer["action"]), type(answer["lower"])) == (
-            f"order-{i}",
-            int,
-            float,
-        )
+        types = type(answer["action"]), type(answer["lower"])
+        assert (answer["id"], *types) == (f"order-{i}", int, float)
         match = cell.find(f"order-{i}")
-        assert (match.decision.part, np.array_equal(match.trace[0], stream.X[50 + i])) == (
-            f"P{i}",
-            True,
-        )
+        assert match.decision.part == f"P{i}"
+        assert np.array_equal(match.trace[0], traces[i])
 
 
 def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> None:

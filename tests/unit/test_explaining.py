@@ -203,26 +203,6 @@ def test_each_reason_is_explained_by_what_it_rests_on(
     assert 0.0 <= float(coin) < 0.1
 
 
-def test_times_are_in_samples_and_values_have_no_unit_while_these_are_unknown(
-    make_data: Callable[..., Dataset],
-) -> None:
-    with played(
-        None, make_data(40, 60), RECIPES["local"], trace=TraceSpec(60, limit=200.0)
-    ) as engine:
-        x = make_data(1, 60).X[0]
-        loud, dead, huge, high = x.copy(), np.full_like(x, 4.0), x.copy(), x.copy()
-        loud[30], huge[5], high[20:25] = 200.0, 1e30, 150.0
-        saturated, constant, _, outside = (
-            engine.explain(engine.decide(trace).id) for trace in (loud, dead, huge, high)
-        )
-    assert "touch the sensor's range of 200, first after 30 samples (channel 1)" in said_of(
-        saturated
-    )
-    assert "every sample is 4: a dead sensor" in said_of(constant)
-    excess = outside.envelope.excesses[0]
-    assert (excess.first, excess.last, excess.from_s, excess.to_s) == (20, 24, None, None)
-
-
 @pytest.mark.parametrize("size", [3.4e38, 1e18, 1e-30, 1e-45, np.nan, np.inf])
 def test_a_trace_of_any_numbers_is_explained_as_json_has_it(size: float, make_data) -> None:
     x = make_data(1, 60).X[0]

@@ -36,23 +36,14 @@ def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_
     kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
     task = Task(who, seed=1, cycles=60)
     asked = [who.with_policy(alpha=0.2), replace(RECIPE, radius=0.4), PCA(2), PCA(2, whiten=True)]
-    asked += [
-        FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))
-    ]
-    asked += [FunctionTransformer(np.abs), "knn", replace(Contender.load("knn"), params={"k": 3})]
-    others = [
-        replace(task, **change)
-        for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})
-    ]
-    others += [replace(task, contender=Contender.load(first)) for first in asked]
+    asked += [FunctionTransformer(np.add, kw_args={"x2": np.full(3, i)}) for i in range(2)]
+    asked += ["knn", replace(Contender.load("knn"), params={"k": 3})]
+    others = [replace(task, contender=Contender.load(item)) for item in asked]
+    changes = ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})
+    others += [replace(task, **change) for change in changes]
     flipped = KeptReplays(tmp_path, replace(data, y=1 - data.y)).path(task)
     assert len({flipped, *(kept.path(item) for item in [task, *others])}) == 2 + len(others)
     assert kept.path(replace(task, contender=replace(who, name="mine"))) == kept.path(task)
-    alike = [
-        Task(Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))), 0)
-        for _ in range(2)
-    ]
-    assert kept.path(alike[0]) == kept.path(alike[1])
     with pytest.raises(SettingError, match="define it in a module"):
         kept.path(Task(Contender.load(FunctionTransformer(lambda x: x)), 0))
 

@@ -433,17 +433,6 @@ def test_a_cut_file_is_a_fault(tmp_path: Path, kind: str, keep: float) -> None:
     assert_only_fault(written)
 
 
-def test_units_are_converted_and_one_that_cannot_be_is_a_fault(tmp_path: Path) -> None:
-    written = write(tmp_path, "files text", *some(), GERMAN)
-    channels = (Channel("FZ", "N"), Channel("Weg ü", "mm"))
-    written = replace(written, description=replace(written.description, channels=channels))
-    for i, path in enumerate(sorted(tmp_path.glob("*.csv"))):
-        units = "s;-;kN;mm" if i == 1 else "s;-;N;V" if i == BAD_PART else "s;-;N;mm"
-        path.write_text(path.read_text().replace("-;-;-;-", units))
-    written.X[1, 0] *= 1000
-    assert_only_fault(written, [3], "Weg ü")
-
-
 def test_a_file_that_changes_while_it_is_read_is_a_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -619,15 +608,6 @@ def test_a_listing_names_parts_once_and_is_no_recording(tmp_path: Path) -> None:
 
 
 # Descriptions.
-
-
-def test_a_label_in_a_column_is_counted_over_the_files_that_were_looked_at(tmp_path: Path) -> None:
-    for i in range(150):
-        rows = "".join(f"{k * 0.004:.3f},{k + i},{WORDS[i % 2]}\n" for k in range(8))
-        (tmp_path / f"part_{i}.csv").write_text(f"time,FZ,verdict\n{rows}")
-    proposal = describe(tmp_path)
-    assert (proposal.open_keys, proposal.label.column) == ((), "verdict")
-    assert proposal.notes["label.column"] == "NOK: 75, OK: 30, over 105 recordings"
 
 
 @pytest.mark.parametrize("rate", [3.0, 700.0])

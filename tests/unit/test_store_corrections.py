@@ -122,36 +122,6 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
     ) == (1, 0, 1, 0)
 
 
-def test_what_an_earlier_version_decided_can_be_left_out(store: SqlStore) -> None:
-    for version in (1, 2):
-        for i in range(3):
-            name = f"{version}-{i}"
-            accept = Decision(
-                name,
-                Action.ACCEPT,
-                Action.ACCEPT,
-                0.9,
-                1.0,
-                9,
-                0,
-                None,
-                version,
-                Reason.CERTAIN,
-                False,
-                0.1,
-            )
-            put_decision(store, accept, trace(i), i, False)
-        put_labels(
-            store, NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version)
-        )
-    assert store.unreported_accepts(2) == ["2-1", "2-2"]
-    assert (store.silent_total(2), store.silent_total()) == (2, 3)
-    assert ([item.seq for item in store.outcomes_since(0, 2)], len(store.outcomes_since(0))) == (
-        [2],
-        2,
-    )
-
-
 @settings(
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -290,15 +290,6 @@ def test_both_exports_decide_as_the_model_does(
         np.testing.assert_allclose(results, places, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("n_components", [1, 2, 3])
-def test_the_embedding_has_as_many_components_as_asked(n_components: int) -> None:
-    X, _ = toy_traces(120)
-    reducer = UmapReducer(n_components=n_components).fit(X)
-    assert reducer.embedding_.shape == reducer.transform(X).shape == (120, n_components)
-    assert reducer.module().dim == n_components
-    assert trustworthiness(X[:, 0], reducer.embedding_.numpy(), n_neighbors=15) > 0.8
-
-
 @pytest.mark.parametrize(
     ("params", "message"),
     [
