@@ -8,6 +8,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
@@ -62,11 +63,10 @@ def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_ve
 def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(
     tmp_path: Path, data: Dataset
 ) -> None:
-    acknowledged: list[str] = []
-    ended = threading.Event()
+    store, acknowledged, ended = tmp_path / "engine.db", list[str](), threading.Event()
 
     def work() -> None:
-        with DataEngine("pca", retrain_every=10**6, store=str(tmp_path / "engine.db")) as engine:
+        with DataEngine("pca", retrain_every=10**6, store=str(store)) as engine:
             for i in itertools.count():
                 decision = engine.decide(data.X[i % len(data)] + np.float32(1e-6 * i))
                 engine.report(decision.id, bool(data.y[i % len(data)]))
@@ -74,22 +74,24 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
                 if ended.is_set():
                     return
 
-    worker = threading.Thread(target=work)
-    worker.start()
-    try:
-        for n in range(1, 5):
-            while len(acknowledged) < 20 * n and worker.is_alive():
-                time.sleep(0.01)
-            before = set(acknowledged)
-            assert len(before) >= 20 * n
-            backup_store(tmp_path / "engine.db", tmp_path / f"{n}.db")
-            assert verify_history(str(tmp_path / f"{n}.db")).ok
-            with SqlStore(str(tmp_path / f"{n}.db")) as store:
-                assert before <= {label.decision_id for label in store.past_labels(0)}
-                assert not [event for event in store.events() if event.kind == "dead letter"]
-    finally:
-        ended.set()
-        worker.join()
+    with ThreadPoolExecutor(1) as pool:
+        working = pool.submit(work)
+        try:
+            for n in range(1, 5):
+                while len(acknowledged) < 20 * n and working.running():
+                    time.sleep(0.01)
+                before, copy = set(acknowledged), str(tmp_path / f"{n}.db")
+                backup_store(store, copy)
+                assert verify_history(copy).ok
+                with SqlStore(copy) as copied:
+                    labels = {label.decision_id for label in copied.past_labels(0)}
+                    kinds = [event.kind for event in copied.events()]
+                assert len(before) >= 20 * n
+                assert before <= labels
+                assert "dead letter" not in kinds
+        finally:
+            ended.set()
+        working.result()
 
 
 def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(

@@ -74,30 +74,24 @@ def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None
 
 
 def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> None:
+    x = make_data(1).X[0]
     with DataEngine.open(store) as engine:
-        engine.decide(np.roll(make_data(1).X[0], 7), "P-7")
+        engine.decide(np.roll(x, 7), "P-7")
         engine.set_policy(replace(engine.policy, windows=("0:0:1000::reject",)))
-        engine.decide(np.roll(make_data(1).X[0], 9), "P-8")
-        assert (
-            "or its HTTP where it is served" in dengine("report", store, "P-7", "bad").stderr
-        )  # while it runs
-    assert line_of("report", store, "P-8", "good", "--author", "kim").endswith(
-        " was good. Event 2, by kim."
-    )
+        engine.decide(np.roll(x, 9), "P-8")
+        while_it_runs = dengine("report", store, "P-7", "bad").stderr
+        assert "or its HTTP where it is served" in while_it_runs
+    for part, label, event in (("P-8", "good", 2), ("P-7", "bad", 3)):
+        line = line_of("report", store, part, label, "--author", "kim")
+        assert line.endswith(f" was {label}. Event {event}, by kim.")
     (reject,) = document("history", store, "--part", "P-8")["decisions"]
     assert (reject["action"], reject["label"], reject["source"]) == ("reject", "good", "inspection")
     assert "good inspection" in line_of("history", store, "--part", "P-8")
-    assert "inspection 1" in " ".join(line_of("status", store).split())
+    assert "inspection 1" in line_of("status", store)
     assert "failure" in line_of("correct", store, "P-8", "bad", "--author", "kim")
     assert document("explain", store, "P-8")["decision"]["id"] == reject["id"]
-    assert "'P-9', which is unknown" in dengine("correct", store, "P-9", "good").stderr
-    assert "'P-9', which is unknown" in dengine("explain", store, "P-9").stderr
-    assert "'P-9', which is unknown" in dengine("report", store, "P-9", "good").stderr
-    assert line_of("report", store, "P-7", "bad", "--author", "kim").endswith(
-        " was bad. Event 4, by kim."
-    )
-    (result,) = document("history", store, "--part", "P-7")["decisions"]
-    assert (result["part"], result["label"]) == ("P-7", "bad")
+    for words in (["correct", "P-9", "good"], ["explain", "P-9"], ["report", "P-9", "good"]):
+        assert "'P-9', which is unknown" in dengine(words[0], store, *words[1:]).stderr
 
 
 def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Path) -> None:
@@ -136,45 +130,31 @@ def test_an_earlier_version_answers_again(store: Path) -> None:
 def test_a_policy_is_changed_in_what_is_given_and_stays(
     store: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    result = document(
-        "policy", store, "--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1
-    )
-    assert (
-        result["policy"]
-        == document("policy", store, "--alpha", 0.2)["policy"]
-        == document("policy", store)["policy"]
-    )
+    def policy(*words: object) -> str:
+        return line_of("policy", store, *words)
+
+    policy("--alpha", 0.2, "--lower-bound", 0.8, "--stops", "all", "--audit-rate", 0.1)
     with DataEngine.open(store) as engine:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
-    assert "alpha 0.2, lower bound 0.8" in line_of("status", store)
-    assert "windows none -> 0.05:0.1:-5:60:reject. Event" in line_of(
-        "policy", store, "--window", "0.05:0.1:-5:60:reject"
-    )
+    assert "nothing changed" in policy("--alpha", 0.2)
+    shown = policy()
+    assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
+    limits = "0.05:0.1:-5:60:reject"
+    assert f"windows none -> {limits}. Event" in policy("--window", limits)
     assert document("policy", store, "--window", "")["policy"]["windows"] == []
     wrong = dengine("policy", store, "--window", "0.05:0.1:-5::channel=4")
-    assert "got '0.05:0.1:-5::channel=4'" in " ".join(
-        wrong.stderr.split()
-    )  # and not as an option of the command
-    shown = line_of("policy", store)
-    assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
-    assert "interval wilson -> jeffreys. Event 4, by" in line_of(
-        "policy", store, "--interval", "jeffreys"
-    )
-    assert line_of("policy", store, "--shadow", "on", "--author", "kim").startswith(
-        "Shadow mode: every part is verified"
-    )
-    assert document("status", store)["shadow"] is True
-    assert "already" in line_of("policy", store, "--shadow", "on")
+    assert "got '0.05:0.1:-5::channel=4'" in " ".join(wrong.stderr.split())
+    assert "interval wilson -> jeffreys. Event 4, by" in policy("--interval", "jeffreys")
+    assert policy("--shadow", "on", "--author", "kim").startswith("Shadow mode: every part")
+    assert "already" in policy("--shadow", "on")
     rule = "from dengine.decision.rule import DecisionRule\n\nclass Mine(DecisionRule): ...\n"
     (tmp_path / "own_rule.py").write_text(rule)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
-    assert "guarantee local -> own_rule:Mine" in line_of(
-        "policy", store, "--guarantee", "own_rule:Mine", "--shadow", "off"
-    )
-    result = document("status", store)
-    assert (result["shadow"], result["recipe"]["policy"]["guarantee"]) == (False, "own_rule:Mine")
+    text = policy("--guarantee", "own_rule:Mine", "--shadow", "off")
+    assert "guarantee local -> own_rule:Mine" in text
+    assert document("status", store)["shadow"] is False
 
 
 @pytest.mark.parametrize(

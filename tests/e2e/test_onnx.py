@@ -4,15 +4,12 @@ not be used.
 
 import hashlib
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-
-onnx = pytest.importorskip("onnx")
-pytest.importorskip("onnxruntime")
-pytest.importorskip("onnxscript")
 
 from dengine import (
     Dataset,
@@ -21,13 +18,15 @@ from dengine import (
     TraceSpec,
     export_torchscript,
     load_exported,
-)  # after the skips
+)
 from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError, TraceError
 from dengine.export import export_onnx, load_onnx
 from dengine.records import Action, Reason
 from tests.support.exports import fitted, trained
 
+NEEDED = ("onnx", "onnxruntime", "onnxscript")
+pytestmark = pytest.mark.skipif(not all(map(find_spec, NEEDED)), reason=f"needs {NEEDED}")
 SPEC = TraceSpec(100, limit=500.0)
 BALLS: list[dict[str, Any]] = [{}, {"interval": "binomial", "radius": 0.5}]
 

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,7 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Decision, Policy, TraceSpec, load_exported
-from dengine.recipe import Recipe
+from dengine import Action, DataEngine, Dataset, Decision, TraceSpec, load_exported
 from dengine.store.records import KEEP
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
@@ -169,15 +168,6 @@ def test_a_decision_appears_and_the_next_one_takes_its_place(page: Page, demo: D
 
 
 @pytest.mark.slow
-def test_a_part_on_the_map_is_clicked_and_shows_its_trace(page: Page, demo: DemoCell) -> None:
-    with_a_model(page, demo)
-    page.locator("a.mark.newest").click()  # the newest is drawn last, and hit by the mouse
-    expect(page.locator("#part-title")).to_be_focused(timeout=PATIENT)
-    expect(page.locator("#part .chart canvas")).to_be_visible()
-    expect(page.locator("#part .story li").first).to_be_visible()
-
-
-@pytest.mark.slow
 def test_the_map_is_gone_over_by_the_keyboard_alone(page: Page, demo: DemoCell) -> None:
     with_a_model(page, demo)
     page.locator(".skip").focus()
@@ -273,6 +263,13 @@ def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(
 def test_a_dialog_offers_what_there_is_now_and_not_when_the_page_was_opened(
     browser: Browser, tmp_path: Path, stream: Dataset
 ) -> None:
+    def offered() -> list[str | None]:
+        page.get_by_role("button", name="Roll back").click()
+        choices = page.get_by_label("Version").locator("option").all()
+        values = [choice.get_attribute("value") for choice in choices]
+        page.get_by_role("button", name="Cancel").click()
+        return values
+
     file = tmp_path / "cell.db"
     with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
         played(service, stream, 40)
@@ -281,29 +278,15 @@ def test_a_dialog_offers_what_there_is_now_and_not_when_the_page_was_opened(
         expect(page.get_by_role("button", name="Roll back")).to_be_enabled()
         for _ in range(2 * KEEP):  # those that were there at first are kept no longer
             service.submit(DataEngine.retrain).result()
-        policy = replace(service.engine.policy, audit_rate=0.25)
-        service.submit(lambda engine: engine.set_policy(policy, "Kim")).result()
         versions = service.submit(lambda engine: engine.store.versions()).result()
-        offered = [str(version.report.version) for version in versions if version.kept][-2::-1]
-        rate = page.get_by_label("Share of certain parts")
-        choices = page.get_by_label("Version").locator("option")
-
-        def values_offered() -> tuple[str, list[str | None]]:
-            page.get_by_role("button", name="Change the policy").click()
-            share = rate.input_value()
-            page.get_by_role("button", name="Cancel").click()
-            page.get_by_role("button", name="Roll back").click()
-            versions = [choice.get_attribute("value") for choice in choices.all()]
-            page.get_by_role("button", name="Cancel").click()
-            return share, versions
-
+        kept = [str(version.report.version) for version in versions if version.kept][-2::-1]
         for _ in range(100):  # the page follows within a moment
-            if values_offered() == ("0.25", offered):
+            if offered() == kept:
                 break
             page.wait_for_timeout(100)
-        assert values_offered() == ("0.25", offered)
+        assert offered() == kept
         confirmed(page, "Roll back", "Robin")
-        expect(page.locator("#result")).to_contain_text(f"Version {offered[0]} answers again")
+        expect(page.locator("#result")).to_contain_text(f"Version {kept[0]} answers again")
 
 
 TOKEN = "correct-horse-battery-staple"
@@ -428,77 +411,6 @@ def test_dark_is_dark_and_programs_find_the_document(page: Page, demo: DemoCell)
     page.get_by_role("link", name="for programs").click()
     for text in ("POST /decide", "GET /explanations/{id}", "PolicyRequest"):
         expect(page.locator("main").get_by_text(text, exact=True).first).to_be_visible()
-
-
-@pytest.mark.slow
-def test_a_safe_mode_that_the_engine_enters_is_shown_and_ends_when_what_was_wrong_is_put_right(
-    browser: Browser, tmp_path: Path, stream: Dataset
-) -> None:
-    recipe = Recipe(
-        "pca", radius=0.5, retrain_every=40, policy=Policy(alpha=0.1, lower_bound=0.9, stops="all")
-    )
-    file = tmp_path / "cell.db"
-    with (
-        a_service(file, recipe) as service,
-        served(create_app(service)) as port,
-        looking(browser, **PHONE) as page,
-    ):
-        demo = DemoCell(f"http://127.0.0.1:{port}", file)
-        opened(page, demo)
-        last = played(service, stream, len(stream), 120).id  # while somebody looks on
-        expect(page.locator("#mode")).to_contain_text("Safe mode", timeout=PATIENT)
-        expect(page.locator("#banner")).to_contain_text(
-            "(accepted parts failed more often than the tolerance)"
-        )
-        for view in VIEWS:
-            opened(page, demo, view)
-            expect(page.locator("#mode")).to_contain_text("Safe mode")
-            expect(page.locator("#banner")).to_contain_text("every part is verified")
-            must_suit_a_phone(page, view)
-        opened(page, demo, f"part?id={last}")
-        confirmed(page, "It was good", "Kim")
-        expect(page.locator("#banner")).to_be_empty(timeout=PATIENT)
-        expect(page.locator("#mode")).to_contain_text("Decides")
-    with demo.store() as store:
-        answers = [(event.kind, event.author, event.text) for event in store.events(3)]
-    assert [item[:2] for item in answers] == [
-        ("safe mode", ""),
-        ("correct", "Kim"),
-        ("safe mode ended", ""),
-    ]
-    assert answers[0][2] == "accepted parts failed more often than the tolerance"
-    assert last in answers[1][2]
-    assert answers[2][2] == "the corrected outcomes keep the tolerance"
-
-
-def test_what_is_said_of_several_channels_is_said_by_their_names(
-    browser: Browser, tmp_path: Path, stream: Dataset
-) -> None:
-    file = tmp_path / "cell.db"
-    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
-        played(
-            service,
-            Dataset(np.stack([stream.X, 0 * stream.X + stream.X[:1]], axis=1), stream.y),
-            40,
-        )
-        opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
-        caption = page.locator("#trace figcaption").nth(1)
-        expect(caption).to_contain_text(
-            re.compile(r"Channel 2 over .*of all channels lies outside the band")
-        )
-
-
-def test_the_axis_is_in_samples_and_no_unit_is_shown_while_these_are_unknown(
-    browser: Browser, tmp_path: Path, stream: Dataset
-) -> None:
-    file = tmp_path / "cell.db"
-    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
-        played(service, stream, 40)
-        opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
-        caption = page.locator("#trace figcaption")
-        expect(caption).to_contain_text(
-            re.compile(rf"Trace over {stream.X.shape[-1]} samples, from [−\d.]+ to [\d.]+\. ")
-        )
 
 
 def test_each_channel_is_drawn_in_its_own_unit_and_is_no_force_for_being_drawn(

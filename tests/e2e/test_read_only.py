@@ -5,11 +5,10 @@ is refused.
 import json
 import os
 import shutil
-import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -123,27 +122,11 @@ def content(store: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in files}
 
 
-DAMAGED = "a locked copy with a damaged label"
-
-
-@contextmanager
-def damaged(stores: dict[str, Path], place: Path) -> Iterator[Path]:
-    """A copy, one of whose labels was changed before it was locked until the end of the block."""
-    folder = place / "damaged"
-    shutil.copytree(stores["closed"], folder)
-    with closing(sqlite3.connect(folder / "engine.db")) as connection, connection:
-        connection.execute("UPDATE label SET silent = 5 WHERE seq = 20")
-    (folder / "engine.db").chmod(0o444)
-    folder.chmod(0o555)
-    yield folder / "engine.db"
-    folder.chmod(0o755)
-
-
 @pytest.fixture(scope="module")
 def read(stores: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Reading]:
-    """What verbs printed of each locked copy, and of a damaged one; one process runs them all."""
+    """What verbs printed of each locked copy; one process runs them all."""
     place = tmp_path_factory.mktemp("read")
-    with damaged(stores, place) as broken, archived(stores, place) as copies:
+    with archived(stores, place) as copies:
         before = {name: content(store) for name, store in copies.items()}
         commands = [
             command
@@ -159,9 +142,8 @@ def read(stores: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> d
                 ("policy", store, "--alpha", "0.2"),
             )
         ]
-        first, *others = dengine(("explain", broken, "last", "--json"), *commands)
-        results = iter(others)
-        return {DAMAGED: Reading([first], {}, {})} | {
+        results = iter(dengine(*commands))
+        return {
             name: Reading(list(islice(results, 8)), before[name], content(store))
             for name, store in copies.items()
         }
@@ -221,8 +203,3 @@ def test_a_write_to_it_is_refused_or_kept_and_never_lost(
     name: str, written: dict[str, str]
 ) -> None:
     assert written[name] == "1" or "writable" in written[name]
-
-
-def test_a_damaged_label_in_it_is_left_out_as_it_is_read(read: dict[str, Reading]) -> None:
-    (explained,) = read[DAMAGED].results
-    assert explained["exit_code"] == 0, explained

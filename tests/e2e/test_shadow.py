@@ -3,13 +3,12 @@
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Source
+from dengine import Action, DataEngine, Dataset
 from dengine.errors import ReportError
 from dengine.store.outbox import BloomFilter
 from tests.support.driving import RECIPE, drive
@@ -66,29 +65,3 @@ def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_onc
             again = engine.decide(x, decision_id=id_)
             assert (again.id, again.action, again.reason) == (id_, action, reason)
         assert engine.store.status()["decisions"] == 20
-
-
-def test_the_shadow_lasts_over_a_restart_and_its_end_brings_the_audit_rate_back(
-    stream: Dataset, tmp_path: Path
-) -> None:
-    recipe = replace(RECIPE, policy=replace(RECIPE.policy, audit_rate=0.05))
-    with DataEngine(recipe=recipe, store=tmp_path / "engine.db") as engine:
-        drive(engine, stream, 0, 200)
-        engine.set_shadow(True)
-        assert engine.set_shadow(True).event is None
-    with DataEngine.open_or_create(
-        tmp_path / "engine.db", recipe=recipe
-    ) as engine:  # the program's own settings
-        assert engine.policy.shadow
-        engine.set_policy(replace(engine.policy, lower_bound=0.8))
-        cycles = drive(engine, stream, 200, 240)
-        would = [cycle for cycle in cycles if cycle.decision.predicted is not Action.VERIFY]
-        assert {cycle.decision.action for cycle in cycles} == {Action.VERIFY}
-        assert {(cycle.source, cycle.decision.propensity) for cycle in would} == {
-            (Source.AUDIT, 1.0)
-        }
-        engine.set_shadow(False, "kim")
-        assert engine.policy == replace(recipe.policy, lower_bound=0.8)
-        assert Action.ACCEPT in {cycle.decision.action for cycle in drive(engine, stream, 240, 400)}
-    with DataEngine.open(tmp_path / "engine.db") as engine:
-        assert not engine.policy.shadow

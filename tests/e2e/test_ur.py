@@ -29,7 +29,6 @@ from dengine.cells.ur.cell import (
 )
 from dengine.cells.ur.protocol import (
     CHANNELS,
-    TYPES,
     Package,
     PackageReader,
     PackageType,
@@ -70,15 +69,6 @@ def test_packages_come_whole_from_pieces_of_any_size() -> None:
         stream, packages = b"".join(item.to_bytes() for item in sent), PackageReader()
         pieces = [stream[i : i + size] for i in range(0, len(stream), size)]
         assert [result for piece in pieces for result in packages.feed(piece)] == sent
-
-
-@pytest.mark.parametrize("kind", TYPES)
-def test_every_type_of_the_guide_is_packed_and_unpacked(kind: str) -> None:
-    recipe = RtdeRecipe(3, ("a", "b"), ("DOUBLE", kind))
-    values = dict(zip(recipe.columns, (0.5, *range(1, TYPES[kind][1] + 1)), strict=True))
-    assert recipe.unpack(recipe.pack(values)[3:]) == values
-    with pytest.raises(CellError, match="Expected a data package"):
-        recipe.unpack(recipe.pack(values)[3:-1])
 
 
 def test_a_data_package_is_bytes_as_the_guide_says() -> None:

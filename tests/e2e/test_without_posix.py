@@ -7,10 +7,8 @@ Python's own.
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +18,9 @@ pytest.importorskip("uvicorn", reason='the server is not installed: pip install 
 
 from sqlalchemy import make_url
 
-from dengine import DataEngine, Recipe
 from dengine.store import journal
 from dengine.store.journal import journal_path
-from tests.support.serving import REPO, WAIT, started
+from tests.support.serving import REPO, WAIT
 
 HIDING = f"{REPO / 'tests' / 'support' / 'without_posix'}{os.pathsep}{REPO}"
 EVERY_MODULE = """
@@ -149,31 +146,6 @@ def test_a_tokens_file_is_read_whose_bits_say_nothing_of_who_may_read_it(tmp_pat
     assert "1 token" in python(
         "-c", f"{text}print(len(read_tokens(Path(sys.argv[1]))), 'token')", tmp_path / "token"
     )
-
-
-def test_a_served_cell_retrains_in_a_process_and_ends_in_order(tmp_path: Path, make_data) -> None:
-    data = make_data(80, samples=80)
-    recipe = Recipe("pca", retrain_every=30)
-    (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    words = "--no-page", "--recipe", "recipe.toml", "--rate", "0"
-    with started(tmp_path, *words, python_path=HIDING) as process:
-        for x, good in zip(data.X, data.y, strict=True):
-            answer = process.ask("/decide", {"trace": x.tolist()})
-            if answer["action"] == "verify":
-                process.ask("/report", {"id": answer["id"], "success": bool(good)})
-        end = time.monotonic() + WAIT
-        while not process.ask("/status")["version"]:
-            assert time.monotonic() < end, "no retrain came"
-            time.sleep(0.05)
-        labels = process.ask("/status")["labels"]
-        backup = python(
-            "-m", "dengine", "backup", tmp_path / "cell.db", "--out", tmp_path / "copy.db", "--json"
-        )
-        assert process.end(signal.SIGINT) == 0
-    assert "Traceback" not in process.output
-    assert '"decisions": 80' in backup
-    with DataEngine.open(tmp_path / "cell.db") as engine:
-        assert engine.status().labels == labels
 
 
 def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:

@@ -77,60 +77,43 @@ def call(name: str, *arguments: object) -> bytes:
 
 
 def test_a_cell_over_xml_rpc_learns_and_accepts(cell: Cell, stream: Dataset) -> None:
-    robot = cell.robot()
-    answers = [
-        robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(stream.X[50:90])
-    ]
-    assert (
-        robot.decide(stream.X[50].tolist(), "order-0", "P0") == answers[0]
-    )  # asked again, the same answer
+    robot, traces = cell.robot(), stream.X[50:90]
+    answers = [robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(traces)]
+    assert robot.decide(traces[0].tolist(), "order-0", "P0") == answers[0]  # asked again
     with pytest.raises(xmlrpc.client.Fault, match="got another"):
         robot.decide(stream.X[1].tolist(), "order-0", "P0")
     assert cell.service.engine.version >= 1
     assert ACCEPT in {answer["action"] for answer in answers}
     for i, answer in enumerate(answers):
-        assert (answer["id"], type(answer["action"]), type(answer["lower"])) == (
-            f"order-{i}",
-            int,
-            float,
-        )
+        types = type(answer["action"]), type(answer["lower"])
+        assert (answer["id"], *types) == (f"order-{i}", int, float)
         match = cell.find(f"order-{i}")
-        assert (match.decision.part, np.array_equal(match.trace[0], stream.X[50 + i])) == (
-            f"P{i}",
-            True,
-        )
+        assert match.decision.part == f"P{i}"
+        assert np.array_equal(match.trace[0], traces[i])
 
 
 def test_a_trace_in_pieces_is_the_same_trace(cell: Cell, stream: Dataset) -> None:
-    robot = cell.robot()
+    robot, x = cell.robot(), stream.X[1]
     id_ = robot.begin()
-    pieces = (
-        stream.X[1][:25].tolist(),
-        stream.X[1][25:50].astype("<f4").tobytes(),
-        stream.X[1][50:].tolist(),
-    )
+    pieces = x[:25].tolist(), x[25:50].astype("<f4").tobytes(), x[50:].tolist()
     assert [robot.add(id_, piece) for piece in pieces] == [25, 50, 60]
-    assert robot.decide(stream.X[1].astype("<f4").tobytes(), "whole", "P8")["id"] == "whole"
-    assert np.array_equal(cell.find("whole").trace[0], stream.X[1])
+    assert robot.decide(x.astype("<f4").tobytes(), "whole", "P8")["id"] == "whole"
     answer = robot.decide_added(id_, 7)
-    assert (answer["id"], robot.decide_added(id_, 7), robot.action_added(id_)) == (
-        id_,
-        answer,
-        answer["action"],
-    )
-    match = cell.find(id_)
-    assert (match.decision.part, np.array_equal(match.trace[0], stream.X[1])) == ("7", True)
+    assert answer["id"] == id_
+    assert (robot.decide_added(id_, 7), robot.action_added(id_)) == (answer, answer["action"])
+    assert cell.find(id_).decision.part == "7"
+    for decided in (id_, "whole"):
+        assert np.array_equal(cell.find(decided).trace[0], x)
     ids = [robot.begin() for _ in range(9)]  # more than are kept
-    for wrong, call in (
-        ("Expected begin and add", lambda: robot.decide_added("unheard of")),
-        ("Expected begin before add", lambda: robot.add("unheard of", [1.0])),
-        ("Expected begin before add", lambda: robot.add(ids[0], [1.0])),
+    assert [robot.add(ids[-1], [0.0] * 2500) for _ in range(80)][-1] == MAX_SAMPLES
+    for wrong, call, arguments in (
+        ("Expected begin and add", robot.decide_added, ("unheard of",)),
+        ("Expected begin before add", robot.add, ("unheard of", [1.0])),
+        ("Expected begin before add", robot.add, (ids[0], [1.0])),
+        (f"at most {MAX_SAMPLES} samples", robot.add, (ids[-1], [0.0])),
     ):
         with pytest.raises(xmlrpc.client.Fault, match=wrong):
-            call()
-    assert [robot.add(ids[-1], [0.0] * 2500) for _ in range(80)][-1] == MAX_SAMPLES
-    with pytest.raises(xmlrpc.client.Fault, match=f"at most {MAX_SAMPLES} samples"):
-        robot.add(ids[-1], [0.0])
+            call(*arguments)
 
 
 def test_what_a_recorder_cut_is_decided_on(cell: Cell, stream: Dataset) -> None:

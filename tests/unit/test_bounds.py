@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from statsmodels.stats.proportion import proportion_confint
 
 from dengine import (
     INTERVALS,
@@ -78,6 +77,9 @@ def test_wilson_gives_the_papers_two_tables(
     ],
 )
 def test_interval_equals_statsmodels(interval, method: str, alpha: float) -> None:
+    # Its import takes seconds, for one worker of three.
+    from statsmodels.stats.proportion import proportion_confint
+
     for n_s, n_f in COUNTS:
         expected = proportion_confint(n_s, n_s + n_f, alpha, method=method)
         if method == "jeffreys":  # ours has its ends closed

@@ -222,8 +222,3 @@ def test_one_sentence_says_what_was_kept_or_what_audits_tell_which_alone_know_of
     of = "Of 10,000 parts that the model would accept, of which 1,000 were audited, at most 3.8 %"
     assert audited.sentence == of + end
     assert not certificate("all", accepted=1203, false_accepts=60).kept
-
-
-def test_parts_of_which_some_were_audited_are_not_said_to_have_gone_unchecked() -> None:
-    result = certificate("some", 1.0, accepted=10, audited_accepts=990)
-    assert "that the model would accept, of which 990 were audited, at most" in result.sentence

@@ -47,7 +47,10 @@ def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(
         ):
             engine.decide(np.arange(samples))
         assert (engine.trace, engine.store.status()["decisions"]) == (None, 0)
-        engine.decide(np.arange(MIN_SAMPLES))
+        buffer = np.arange(MIN_SAMPLES)
+        first = engine.decide(buffer)
+        buffer[:] = 0  # it is the caller's, and may be used again
+        assert engine.find(first.id).trace[0].tolist() == [*range(MIN_SAMPLES)]
         assert engine.trace == TraceSpec(MIN_SAMPLES)
     with DataEngine("pca", trace=TraceSpec(samples)) as engine:  # it is meant
         assert engine.decide(np.arange(samples)).reason in (Reason.NO_MODEL, Reason.CONSTANT)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import Action, DataEngine, Dataset, Reason, Recipe
-from dengine.errors import ReportError, SettingError
+from dengine.errors import SettingError
 from dengine.export.bundle import exportable
 from dengine.folds import fold_of
 from tests.support.driving import RECIPE, Counting, evidence, make
@@ -137,26 +137,6 @@ def test_what_is_forgotten_trains_nothing_any_more_and_what_is_corrected_trains_
     assert trained["labels"][0] == (not cycles[5].success)
 
 
-def test_what_was_decided_and_reported_stays_as_it_was(tmp_path: Path, data: Dataset) -> None:
-    engine = make(store=tmp_path / "engine.db")
-    cycles = play(engine, data, 0, 100, confirm=True)
-
-    def rows() -> list:
-        engine.flush()
-        with closing(sqlite3.connect(tmp_path / "engine.db")) as connection:
-            tables = ("decision", "label", "trace", "model_version")
-            return [
-                connection.execute(f"SELECT * FROM {table} ORDER BY 1, 2").fetchall()
-                for table in tables
-            ]
-
-    before = rows()
-    engine.correct(cycles[3].decision.id, not cycles[3].success)
-    engine.forget(cycles[4].decision.id)
-    assert rows() == before
-    assert len(engine.store.corrections()) == 2
-
-
 def test_the_rule_is_told_again_and_safe_mode_follows_the_labels_as_they_are_now(
     data: Dataset,
 ) -> None:
@@ -182,24 +162,6 @@ def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
     assert engine.certificate().accepted.upper > before.upper
     engine.correct(stopped[1].id, True)
     assert engine.certificate().accepted.n_bad == before.n_bad
-
-
-@pytest.mark.parametrize("verb", ["correct", "forget"])
-def test_what_has_no_label_is_refused_with_advice_and_changes_nothing(
-    verb: str, data: Dataset
-) -> None:
-    engine = make()
-    open_ = engine.decide(data.X[0])
-
-    def put_right(name: object) -> None:
-        engine.correct(name, True) if verb == "correct" else engine.forget(name)
-
-    with pytest.raises(ReportError, match="report its label"):
-        put_right(open_.id)
-    for unknown in ("nobody", None, float("nan"), 7):
-        with pytest.raises(ReportError, match="does not hold"):
-            put_right(unknown)
-    assert (engine.store.events(), engine.store.corrections()) == ([], [])
 
 
 def test_what_is_so_already_is_said_and_changes_nothing(data: Dataset) -> None:

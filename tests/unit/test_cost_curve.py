@@ -394,27 +394,18 @@ def test_the_lines_that_are_shown_set_the_policy(policy: Policy) -> None:
     assert ("--audit-rate" in words) == ("audit_rate" in settings)
 
 
-def test_the_picture_names_what_it_shows_and_marks_what_leaves_its_axes() -> None:
+def test_the_picture_names_every_policy_and_marks_what_leaves_its_axes() -> None:
     lucky = replace(alone(50).marked, upper=80.0)
     result = replace(curve(lax=[(50, 0)] * 4), left_behind=(lucky,))
-    figure = cost_picture(result, unit="EUR")
-    left, right = figure.axes
+    left = cost_picture(result, unit="EUR").axes[0]
+    rows = (*result.rows, lucky)
     assert left.get_xlabel() == "cost a part [EUR]"
     names = [text.get_text() for text in left.get_yticklabels()]
-    assert names == [policy_name(row.policy) for row in (*result.rows, lucky)]
-    labels = [text.get_text() for text in left.get_legend().get_texts()]
-    assert {"check everything", "choice: may pay", "left behind"} <= set(labels)
+    assert names == [policy_name(row.policy) for row in rows]
     end = left.get_xlim()[1]
-    drawn = [
-        point[0] for c in left.collections for path in c.get_paths() for point in path.vertices
-    ]
-    assert max(drawn) <= end
-    texts = [text.get_text() for text in left.texts]
-    cut = [row for row in (*result.rows, lucky) if row.upper > end]
-    assert texts == [f"to {row.upper:.3g} \u2192" for row in cut]
-    assert "to 80 \u2192" in texts
-    assert "check 5 EUR, escape 100 EUR, false reject 20 EUR" in figure.get_suptitle()
-    assert len(right.patches) == 3
+    cut = [f"to {row.upper:.3g} \u2192" for row in rows if row.upper > end]
+    assert [text.get_text() for text in left.texts] == cut
+    assert "to 80 \u2192" in cut
 
 
 WORDS = [
@@ -451,17 +442,13 @@ def recordings(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_verb_shows_a_table_and_writes_the_curve(recordings: Path) -> None:
     shown = succeed(*WORDS, "--out", "out")
-    assert "what a part costs, in s" in " ".join(shown.split())
-    assert "check all" in shown
     assert max(map(len, shown.splitlines())) <= 80
     assert (recordings / "out" / "costs.png").stat().st_size > 10_000
     n_rows = (recordings / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") - 1
-    result = document(*WORDS)
-    assert result["verdict"] in ("pays", "may pay", "does not pay")
+    result, text = document(*WORDS), " ".join(shown.split())
     assert len(result["rows"]) == n_rows
-    text = " ".join(shown.split())
-    assert result["sentence"] in text
-    assert "Not tried: " in text
+    for words in ("what a part costs, in s", "check all", result["sentence"], "Not tried: "):
+        assert words in text
     if result["policy"]:
         assert result["python"] in text
         assert result["command"].startswith("dengine policy cell.db --")
@@ -475,31 +462,3 @@ def test_the_verb_names_a_price_that_is_no_number(recordings: Path) -> None:
     assert "'0.5 EUR' is not a valid float" in " ".join(result.output.split())
     refused = " ".join(dengine(*WORDS, "--alpha", "0.1").output.split())
     assert "but a list is tried here: use --alphas" in refused
-
-
-def test_the_verb_says_that_recordings_come_twice(recordings: Path, data: Dataset) -> None:
-    twice = np.r_[0:60, 0:30]
-    np.savez(recordings / "mine.npz", X=data.X[twice], y=data.y[twice])
-    text = " ".join(succeed(*WORDS).split())
-    assert "Of the recordings 30 repeat another: the interval is too narrow." in text
-
-
-def test_after_an_error_in_one_replay_the_verb_shows_what_was_finished(
-    recordings: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from dengine.experiments import grid
-
-    play = grid._play
-
-    def fail_late(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
-        if task.seed == 3:
-            raise SettingError("a sensor is missing")
-        return play(data, i, task, on_cycle)
-
-    monkeypatch.setattr(grid, "_play", fail_late)
-    result = dengine(*WORDS, "--lower-bounds", "0.7,0.8")
-    text = " ".join(result.output.split())
-    assert result.exit_code == 1
-    assert "these shuffles also chose the policy" in text
-    assert "Interrupted: what was finished is shown. " in text
-    assert "a sensor is missing" in text

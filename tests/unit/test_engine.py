@@ -26,7 +26,6 @@ from dengine import (
     Recipe,
     ReplayCell,
     Source,
-    TraceError,
     TraceSpec,
     load_dataset,
 )
@@ -93,20 +92,6 @@ def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part
     ):
         make().run(Half(), 1)
     assert inserted == []
-
-
-@pytest.mark.parametrize("reducer", ["rocket", "pca", "conv"])
-@pytest.mark.parametrize("broken", [np.nan, np.inf])
-def test_a_first_labelled_trace_that_is_not_finite_is_kept_without_a_traceback(
-    reducer: str, broken: float, data: Dataset, caplog: pytest.LogCaptureFixture
-) -> None:
-    engine = DataEngine(reducer, trace=TraceSpec(data.X.shape[1]))
-    first = engine.decide(np.full(data.X.shape[1], broken))
-    engine.report(first.id, True)
-    decision = engine.decide(data.X[0])
-    engine.report(decision.id, bool(data.y[0]))
-    assert (first.reason, decision.reason) == (Reason.NOT_FINITE, Reason.NO_MODEL)
-    assert caplog.records == []
 
 
 def test_the_collector_works_between_decisions_and_leaves_old_objects_alone_until_the_loop_ends(
@@ -229,31 +214,6 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(
     np.testing.assert_array_equal(stored.trace[0], x.astype(np.float32))
     assert (engine.version, engine.state.new_labels, len(engine.model.index)) == before
     assert content_hash(x[None])[0] not in engine.store.labelled().hashes
-
-
-def test_the_first_trace_sets_the_contract_and_a_wrong_shape_raises(data: Dataset) -> None:
-    engine, buffer = make(), data.X[0].copy()
-    first = engine.decide(buffer)
-    buffer[:] = 0.0  # it is the caller's, and may be used again
-    np.testing.assert_array_equal(engine.store.get_decision(first.id).trace[0], data.X[0])
-    assert engine.trace == TraceSpec(samples=100)
-    with pytest.raises(TraceError, match="Expected 100 samples, got 99"):
-        engine.decide(data.X[0][:99])
-    with pytest.raises(TraceError, match=r"Expected 1 channel\(s\), got 2"):
-        engine.decide(np.stack([data.X[0], data.X[0]]))
-    assert engine.store.status()["decisions"] == 1
-    assert engine.decide(data.X[1]).action is Action.VERIFY
-
-
-@pytest.mark.parametrize(("samples", "channels"), [(800, 1), (60, 3)])
-def test_other_lengths_and_several_channels_go_the_whole_way(
-    samples: int, channels: int, make_data
-) -> None:
-    data = make_data(150, samples=samples, channels=channels)
-    engine = make()
-    actions = Counter(c.decision.action for c in play(engine, data))
-    assert engine.trace == TraceSpec(samples=samples, channels=channels)
-    assert actions[Action.ACCEPT] > 20
 
 
 def test_a_finite_trace_beyond_all_measure_is_verified(data: Dataset) -> None:

@@ -1,5 +1,6 @@
 """Why a decision came out so: what is found again is what was counted, and what is said is true."""
 
+import json
 import re
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -15,6 +16,7 @@ from dengine.errors import ReportError, StoreError
 from dengine.history.envelope import envelope_of
 from dengine.history.explain import Explanation, explain
 from dengine.history.sentences import WHY, Circumstances, bound_of
+from dengine.representation import to_jsonable
 from tests.support.driving import Counting, drive, easy_parts
 from tests.support.stores import execute
 
@@ -91,33 +93,25 @@ def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(
 def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(
     store: SqlStore, make_data
 ) -> None:
-    data = make_data(120, samples=60)
-    data = Dataset(
-        np.concatenate([data.X, data.X[:60]]), np.concatenate([data.y, data.y[:60]]), name="twice"
-    )
-    with played(store, data, RECIPES["local"]) as engine:
+    once = make_data(120, samples=60)
+    rows = np.r_[0:120, 0:60]
+    with played(store, Dataset(once.X[rows], once.y[rows]), RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, action="accept")
         explanation = engine.explain(past.decision.id, neighbours=15)
         distances = [item.distance for item in explanation.neighbours]
         assert distances == sorted(distances)
         assert explanation.radius == pytest.approx(engine.recipe.radius)
-        assert [item.inside for item in explanation.neighbours] == [
-            item <= explanation.radius for item in distances
-        ]
-        custom = engine.store.get_decision(past.decision.id)
+        asked = engine.store.get_decision(past.decision.id)
         for item in explanation.neighbours:
             stored = engine.store.get_decision(item.decision_id)
+            assert item.inside == (item.distance <= explanation.radius)
             assert (stored.success, stored.source) == (item.success, item.source)
-            assert (
-                stored.content_hash != custom.content_hash
-            )  # the same part, which came before, has no vote
+            # The same part, which came before, has no vote.
+            assert stored.content_hash != asked.content_hash
             np.testing.assert_array_equal(item.trace, stored.trace)
-            z = engine.model.predictor.embed(torch.from_numpy(np.array(stored.trace)))[
-                item.space
-            ].numpy()
-            assert np.linalg.norm(z - custom.decision.embedding[item.space]) == pytest.approx(
-                item.distance, abs=1e-3
-            )
+            z = engine.model.predictor.embed(torch.from_numpy(np.array(stored.trace)))
+            offset = z[item.space].numpy() - asked.decision.embedding[item.space]
+            assert np.linalg.norm(offset) == pytest.approx(item.distance, abs=1e-3)
 
 
 def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(
@@ -176,57 +170,47 @@ def test_each_reason_is_explained_by_what_it_rests_on(
 ) -> None:
     data = make_data(260, samples=60)
     spec = TraceSpec(60, rate_hz=500.0, limit=200.0, unit="Nm")
+    bump, dead, torn, loud = (np.array(data.X[0]) for _ in range(4))
+    bump[20:40] += 60.0
+    dead[:], torn[7], loud[30] = 4.0, np.nan, 200.0
     with played(tmp_path, data, RECIPES["local"], trace=spec) as engine:
-        bump, dead, torn, loud = (np.array(data.X[0]) for _ in range(4))
-        bump[20:40] += 60.0
-        dead[:] = 4.0
-        torn[7] = np.nan
-        loud[30] = 200.0
-        novel, constant, cut, saturated = (
-            engine.explain(engine.decide(x).id) for x in (bump, dead, torn, loud)
-        )
-        (audit,) = engine.history(last=1, reason="audit")
-        (first,) = list(engine.history())[:1]
-        audited, untrained = engine.explain(audit.decision.id), engine.explain(first.decision.id)
+        ids = {
+            "novel": engine.decide(bump).id,
+            "constant": engine.decide(dead).id,
+            "not_finite": engine.decide(torn).id,
+            "saturated": engine.decide(loud).id,
+            "audit": next(iter(engine.history(last=1, reason="audit"))).decision.id,
+            "no_model": next(iter(engine.history())).decision.id,
+        }
         engine.report("lost", success=False, trace=data.X[3] + 0.01)
-        lost = engine.explain("lost")
-    assert novel.decision.decision.reason is Reason.NOVEL
+        explained = {reason: engine.explain(id_) for reason, id_ in ids.items()}
+        explained["lost"] = engine.explain("lost")
+    novel = explained["novel"]
+    assert (novel.decision.decision.reason, novel.bound) == (Reason.NOVEL, None)
     assert max(asdict(novel.novelty).values()) > 1.0
-    assert f"in level {novel.novelty.level:.2f} times the limit" in said_of(novel)
-    assert novel.bound is None
-    assert "every sample is 4 Nm: a dead sensor" in said_of(constant)
-    assert "1 of 60 samples are NaN or infinite" in said_of(cut)
-    assert "first after 0.060 s (channel 1)" in said_of(saturated)
-    for bad in (constant, cut, saturated):
-        assert bad.neighbours == ()
-        assert "The trace is quarantined" in said_of(bad)
-    assert "the model alone would have" in said_of(audited)
-    assert "below the audit rate 0.1" in said_of(audited)
-    assert 0.0 <= float(re.search(r"coin fell on ([\d.]+),", said_of(audited)).group(1)) < 0.1
-    assert "no model had been trained yet" in said_of(untrained)
-    assert "the trace was not embedded" in said_of(untrained)
-    assert "the decision was lost, and recorded again" in said_of(lost)
-    assert "The part turned out bad (stop)" in said_of(lost)
+    for reason, words in {
+        "novel": [f"in level {novel.novelty.level:.2f} times the limit"],
+        "constant": ["every sample is 4 Nm: a dead sensor", "The trace is quarantined"],
+        "not_finite": ["1 of 60 samples are NaN or infinite", "The trace is quarantined"],
+        "saturated": ["first after 0.060 s (channel 1)", "The trace is quarantined"],
+        "audit": ["the model alone would have", "below the audit rate 0.1"],
+        "no_model": ["no model had been trained yet", "the trace was not embedded"],
+        "lost": ["the decision was lost, and recorded again", "turned out bad (stop)"],
+    }.items():
+        text = said_of(explained[reason])
+        assert [item for item in words if item not in text] == [], text
+    coin = re.search(r"coin fell on ([\d.]+),", said_of(explained["audit"])).group(1)
+    assert 0.0 <= float(coin) < 0.1
 
 
-def test_times_are_in_samples_and_values_have_no_unit_while_these_are_unknown(
-    make_data: Callable[..., Dataset],
-) -> None:
-    with played(
-        None, make_data(40, 60), RECIPES["local"], trace=TraceSpec(60, limit=200.0)
-    ) as engine:
-        x = make_data(1, 60).X[0]
-        loud, dead, huge, high = x.copy(), np.full_like(x, 4.0), x.copy(), x.copy()
-        loud[30], huge[5], high[20:25] = 200.0, 1e30, 150.0
-        saturated, constant, _, outside = (
-            engine.explain(engine.decide(trace).id) for trace in (loud, dead, huge, high)
-        )
-    assert "touch the sensor's range of 200, first after 30 samples (channel 1)" in said_of(
-        saturated
-    )
-    assert "every sample is 4: a dead sensor" in said_of(constant)
-    excess = outside.envelope.excesses[0]
-    assert (excess.first, excess.last) == (20, 24)
+@pytest.mark.parametrize("size", [3.4e38, 1e18, 1e-30, 1e-45, np.nan, np.inf])
+def test_a_trace_of_any_numbers_is_explained_as_json_has_it(size: float, make_data) -> None:
+    x = make_data(1, 60).X[0]
+    with DataEngine("pca") as engine:
+        for trace in (np.where(np.arange(60) == 7, -size, x), np.resize([size, -size], 60)):
+            trace[9] = size
+            explanation = engine.explain(engine.decide(trace.astype(np.float32)).id)
+            json.dumps(to_jsonable(explanation), allow_nan=False)
 
 
 def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
@@ -286,24 +270,19 @@ def test_an_unknown_id_says_where_the_ids_are(make_data: Callable[..., Dataset])
 def test_a_planted_excess_is_found_where_and_how_far_it_is() -> None:
     X = np.random.default_rng(0).normal(0.0, 1.0, (200, 2, 50)).astype(np.float32)
     trace = np.median(X, axis=0)
-    trace[1, 20:25] = 6.0
-    trace[0, 40] = -5.0
+    trace[1, 20:25], trace[0, 40] = 6.0, -5.0
     result = envelope_of(X, trace)
-    high, low = result.excesses
-    assert (low.channel, low.first, low.last, low.above) == (0, 40, 40, False)
-    assert (high.channel, high.first, high.last, high.above) == (1, 20, 24, True)
+    found = [(e.channel, e.first, e.last, e.above) for e in result.excesses]
+    assert found == [(1, 20, 24, True), (0, 40, 40, False)]  # the farthest first
     widths = (6.0 - result.high[1, 20:25]) / (result.high - result.low)[1, 20:25]
-    assert high.widths == pytest.approx(widths.max(), rel=1e-5)
+    assert result.excesses[0].widths == pytest.approx(widths.max(), rel=1e-5)
     assert result.outside == pytest.approx(6 / 100)
     trace = np.zeros((2, 50), np.float32)
     trace[0, 3], trace[1, 4:6] = np.nan, np.inf  # these lie nowhere
     trace[0, 10:12], trace[0, 12:15] = 9.0, -9.0  # one that changes sides is two
     result = envelope_of(X, trace)
-    assert result.not_finite == 3
-    assert sorted((excess.first, excess.last, excess.above) for excess in result.excesses) == [
-        (10, 11, True),
-        (12, 14, False),
-    ]
+    found = sorted((e.first, e.last, e.above) for e in result.excesses)
+    assert (result.not_finite, found) == (3, [(10, 11, True), (12, 14, False)])
     assert envelope_of(X[:19], trace) is envelope_of(X, trace[:, :49]) is None
 
 

@@ -321,31 +321,6 @@ def test_in_random_histories_with_overdue_checks_a_reopened_engine_is_the_one_th
     history.engine.close()
 
 
-@pytest.mark.parametrize("policy", [replace(LOCAL, stops="all"), POOLED], ids=["local", "pooled"])
-def test_neither_a_restart_nor_a_correction_sends_a_healthy_cell_with_overdue_checks_into_safe_mode(
-    stream: Dataset, tmp_path: Path, policy: Policy
-) -> None:
-    engine, checks = make(replace(policy, label_within=50), store=tmp_path / "e.db"), 0
-    for x, success in zip(stream.X, stream.y.tolist(), strict=True):
-        decision = engine.decide(x)
-        if decision.action is Action.ACCEPT and not success:
-            engine.report(decision.id, False)
-        elif decision.action is Action.VERIFY:
-            checks += 1
-            if checks % 10:
-                engine.report(decision.id, success)
-                last = decision.id, success
-    engine.flush()
-    assert engine.safe_mode == ""
-    assert engine.store.overdue_to(50) > 0
-    engine.close()
-    engine = DataEngine.open(tmp_path / "e.db", replaying=True)
-    assert engine.safe_mode == ""
-    engine.correct(last[0], not last[1])
-    engine.correct(*last)
-    assert engine.safe_mode == ""
-
-
 def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_not_know_of_overdue_checks(
     stream: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -107,33 +107,6 @@ def test_window_curves_are_shares_of_what_was_decided_in_all_replays_where_that_
     ]
 
 
-def test_the_curves_have_precision_and_lb_on_axes_of_their_own_and_count_the_errors() -> None:
-    figure = curves({"a": [MANY_RIGHT], "b": [ONE_WRONG]})
-    certain, precision, errors = figure.axes
-    for axes, level in ((precision, 90.0), (errors, 10.0)):
-        assert any(
-            np.allclose(line.get_ydata(), level) and line.get_linestyle() == ":"
-            for line in axes.lines
-        )
-    assert all(line.get_linestyle() != ":" for line in certain.lines)
-    assert precision.get_ylim()[0] > 0
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "a: 10 bad of 300 accepted, 0 good of 0 rejected",
-        "b: 1 bad of 1 accepted, 1 good of 1 rejected",
-    ]
-
-
-def test_the_ball_is_as_large_as_the_radius_in_equal_units_and_lies_around_the_newest_part() -> (
-    None
-):
-    figure = embedding_map(MANY_RIGHT)
-    (ball,) = figure.axes[0].patches
-    assert [axes.get_aspect() for axes in figure.axes] == [1.0, 1.0]
-    assert ball.get_radius() == RECIPE.radius
-    np.testing.assert_array_equal(ball.get_center(), MANY_RIGHT.position[-1])
-    assert "root mean square radius = 1" in figure.axes[0].get_ylabel()
-
-
 def test_an_axis_that_is_a_probability_says_so_and_the_other_is_the_cycle() -> None:
     left = embedding_map(
         replay_of(["accept"] * 50, [1] * 50, recipe=Recipe("conv", radius=0.05))

@@ -329,27 +329,6 @@ def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
     return SqlStore(fleet.url, cell_id)  # its product is known
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
-def test_a_reopened_cell_decides_the_same_bit_for_bit(
-    recipe: Recipe, fleet: Fleet, parts: Dataset, probe
-) -> None:
-    for engine in taught(fleet, parts, 130, recipe):
-        engine.poll()
-        before = (
-            predictions(engine, probe),
-            rule(engine),
-            engine.version,
-            engine.state.new_labels,
-        )
-        again = fleet.engine("", recipe=None, store=reopened(fleet, engine))
-        assert (
-            predictions(again, probe),
-            rule(again),
-            again.version,
-            again.state.new_labels,
-        ) == before
-
-
 def test_nothing_is_mixed_between_products_and_cells_without(
     fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:

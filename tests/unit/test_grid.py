@@ -36,23 +36,14 @@ def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_
     kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
     task = Task(who, seed=1, cycles=60)
     asked = [who.with_policy(alpha=0.2), replace(RECIPE, radius=0.4), PCA(2), PCA(2, whiten=True)]
-    asked += [
-        FunctionTransformer(np.add, kw_args={"x2": value}) for value in (np.zeros(3), np.ones(3))
-    ]
+    asked += [FunctionTransformer(np.add, kw_args={"x2": np.full(3, i)}) for i in range(2)]
     asked += [FunctionTransformer(np.abs), "knn"]
-    others = [
-        replace(task, **change)
-        for change in ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})
-    ]
-    others += [replace(task, contender=Contender.load(first)) for first in asked]
+    others = [replace(task, contender=Contender.load(item)) for item in asked]
+    changes = ({"seed": 2}, {"cycles": 61}, {"confirm": True}, {"shuffle": False})
+    others += [replace(task, **change) for change in changes]
     flipped = KeptReplays(tmp_path, replace(data, y=1 - data.y)).path(task)
     assert len({flipped, *(kept.path(item) for item in [task, *others])}) == 2 + len(others)
     assert kept.path(replace(task, contender=replace(who, name="mine"))) == kept.path(task)
-    alike = [
-        Task(Contender.load(make_pipeline(FunctionTransformer(np.abs), PCA(2))), 0)
-        for _ in range(2)
-    ]
-    assert kept.path(alike[0]) == kept.path(alike[1])
     with pytest.raises(SettingError, match="define it in a module"):
         kept.path(Task(Contender.load(FunctionTransformer(lambda x: x)), 0))
 
@@ -80,33 +71,24 @@ def test_a_reducer_of_ones_own_is_played_again_when_its_source_changes(
 
 
 def test_a_file_is_whole_or_not_there_wherever_it_is_damaged(data: Dataset, tmp_path: Path) -> None:
-    task, kept, rng = (
-        Task(Contender.load(RECIPE), seed=1, cycles=50),
-        KeptReplays(tmp_path, data),
-        np.random.default_rng(0),
-    )
-    played = replay(data, RECIPE, seed=1, cycles=50)
+    task, rng = Task(Contender.load(RECIPE), seed=1, cycles=50), np.random.default_rng(0)
+    kept, played = KeptReplays(tmp_path, data), replay(data, RECIPE, seed=1, cycles=50)
     kept.put(task, played)
-    file = kept.path(task).read_bytes()
+    path, whole = kept.path(task), kept.path(task).read_bytes()
+    same(kept.get(task), played)
     results = []
-    for size in [1, 1, 3, 50] * 75:
-        damaged = np.frombuffer(file, dtype=np.uint8).copy()
+    for size in [1, 1, 3, 50] * 25:
+        damaged = np.frombuffer(whole, dtype=np.uint8).copy()
         damaged[rng.integers(len(damaged), size=size)] = rng.integers(256, size=size)
-        kept.path(task).write_bytes(damaged.tobytes())
+        path.write_bytes(damaged.tobytes())
         results.append(kept.get(task))
-    assert results.count(None) > 200
+    assert results.count(None) > 60
     for back in filter(None, results):  # what was hit is nothing that is read
         np.testing.assert_array_equal(back.action, played.action)
-    kept.path(task).write_bytes(b"")
+    path.write_bytes(b"")
     (again,) = iterate_replays(data, [task], keep=tmp_path)
     assert not again.kept
-    back = kept.get(task)
-    same(back, played)
-    assert (back.retrains, back.seconds, back.recipe) == (
-        again.replay.retrains,
-        again.replay.seconds,
-        played.recipe,
-    )
+    assert kept.get(task).retrains == again.replay.retrains
 
 
 def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: Path) -> None:

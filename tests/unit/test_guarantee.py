@@ -12,10 +12,7 @@ from dengine.decision.member_rules import LOWEST_LEVEL, PooledRule, PricedRule, 
 from dengine.decision.members import (
     BET,
     FALSE_ALARMS,
-    N_RECENT,
-    SAFE_MODES,
     MemberEvidence,
-    max_recent_errors,
 )
 from dengine.decision.rule import DecisionRule
 from dengine.decision.scripting import script
@@ -67,37 +64,6 @@ def test_what_came_before_a_level_was_aimed_at_is_no_evidence_for_it() -> None:
     assert rule.action(0.5, 1.0) == VERIFY
 
 
-def test_the_newest_of_a_level_may_hold_so_many_wrong_ones_and_no_more() -> None:
-    rule, most = pooled(), max_recent_errors(0.1)
-    tell(rule, 0.9, *[True] * 1000)
-    for n_wrong in range(1, most + 2):
-        tell(rule, 0.6, False, *[True] * 4)  # not so many that the detector would notice
-        assert rule.action(0.6, 1.0) == (ACCEPT if n_wrong <= most else VERIFY)
-    assert (rule.safe_mode(), rule.action(0.9, 1.0)) == (0, ACCEPT)  # the stricter level goes on
-    tell(rule, 0.6, *[True] * N_RECENT)
-    assert rule.action(0.6, 1.0) == ACCEPT
-
-
-def test_stops_that_come_unasked_are_no_evidence_where_not_all_are_known_and_audits_weigh_by_their_propensity() -> (
-    None
-):
-    rule = PooledRule(0.1, 0.9, inclusion_probability=0.1)
-    for _ in range(5000):
-        rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
-    assert rule.action(0.95, 1.0) == VERIFY
-    n = 0
-    while rule.action(0.95, 1.0) == VERIFY:
-        rule.update(0.95, 1.0, True, predicted=0, inclusion_probability=1.0)
-        n += 1
-    assert (
-        9 * enough(0.1, 0.1) < n < 11 * enough(0.1, 0.1)
-    )  # what is to come is looked at in one of ten
-    for _ in range(100):
-        rule.update(0.95, 1.0, True, predicted=1, inclusion_probability=0.0)
-    rule.update(0.95, 1.0, False, predicted=1, inclusion_probability=0.1)  # it stands for ten
-    assert rule.action(0.95, 1.0) == VERIFY
-
-
 def test_a_pooled_guarantee_of_which_nobody_hears_is_refused() -> None:
     with pytest.raises(
         SettingError, match="Expected audits, or stops='all', beside the pooled guarantee"
@@ -145,14 +111,6 @@ def test_an_adversary_who_sees_the_levels_makes_a_false_claim_no_more_often_than
         )  # it is an adversary
 
 
-def test_a_level_that_its_members_contradict_stays_shut_below_the_ones_that_hold() -> None:
-    rule = pooled()
-    tell(rule, 0.9, *[True] * 150)
-    tell(rule, 0.7, *[False, True, True, True, True] * 20)
-    assert rule.action(0.9, 1.0) == ACCEPT
-    assert rule.action(0.7, 1.0) == VERIFY
-
-
 def priced(inclusion_probability: float = 1.0) -> PricedRule:
     return PricedRule(0.1, 0.9, "wilson", (5 / 120, 5 / 47.5), inclusion_probability)
 
@@ -182,33 +140,6 @@ def test_by_costs_nothing_passes_that_is_expected_to_cost_more_than_its_check() 
     assert [rule.action(0.0, p) for p in (0.105, 0.106)] == [REJECT, VERIFY]
 
 
-def test_by_costs_an_audit_stands_for_as_many_as_it_was_drawn_from_and_a_stop_that_came_unasked_for_none() -> (
-    None
-):
-    rule = priced(inclusion_probability=0.1)
-    tell(rule, 1.0, *[True] * 30)
-    rule.update(1.0, 1.0, False, predicted=1, inclusion_probability=0.0)
-    assert rule.action(1.0, 1.0) == ACCEPT
-    rule.update(1.0, 1.0, False, predicted=1, inclusion_probability=0.1)  # ten escapes
-    assert rule.action(1.0, 1.0) == VERIFY
-
-
-def test_after_an_alarm_costs_open_when_the_account_since_then_is_even_over_25_members_or_more() -> (
-    None
-):
-    rule = priced()
-    tell(rule, 1.0, *[True] * 400)
-    n_bad = 0
-    while rule.safe_mode() == 0:
-        tell(rule, 1.0, False)
-        n_bad += 1
-    assert (400 + n_bad) * 5 > n_bad * 120  # by the account of all members it could go on
-    tell(rule, 1.0, *[True] * 23)
-    assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (1, VERIFY)
-    tell(rule, 1.0, True, True)
-    assert (rule.safe_mode(), rule.action(1.0, 1.0)) == (0, ACCEPT)
-
-
 def test_a_doubled_share_of_bad_parts_ends_a_safe_mode_of_the_local_rule_in_at_most_alpha() -> None:
     n_ended = {0.1: 0, 0.2: 0}
     for rate in n_ended:
@@ -235,38 +166,6 @@ def test_prices_that_give_no_tolerance_below_one_half_are_refused(prices: object
         Policy(prices=prices)
 
 
-def test_a_part_that_both_sides_claim_is_verified() -> None:
-    rule = pooled()
-    tell(rule, 0.9, *[True] * 60)
-    tell(rule, 0.0, *[False] * 60, upper=0.1)
-    assert rule.action(0.95, 1.0) == ACCEPT
-    assert rule.action(0.0, 0.05) == REJECT
-    assert rule.action(0.4, 0.6) == VERIFY
-
-
-@pytest.mark.parametrize("kind", [PooledRule, WatchedRule])
-def test_a_collapse_of_what_is_accepted_is_noticed_within_six_parts_and_verified_until_fresh_evidence(
-    kind,
-) -> None:
-    rule = kind(0.1, 0.9)
-    tell(rule, 0.95, *[True] * 500)
-    bad = fresh = 0
-    while rule.action(0.95, 1.0) == ACCEPT:
-        tell(rule, 0.95, False)
-        bad += 1
-    assert bad <= 6
-    assert SAFE_MODES[rule.safe_mode()] == "accepted parts failed more often than the tolerance"
-    while rule.safe_mode() != 0:
-        assert rule.action(1.0, 1.0) == VERIFY
-        assert rule.action(0.0, 0.0) == VERIFY
-        tell(rule, 0.95, True)
-        fresh += 1
-    likely = math.log(10) / math.log(0.9 / 0.8)  # by the ratio to twice the tolerance
-    # What was known before the alarm does not count.
-    assert fresh >= (likely if kind is WatchedRule else enough(0.1, 0.1))
-    assert rule.action(0.95, 1.0) == ACCEPT
-
-
 @pytest.mark.parametrize(("alpha", "lower_bound", "soon"), [(0.1, 0.9, 106), (0.05, 0.95, 441)])
 def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever(
     alpha, lower_bound, soon: int
@@ -281,44 +180,6 @@ def test_twice_the_tolerance_starts_safe_mode_soon_and_the_tolerance_hardly_ever
         mean.append(n / len(rules))
     assert mean[0] > 0.7 * FALSE_ALARMS / alpha  # of 20; exactly, it is beyond that
     assert mean[1] < soon
-
-
-def test_silence_is_no_success_for_a_level_and_no_failure_for_the_watch() -> None:
-    silent, answer = pooled(), pooled()
-    for rule in (silent, answer):
-        tell(rule, 0.95, *[True] * 100)
-    before = {
-        name: value.clone() for name, value in silent.state_dict().items() if "counts" in name
-    }
-    silent.observe(50, False)
-    assert all(torch.equal(silent.state_dict()[name], value) for name, value in before.items())
-    for _ in range(50):
-        answer.observe(1, False)
-    torch.testing.assert_close(
-        silent.evidence.detector_sums[0], answer.evidence.detector_sums[0]
-    )  # fifty at once, or one by one
-    # Every twentieth accepted part stops the system: within the tolerance, though no success is
-    # ever heard of.
-    watched = WatchedRule(0.1, 0.9)
-    for _ in range(30):
-        watched.observe(19, False)
-        watched.update(0.95, 1.0, False)
-    assert watched.safe_mode() == 0
-
-
-def test_too_many_novel_traces_start_safe_mode_and_a_few_do_not() -> None:
-    few, many = pooled(), pooled()
-    for i in range(300):
-        few.observe(0, i % 10 == 0)
-        many.observe(0, i % 2 == 0)
-    assert few.safe_mode() == 0
-    assert SAFE_MODES[many.safe_mode()] == "too many traces were novel"
-    for every in (2, 1000):  # as many as ever, and few
-        assert many.safe_mode() == 3
-        for i in range(1, 300):
-            many.observe(0, i % every == 0)
-            tell(many, 0.95, True)
-    assert many.safe_mode() == 0
 
 
 @pytest.mark.parametrize(
@@ -345,22 +206,6 @@ def test_the_scripted_rule_is_told_and_asked_as_the_eager_one(guarantee: str, st
         assert torch.equal(value, scripted.state_dict()[name]), name
     counts = [(n, k) for n in range(0, 60, 7) for k in range(0, 10, 3)]
     assert [eager(*count) for count in counts] == [scripted(*count) for count in counts]
-
-
-@pytest.mark.parametrize("first", [0, 1])
-def test_after_safe_mode_each_side_opens_by_its_own_evidence(first: int) -> None:
-    rule = WatchedRule(0.1, 0.9)
-    shown = [
-        lambda n: tell(rule, 0.95, *[True] * n),
-        lambda n: tell(rule, 0.0, *[False] * n, upper=0.02),
-    ]
-    tell(rule, 0.95, *[True] * 100, *[False] * 6)
-    assert rule.safe_mode() != 0
-    shown[first](100)
-    assert (rule.safe_mode() == 0) is (first == 0)  # accepted parts had failed
-    assert rule.action(*[(0.95, 1.0), (0.0, 0.02)][1 - first]) == VERIFY
-    shown[1 - first](100)
-    assert (rule.action(0.95, 1.0), rule.action(0.0, 0.02), rule.safe_mode()) == (ACCEPT, REJECT, 0)
 
 
 @pytest.mark.parametrize("kind", ["watched", "pooled", "priced"])

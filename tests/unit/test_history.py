@@ -149,17 +149,6 @@ def test_a_filter_takes_what_it_says_and_the_newest_of_that(
         assert list(history(store, last=3, **asked)) == expected[-3:]
 
 
-def test_a_past_decision_has_its_part_its_evidence_and_its_label(store: SqlStore) -> None:
-    labelled = next(past for past in everything(store) if past.label == "good")
-    stored = store.get_decision(labelled.decision.id)
-    assert stored == labelled
-    assert (stored.trace.size, labelled.trace.size) == (5, 0)
-    assert store.get_decision(labelled.decision.id, trace=False) == labelled
-    assert labelled.label_time is not None
-    assert labelled.label_time >= labelled.time
-    assert store.get_decision("unknown", trace=False) is None
-
-
 def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
     whole = everything(store)
     for last in (None, 1, 10, 59, 500):

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, TraceSpec, load_exported
+from dengine import DataEngine, Dataset, TraceSpec
 from dengine.errors import DataError
 from dengine.export import import_journal
 from dengine.export.cell_journal import read_journal
 from dengine.folds import part_hash
 from dengine.records import Reason
 from dengine.store.opening import open_store
-from tests.support.command_line import line_of, succeed
+from tests.support.command_line import line_of
 from tests.support.exports import cell_journal, trained
 
 DECIDED = "verify,verify,uncertain,0,1,0,0"
@@ -327,16 +327,3 @@ def test_what_is_no_journal_or_a_line_that_does_not_fit_is_named(
     path.write_bytes(line if isinstance(line, bytes) else cell_journal(line))
     with pytest.raises(DataError, match=message):
         read_journal(path, TraceSpec(100))
-
-
-def test_the_verbs_export_and_import(
-    store: str, make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
-    out = tmp_path / "model.ts"
-    assert "version 1 with 200 labelled references" in line_of("export", store, "--out", out)
-    assert load_exported(out).metadata["references"] == 200
-    new = make_data(30, seed=4)
-    journal = write(tmp_path / "cell.csv", new.X, new.y)
-    assert '"imported": 30' in succeed(
-        "import-labels", journal, "--store", store, "--any-model", "--json"
-    )

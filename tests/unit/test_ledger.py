@@ -96,18 +96,6 @@ def test_what_a_store_wrote_is_whole_in_every_database(place: tuple[str, str]) -
     assert result.cells[0].rows == 2 * 16 + 14 + 3 + 3 + 2
 
 
-def test_the_digest_depends_on_what_was_written_and_not_on_the_database(
-    place: tuple[str, str], tmp_path: Path
-) -> None:
-    at, cell = place
-    digests = []
-    for url in (at, str(tmp_path / "other.db")):
-        with SqlStore(url, cell, clock=lambda: 12.5) as store:
-            write(store)
-        digests.append(verify_history(url, cell).cells[0].digest)
-    assert digests[0] == digests[1]
-
-
 def test_every_transaction_is_an_entry_and_an_empty_one_or_one_that_fails_is_none(
     place: tuple[str, str],
 ) -> None:

@@ -45,22 +45,6 @@ def test_the_surface_of_the_ball_counts() -> None:
 
 
 @settings(deadline=None)
-@given(st.lists(st.integers(0, 25), min_size=1, max_size=8), st.integers(1, 20))
-def test_a_full_ring_holds_exactly_the_newest_points(batches: list[int], capacity: int) -> None:
-    Z, y = points(sum(batches))
-    index, start = RadiusIndex(2, capacity), 0
-    for size in batches:
-        index.add(Z[start : start + size], y[start : start + size])
-        start += size
-    kept = slice(max(0, start - capacity), start)
-    assert len(index) == min(start, capacity)
-    items = sorted(map(tuple, index.column("points").tolist()))
-    assert items == sorted(map(tuple, Z[kept].tolist()))
-    expected = (int(y[kept].sum()), int((1 - y[kept]).sum()))
-    assert tuple(int(c[0]) for c in index.count(np.zeros((1, 2)), radius=100.0)) == expected
-
-
-@settings(deadline=None)
 @given(st.integers(1, 30), st.integers(1, 12), st.integers(1, 30), st.integers(0, 10))
 def test_a_restored_ring_of_any_capacity_holds_the_newest_points_that_fit_and_goes_on(
     n: int, capacity: int, other: int, more: int

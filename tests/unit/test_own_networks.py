@@ -195,9 +195,9 @@ def reducer_of(network: Any, random_state: Any = 0) -> TorchReducer:
     return TorchReducer(network=network, folds=2, steps=4, fit_steps=30, random_state=random_state)
 
 
-def taught(reducer: Any, store: Path | None = None, n: int = 60) -> DataEngine:
+def taught(reducer: Any, store: Path | None = None, traces: Any = None) -> DataEngine:
     engine = DataEngine(reducer=reducer, store=store, replaying=True, retrain_every=20)
-    for x, good in zip(*toy_traces(n), strict=True):
+    for x, good in zip(*(traces or toy_traces(60)), strict=True):
         engine.report(engine.decide(x).id, bool(good))
     return engine
 
@@ -216,26 +216,19 @@ ANSWERING = (
 
 
 @pytest.mark.parametrize("network", ANSWERING)
-def test_every_engine_of_a_process_decides_by_the_weights_that_it_trained(network: Any) -> None:
-    X = toy_traces(20, seed=3)[0]
-    for seed in (0, 1):
-        engine = taught(reducer_of(network, seed))
-        assert engine.version > 0
-        actual = [engine.decide(x).embedding for x in X]
-        np.testing.assert_allclose(actual, engine.model.spaces.embed(X), atol=1e-6)
-
-
-@pytest.mark.parametrize("network", ANSWERING)
-def test_a_store_opens_again_with_the_same_points_whatever_tensors_a_network_keeps(
+def test_an_engine_decides_by_the_weights_that_it_trained_whatever_tensors_a_network_keeps(
     network: Any, tmp_path: Path
 ) -> None:
     X = toy_traces(20, seed=3)[0]
-    with taught(reducer_of(network, None), tmp_path / "cell.db") as engine:
-        version = engine.version
-        expected = [engine.decide(x).embedding for x in X]
-    with DataEngine.open(tmp_path / "cell.db", reducer=reducer_of(network, None)) as engine:
-        assert engine.version == version > 0
-        np.testing.assert_allclose([engine.decide(x).embedding for x in X], expected, atol=1e-6)
+    for seed in (0, None):  # two engines of one process, each opened again
+        store, reducer = tmp_path / f"{seed}.db", reducer_of(network, seed)
+        with taught(reducer, store) as engine:
+            version, points = engine.version, [engine.decide(x).embedding for x in X]
+            np.testing.assert_allclose(points, engine.model.spaces.embed(X), atol=1e-6)
+        with DataEngine.open(store, reducer=reducer_of(network, seed)) as engine:
+            assert engine.version == version > 0
+            again = [engine.decide(x).embedding for x in X]
+            np.testing.assert_allclose(again, points, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -270,7 +263,7 @@ def test_a_model_that_answers_otherwise_than_it_was_trained_is_neither_exported_
         check_reducer(reducer_of(OtherwiseCompiled))
 
 
-@pytest.mark.parametrize("network", [RandomAnswer, CountsItsCalls, NoPointForARamp])
+@pytest.mark.parametrize("network", [CountsItsCalls, NoPointForARamp])
 def test_the_contract_of_a_reducer_has_what_an_engine_requires_of_a_version(network: Any) -> None:
     with pytest.raises(AssertionError, match=r"breaks '(a_version_answers|it_embeds)"):
         check_reducer(reducer_of(network))
@@ -302,16 +295,14 @@ def test_a_window_that_never_holds_enough_for_a_first_training_is_refused(reduce
         DataEngine(recipe=Recipe(reducer, window=19))
 
 
-@pytest.mark.parametrize("amplitude", [-1e-8, 1e-14, 1e-45])
-@pytest.mark.parametrize("reducer", ["conv", "rocket", "umap", "pca", PCA(2)])
+@pytest.mark.parametrize("amplitude", [-1e-8, 1e-45])
+@pytest.mark.parametrize("reducer", ["conv", "umap", PCA(2)])
 def test_traces_too_small_for_their_unit_raise_an_alarm_that_says_so(
     reducer: Any, amplitude: float
 ) -> None:
     X, y = toy_traces(60)
-    tiny = np.abs(X) * amplitude if amplitude < 0.0 else X * amplitude
-    engine = DataEngine(reducer=reducer, replaying=True, retrain_every=20)
-    for x, good in zip(tiny.astype(np.float32), y, strict=True):
-        engine.report(engine.decide(x).id, bool(good))
+    tiny = (np.abs(X) * amplitude if amplitude < 0.0 else X * amplitude).astype(np.float32)
+    engine = taught(reducer, traces=(tiny, y))
     assert engine.version == 0
     assert "the sensor" in engine.status().alarm
     assert "unit" in engine.status().alarm

@@ -125,38 +125,29 @@ def test_force_limits_along_a_path_need_no_rate(make_data) -> None:
 def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts_it(
     make_data, tmp_path: Path
 ) -> None:
-    data = make_data(300, SAMPLES)
-    with trained(data, tmp_path / "cell.db") as engine:
+    store, data = tmp_path / "cell.db", make_data(300, SAMPLES)
+    with trained(data, store) as engine:
         x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT)
         engine.set_policy(replace(engine.policy, windows=(f"0:0.1::{x[:50].max() - 0.1}:reject",)))
         decision = engine.decide(x)
-        assert (decision.action, decision.predicted, decision.reason) == (
-            Action.REJECT,
-            Action.VERIFY,
-            Reason.OUTSIDE,
-        )
-        assert (decision.propensity, "alone the model" in repr(decision)) == (0.0, False)
+        decided = decision.action, decision.predicted, decision.reason, decision.propensity
+        assert decided == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE, 0.0)
         engine.set_shadow(True)
         assert engine.decide(x).action is Action.VERIFY
         for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:", "0:1:0::channel=1", "0:1:0::along=FZ"):
-            with pytest.raises(
-                SettingError, match="on some of 1 x 100 samples"
-            ):  # beyond the last, and between two
+            with pytest.raises(SettingError, match="on some of 1 x 100 samples"):
                 engine.set_policy(Policy(windows=(nowhere,)))
-    with DataEngine.open(tmp_path / "cell.db") as engine:
-        status = engine.status()
-        assert (status.newest.outside, status.newest.rejected, status.actions["reject"]) == (
-            2,
-            0,
-            1,
-        )
+    with DataEngine.open(store) as engine:
+        status = engine.status(last=3)
+        newest = engine.status().newest
+        assert (newest.outside, newest.rejected, status.actions["reject"]) == (2, 0, 1)
         assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
+        assert status.alarm == "2 of the newest parts leave a window."
         assert "leaves an operator's window, 0:0.1::" in engine.explain(decision.id).sentences[0]
-        assert engine.status(last=3).alarm == "2 of the newest parts leave a window."
     with pytest.raises(
         SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"
     ):
-        DataEngine.open_or_create(tmp_path / "cell.db", recipe=recipe(windows=["0:0.2:0:"]))
+        DataEngine.open_or_create(store, recipe=recipe(windows=["0:0.2:0:"]))
 
 
 @pytest.mark.parametrize("text", ["0.2=9:0.4::60", "0.2:0.4::60=7", "0.2:0.4::60:channel=1=2"])

@@ -21,7 +21,6 @@ from dengine import (
 )
 from dengine.decision.decider import DecisionConditions, trace_gate
 from dengine.folds import content_fold, content_hash
-from dengine.model import neighbours
 from dengine.records import ACTIONS, REASONS
 
 
@@ -37,41 +36,18 @@ def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_
     data = make_data(120, samples=40)
     model = ModelPrediction("conv", WilsonRadiusClassifier(radius=0.05), 5).fit(data.X, data.y)
     conditions = DecisionConditions(TraceSpec(40))
-    queries = [
-        *data.X[100:, None],
-        *make_data(20, samples=40, seed=9).X[:, None],
-        np.ones((1, 40), np.float32),
-    ]
-    for x in queries:
-        result = trace_gate(*x.shape)(torch.from_numpy(x))
+    queries = [*data.X[100:], *make_data(20, samples=40, seed=9).X, np.ones(40, np.float32)]
+    for x in (query[None] for query in queries):
+        gate = trace_gate(*x.shape)(torch.from_numpy(x))
         for part in (0, 7):
-            (
-                fault,
-                content,
-                action,
-                predicted,
-                reason,
-                lower,
-                upper,
-                n_success,
-                n_failure,
-                z,
-                propensity,
-            ) = model.decide_one(x, part, conditions)
-            assert (fault, content) == result
-            if not fault:  # without a vote on itself
-                embedding = tuple(map(tuple, z.tolist()))
-                text = (
-                    ACTIONS[action],
-                    lower,
-                    upper,
-                    n_success,
-                    n_failure,
-                    embedding,
-                    REASONS[reason],
-                )
-                assert model.predict_one(x, part or content) == text
+            decided = model.decide_one(x, part, conditions)
+            fault, content, action, predicted, reason, *evidence, z, propensity = decided
+            assert (fault, content) == gate
             assert (action, propensity) == (predicted, 0.0 if action else 1.0)
+            if not fault:  # without a vote on itself
+                points = tuple(map(tuple, z.tolist()))
+                text = (ACTIONS[action], *evidence, points, REASONS[reason])
+                assert model.predict_one(x, part or content) == text
 
 
 @pytest.mark.parametrize("folds", [2, 3])
@@ -172,48 +148,6 @@ def test_a_successor_learns_without_disturbing_its_parent(data: Dataset) -> None
     child.add(data.X[0], 1)
     assert parent.predict_many(data.X[100:]) == before
     assert child.predict_many(data.X[100:]) != before
-
-
-def fitted(name: str, data: Dataset) -> ModelPrediction:
-    reducers = {"pca": "pca", "lda": LinearDiscriminantAnalysis()}
-    model = ModelPrediction(reducers[name], classifier()).fit(data.X[:120], data.y[:120])
-    for x, y in zip(data.X[120:150], data.y[120:150], strict=True):
-        model.add(x, y)
-    return model
-
-
-def test_a_state_restores_every_judgement_bit_for_bit(data: Dataset) -> None:
-    model = fitted("pca", data)
-    state = model.get_state()
-    assert all(isinstance(v, np.ndarray) and not v.dtype.hasobject for v in state.values())
-    restored = ModelPrediction("pca", classifier()).set_state(state)
-    assert restored.predict_many(data.X) == model.predict_many(data.X)
-    restored.add(data.X[160], 1)
-    model.add(data.X[160], 1)
-    assert restored.predict_many(data.X) == model.predict_many(data.X)
-
-
-def test_without_a_state_of_its_own_a_reducer_is_refitted_to_the_same_judgements(
-    data: Dataset,
-) -> None:
-    model = fitted("lda", data)
-    state = model.get_state()
-    assert not any(name.startswith("reducer.") for name in state)
-    restored = lda().fit(data.X[:120], data.y[:120]).set_state(state)
-    assert restored.predict_many(data.X) == model.predict_many(data.X)
-
-
-def test_what_will_answer_is_compiled_before_there_is_anything_to_learn(
-    data: Dataset, monkeypatch
-) -> None:
-    with DataEngine("conv", replaying=True) as engine:
-        for x, y in zip(data.X, data.y, strict=True):
-            engine.report(engine.decide(x).id, bool(y))
-            monkeypatch.setattr(
-                neighbours, "script", None
-            )  # in a retrain there is no time for that
-        assert engine.retrain().accepted
-        assert isinstance(engine.model.predictor, torch.jit.ScriptModule)
 
 
 def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_are_few(

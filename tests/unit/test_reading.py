@@ -24,7 +24,6 @@ from dengine.datasets.description import (
     Clock,
     LabelSource,
     PartSource,
-    RowWords,
     TextForm,
     TraceForm,
 )
@@ -434,17 +433,6 @@ def test_a_cut_file_is_a_fault(tmp_path: Path, kind: str, keep: float) -> None:
     assert_only_fault(written)
 
 
-def test_units_are_converted_and_one_that_cannot_be_is_a_fault(tmp_path: Path) -> None:
-    written = write(tmp_path, "files text", *some(), GERMAN)
-    channels = (Channel("FZ", "N"), Channel("Weg ü", "mm"))
-    written = replace(written, description=replace(written.description, channels=channels))
-    for i, path in enumerate(sorted(tmp_path.glob("*.csv"))):
-        units = "s;-;kN;mm" if i == 1 else "s;-;N;V" if i == BAD_PART else "s;-;N;mm"
-        path.write_text(path.read_text().replace("-;-;-;-", units))
-    written.X[1, 0] *= 1000
-    assert_only_fault(written, [3], "Weg ü")
-
-
 def test_a_file_that_changes_while_it_is_read_is_a_fault(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -491,11 +479,7 @@ def test_one_sentence_says_what_to_type(tmp_path: Path) -> None:
         ("channels", (), "still open: channels"),
         ("traces", TraceForm(), "traces.samples"),
         ("label", listed, "list.csv"),
-        ("label", replace(listed, key=""), "label.key"),
-        ("part", PartSource(path="(["), "a regular expression"),
         ("part", PartSource(path="part"), "one group"),
-        ("text", TextForm("utf-99"), "text.encoding"),
-        ("text", TextForm(delimiter=";;"), "text.delimiter"),
         ("time", Clock(("time",), ("parsec",)), "time.format"),
         ("time", Clock(("time",), ("s", "ms")), "a format for each"),
         ("time", Clock(("time",), zone="Mars/X"), "time.zone"),
@@ -560,8 +544,6 @@ def in_files(folder: Path, header: str, name: str = "{}_{}.csv", **cells: str) -
         ("label.column", "verdict", "where [label] says they stand"),
         ("label.path", "(", "a regular expression with one group"),
         ("label.listing", "x.csv", "label.key"),
-        ("label", {"listing": "x.csv", "key": "a", "column": "b"}, "the listing x.csv"),
-        ("text.encoding", "base64", "text.encoding"),
         ("text.encoding", "utf-99", "text.encoding"),
         ("text.delimiter", ";;", "text.delimiter"),
         ("text.header", 9, "none: 0_NOK.csv, line 9: Expected a header"),
@@ -595,42 +577,6 @@ def test_lines_of_json_under_another_suffix_are_refused_until_that_is_stated(
     assert load_dataset(path, describe(path, {"format": "jsonl"})).y.tolist() == [1, 0, 1, 0]
 
 
-def test_a_unit_in_a_name_is_converted(tmp_path: Path) -> None:
-    folder = in_files(tmp_path, "time,force [kN]")
-    plain, newtons = (
-        load_dataset(folder, describe(folder, {"channels.force [kN]": unit}))
-        for unit in ("kN", "N")
-    )
-    np.testing.assert_allclose(newtons.X, 1000 * plain.X)
-
-
-@pytest.mark.parametrize(
-    ("header", "name", "good", "bad"),
-    [
-        ("time,force,not_ok", "{}.csv", ",0", ",1"),
-        ("time,force,pass_fail", "{}.csv", ",1", ",0"),
-        ("time,force,quality_error", "{}.csv", ",false", ",true"),
-        ("time,force", "{1}/{0}_leak=False.csv", "", ""),
-    ],
-)
-def test_true_and_false_of_a_name_that_may_be_bad_mean_nothing(
-    tmp_path: Path, header: str, name: str, good: str, bad: str
-) -> None:
-    if "leak" in name:
-        for i in range(4):
-            in_files(tmp_path, header, f"{{}}_leak={i % 2 == 0}.csv")
-    else:
-        in_files(tmp_path, header, name, OK=good, NOK=bad)
-    assert {"label.good", "label.column"} & {*describe(tmp_path).open_keys}
-
-
-def test_folders_of_other_words_are_shown_as_labels(tmp_path: Path) -> None:
-    for word in ("Gutteile", "Ausschuss"):
-        in_files(tmp_path, "time,force", f"{word}/{{}}.csv")
-    note = describe(tmp_path).notes["label.column"]
-    assert "label.path=([^/]+)/[^/]*$ has few words (Ausschuss: 5, Gutteile: 5)" in note
-
-
 def test_times_that_repeat_are_asked_about(tmp_path: Path) -> None:
     for i in range(5):
         rows = [f"10:00:{k // 10:02},{k * i % 7}" for k in range(60)]
@@ -661,48 +607,14 @@ def test_a_listing_names_parts_once_and_is_no_recording(tmp_path: Path) -> None:
     assert "1 of 5 rows of part_list.csv name no recording: 9." in data.notes
 
 
-def test_sources_of_labels_must_agree(tmp_path: Path) -> None:
-    written = write(tmp_path, "files text", *some(), PLAIN, all_nok)
-    check = replace(LABEL, path="_([A-Z]+)$")
-    description = replace(written.description, check=(check,))
-    assert_only_fault(replace(written, description=description), column="")
-
-
-def all_nok(columns: Columns) -> None:
-    columns["verdict"] = ["NOK"] * N
-
-
-def test_rows_are_kept_or_lost_by_the_words_of_a_column(tmp_path: Path) -> None:
-    written = write(tmp_path, "files text", *some(), PLAIN)
-    for i, path in enumerate(sorted(tmp_path.glob("*.csv"))):
-        head, *lines = path.read_text().splitlines()
-        words = ["bad" if row == 7 else "odd" if (row, i) == (9, 2) else "ok" for row in range(N)]
-        rows = [f"{line},{word}" for line, word in zip(lines, words, strict=True)]
-        other = ["x,OK,lost,1,,off"]
-        path.write_text("\n".join([f"{head},Status", *other, *rows]))
-    about = {"Status": RowWords(keep=("ok",), drop=("off",), invalid=("bad",))}
-    written.X[:, :, 7] = np.nan
-    written = replace(written, description=replace(written.description, rows=about))
-    assert_only_fault(written, [12], "Status")
-
-
 # Descriptions.
 
 
-def test_a_label_in_a_column_is_counted_over_the_files_that_were_looked_at(tmp_path: Path) -> None:
-    for i in range(150):
-        rows = "".join(f"{k * 0.004:.3f},{k + i},{WORDS[i % 2]}\n" for k in range(8))
-        (tmp_path / f"part_{i}.csv").write_text(f"time,FZ,verdict\n{rows}")
-    proposal = describe(tmp_path)
-    assert (proposal.open_keys, proposal.label.column) == ((), "verdict")
-    assert proposal.notes["label.column"] == "NOK: 75, OK: 30, over 105 recordings"
-
-
-@pytest.mark.parametrize("rate", [3.0, 10.0, 300.0, 700.0])
+@pytest.mark.parametrize("rate", [3.0, 700.0])
 def test_a_resampled_recording_may_end_one_step_before_the_trace(
     tmp_path: Path, rate: float
 ) -> None:
-    for n in range(3, 60):
+    for n in range(3, 60, 4):
         table = pd.DataFrame({"time": np.arange(n) / rate, "FZ": np.arange(n) ** 2.0, "y": 1})
         about = {
             "format": "frame",

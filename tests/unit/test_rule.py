@@ -49,14 +49,6 @@ def test_the_scalar_rule_is_the_interval_and_the_policy(
     assert 0.0 <= lower <= upper <= 1.0
 
 
-def test_the_fewest_all_good_neighbours_that_accept_are_those_of_the_field() -> None:
-    # 25 at (0.1, 90 %), 73 at (0.05, 95 %), 7 at (0.2, 80 %): lower = n / (n + z^2) >= LB.
-    for alpha, lower_bound, fewest in ((0.1, 0.9, 25), (0.05, 0.95, 73), (0.2, 0.8, 7)):
-        rule = Policy(alpha, lower_bound).rule()
-        assert [rule(n, 0)[0] for n in (fewest - 1, fewest)] == [0, 1]
-        assert [rule(0, n)[0] for n in (fewest - 1, fewest)] == [0, 2]
-
-
 class FuseRule(DecisionRule):
     """Accepts nothing for a while after a part that looked good enough to accept turned out bad."""
 

@@ -35,44 +35,6 @@ def correct(store: SqlStore, success: bool | None, *names: str, author: str = "k
     )
 
 
-def test_a_forgotten_label_takes_no_part_and_its_trace_stays(store: SqlStore) -> None:
-    fill(store)
-    correct(store, None, "1", "3")
-    labelled = store.labelled()
-    assert (labelled.seq.tolist(), labelled.labels.tolist(), labelled.hashes.tolist()) == (
-        [1, 3, 5],
-        [1, 1, 1],
-        [100, 102, 104],
-    )
-    np.testing.assert_array_equal(labelled.traces, np.stack([trace(i) for i in (0, 2, 4)]))
-    assert store.labelled(2).seq.tolist() == [3, 5]
-    assert [item.seq for item in store.outcomes_since(0)] == [1, 3, 5]
-    stored = store.get_decision("1")
-    assert (stored.success, stored.source, stored.trace.tolist()) == (
-        None,
-        Source.VERIFICATION,
-        trace(1).tolist(),
-    )
-    assert (store.status()["labels"], store.status()["forgotten"], store.status()["corrected"]) == (
-        3,
-        2,
-        0,
-    )
-
-
-def test_labels_are_read_as_they_stood_after_any_correction_and_between_two_numbers(
-    store: SqlStore,
-) -> None:
-    fill(store)
-    correct(store, False, "0")
-    correct(store, None, "0", "2")
-    assert store.labelled(corrected_to=0).labels.tolist() == [1, 0, 1, 0, 1]
-    assert store.labelled(corrected_to=1).labels.tolist() == [0, 0, 1, 0, 1]
-    assert store.labelled(corrected_to=2).seq.tolist() == [2, 3, 4, 5]
-    assert store.labelled(first=2, last=4).seq.tolist() == [2, 4]
-    assert store.labelled(1, first=2, last=4, corrected_to=0).seq.tolist() == [4]
-
-
 def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: SqlStore) -> None:
     fill(store, 3)
     store.put_event("note", "before")
@@ -158,36 +120,6 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
         later.forgotten_accepts,
         later.audited_accepts,
     ) == (1, 0, 1, 0)
-
-
-def test_what_an_earlier_version_decided_can_be_left_out(store: SqlStore) -> None:
-    for version in (1, 2):
-        for i in range(3):
-            name = f"{version}-{i}"
-            accept = Decision(
-                name,
-                Action.ACCEPT,
-                Action.ACCEPT,
-                0.9,
-                1.0,
-                9,
-                0,
-                None,
-                version,
-                Reason.CERTAIN,
-                False,
-                0.1,
-            )
-            put_decision(store, accept, trace(i), i, False)
-        put_labels(
-            store, NewLabel(f"{version}-0", True, Source.CONFIRMED, version, None, silent=version)
-        )
-    assert store.unreported_accepts(2) == ["2-1", "2-2"]
-    assert (store.silent_total(2), store.silent_total()) == (2, 3)
-    assert ([item.seq for item in store.outcomes_since(0, 2)], len(store.outcomes_since(0))) == (
-        [2],
-        2,
-    )
 
 
 @settings(

@@ -1,6 +1,5 @@
 """UMAP in PyTorch agrees with umap-learn, goes on from training to training, and is restored."""
 
-import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from torch import Tensor
 
 from dengine import (
     Action,
-    DataEngine,
     Dataset,
     ModelPrediction,
     UmapLearnReducer,
@@ -146,13 +144,6 @@ def test_places_that_were_trained_warm_are_as_good_as_those_of_one_fit(
     assert label_agreement(places, y) > label_agreement(fitted.embedding_.numpy(), y) - 0.02
 
 
-def test_frames_keep_the_neighbours_of_whole_traces(insertion: Traces, fitted: UmapReducer) -> None:
-    rows = insertion[0][:, 0]
-    whole = NearestNeighbors(n_neighbors=14).fit(rows).kneighbors(return_distance=False)
-    pairs = zip(whole.tolist(), fitted.neighbors_.indices.tolist(), strict=True)
-    assert np.mean([len(set(pair) & set(other)) / 14 for pair, other in pairs]) > 0.95
-
-
 @pytest.mark.parametrize(
     ("samples", "n_frames"),
     [(1, 1), (2, 2), (99, 99), (101, 101), (250, 125), (404, 101), (1000, 100)],
@@ -236,17 +227,6 @@ def test_state_is_restored_bit_for_bit_over_further_trainings(insertion: Traces)
         np.testing.assert_array_equal(restored.transform(X), reducer.transform(X))
 
 
-def test_places_repeat_exactly_with_a_random_state_and_differ_between_two(
-    insertion: Traces,
-) -> None:
-    X, _ = insertion
-    first, same, other = (
-        UmapReducer(random_state=seed).fit(X[:100]).embedding_ for seed in (1, 1, 2)
-    )
-    assert torch.equal(first, same)
-    assert not torch.equal(first, other)
-
-
 def test_the_scripted_module_is_the_eager_one_bit_for_bit(
     insertion: Traces,
     fitted: UmapReducer,
@@ -308,15 +288,6 @@ def test_both_exports_decide_as_the_model_does(
         assert [decision.action for decision in decided] == actions
         results = [decision.embedding for decision in decided]
         np.testing.assert_allclose(results, places, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("n_components", [1, 2, 3])
-def test_the_embedding_has_as_many_components_as_asked(n_components: int) -> None:
-    X, _ = toy_traces(120)
-    reducer = UmapReducer(n_components=n_components).fit(X)
-    assert reducer.embedding_.shape == reducer.transform(X).shape == (120, n_components)
-    assert reducer.module().dim == n_components
-    assert trustworthiness(X[:, 0], reducer.embedding_.numpy(), n_neighbors=15) > 0.8
 
 
 @pytest.mark.parametrize(
@@ -436,29 +407,6 @@ def test_attraction_is_the_gradient_of_the_cross_entropy(fitted: UmapReducer) ->
     assert (stiffness > 0.0).all()
 
 
-def test_a_new_trace_lies_where_the_attraction_of_its_neighbours_nearly_balances(
-    insertion: Traces,
-) -> None:
-    X, _ = insertion
-    reducer = UmapReducer().fit(X[:300])
-    encoder = reducer.encoder_
-    frames = encoder.make_frames(torch.from_numpy(X[300:]))
-    distances, nearest = torch.cdist(frames, encoder.references[:300]).topk(15, largest=False)
-    strengths = encoder.strengths(distances)
-    neighbors = reducer.embedding_[nearest]  # (100, 15, 2)
-    a, b = find_ab_params(0.1)
-
-    def net_attraction(point: Tensor) -> Tensor:
-        offsets = neighbors - point[:, None]
-        squared = offsets.square().sum(2) + 1e-3
-        coefficients = strengths * squared ** (b - 1) / (1 + a * squared**b)
-        return (coefficients[:, :, None] * offsets).sum(1).norm(dim=1)
-
-    start = (strengths[:, :, None] * neighbors).sum(1) / strengths.sum(1, keepdim=True)
-    placed = torch.from_numpy(reducer.embed(X[300:])[:, 0])
-    assert net_attraction(placed).mean() < 0.2 * net_attraction(start).mean()
-
-
 def test_repulsion_is_the_gradient_of_the_cross_entropy_of_places_that_are_apart() -> None:
     a, b = find_ab_params(0.1)
     places = torch.zeros(2, 1, requires_grad=True)
@@ -479,23 +427,6 @@ def test_negative_samples_are_other_places_each_drawn_equally_often() -> None:
     assert (torch.bincount(samples.flatten().long()) == 16).all()
 
 
-def test_an_engine_with_umap_is_opened_without_a_refit(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    X, y = toy_traces(120)
-    url = str(tmp_path / "engine.db")
-    with DataEngine("umap", store=url, replaying=True) as engine:
-        for x, label in zip(X, y, strict=True):
-            engine.report(engine.decide(x).id, bool(label))
-        version = engine.version
-    assert version
-    monkeypatch.setattr(UmapReducer, "_train", None)
-    with DataEngine.open(url) as engine:
-        assert engine.version == version
-        assert engine.decide(X[0]).embedding is not None
-
-
 def test_points_of_another_umap_are_not_counted_with_this_one() -> None:
     X, y = toy_traces(120)
     state = ModelPrediction("umap").fit(X, y).get_state()
@@ -503,11 +434,3 @@ def test_points_of_another_umap_are_not_counted_with_this_one() -> None:
     refitted = ModelPrediction("umap").fit(X, y)
     with pytest.raises(StoreError, match=r"whose UmapReducer has no state; .*dengine train"):
         refitted.set_state(stateless)
-
-
-def test_a_fitted_reducer_travels_between_processes(insertion: Traces) -> None:
-    X, _ = insertion
-    reducer = UmapReducer()
-    train(reducer, X, NUMBERS[:100])
-    received = pickle.loads(pickle.dumps(reducer))
-    np.testing.assert_array_equal(train(received, X, NUMBERS), train(reducer, X, NUMBERS))

@@ -293,25 +293,3 @@ def test_a_full_disk_costs_no_label_that_was_acknowledged_and_no_decision(
     assert set(acknowledged) <= {line.decision.id for line in journal.lines if line.label}
     with start() as cell:  # there is room again
         assert cell.decide(X[0])[0] != "-"
-
-
-@ONE
-def test_with_a_key_only_what_was_signed_with_it_is_loaded(
-    programs: Path, learned: Learned, tmp_path: Path
-) -> None:
-    for name in ("model.ts", "model.ts.sha256"):
-        shutil.copy(learned.file.with_name(name), tmp_path / name)
-    signed = learned.file.with_name("model.ts.sig").read_text()
-    (short := tmp_path / "short.key").write_text("secret\n")
-    for key, signature, expected in (
-        (make_key(tmp_path / "other.key"), signed, "its signature is not one by this key"),
-        (
-            learned.key,
-            signed.replace(signed[12:76], "0" * 64),
-            "its signature is not one by this key",
-        ),
-        (short, signed, "is too short for a key"),
-    ):
-        (tmp_path / "model.ts.sig").write_text(signature)
-        with Program(programs, tmp_path / "model.ts", "--key", key) as cell:
-            cell.must_refuse(expected)

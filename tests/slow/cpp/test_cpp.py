@@ -6,18 +6,15 @@ import hashlib
 import hmac
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dengine import DataEngine, Dataset, TraceSpec, export_torchscript, load_exported
-from dengine.errors import DataError
 from dengine.export import import_journal
-from dengine.export.cell_journal import read_journal
 from dengine.records import Action, Reason
-from tests.support.exports import SAMPLES, cell_journal, fitted, trained, wild_traces
+from tests.support.exports import SAMPLES, cell_journal, trained, wild_traces
 from tests.support.programs import Program, must_agree
 
 
@@ -69,15 +66,6 @@ def test_it_takes_the_engines_decisions(
         Reason.CONSTANT,
         Reason.SATURATED,
     }
-
-
-def test_several_channels_come_one_after_the_other(
-    programs: Path, make_data, tmp_path: Path
-) -> None:
-    data = make_data(150, 40, 3)
-    path = export_torchscript(fitted(data), tmp_path / "model.ts")
-    with Program(programs, path) as cell:
-        must_agree([cell.decide(x) for x in data.X], load_exported(path).decide_many(data.X))
 
 
 @pytest.mark.parametrize("fit", ["cut", "pad", "resample"])
@@ -143,29 +131,6 @@ def test_a_journal_that_is_damaged_anywhere_but_at_its_end_is_refused_with_the_l
             cell.must_refuse(
                 "is damaged in line 3, or a line before it is missing; take its earlier lines in"
             )
-
-
-@pytest.mark.parametrize(
-    ("order", "number"),
-    [((0, 2), 2), ((0, 2, 1), 2), ((0, 1, 1, 2), 3)],
-    ids=["missing", "swapped", "doubled"],
-)
-def test_a_missing_swapped_or_doubled_line_is_refused_and_what_is_before_it_is_imported(
-    programs: Path, file: Path, written: str, tmp_path: Path, order: tuple[int, ...], number: int
-) -> None:
-    lines = written.splitlines()
-    (journal := tmp_path / "cell.csv").write_text("\n".join([*(lines[i] for i in order), ""]))
-    with Program(programs, file, "--journal", journal) as cell:
-        cell.must_refuse(f"is damaged in line {number}, or a line before it is missing")
-    with (
-        pytest.raises(DataError, match=f"The checksum of line {number} of")
-        if number == 2
-        else nullcontext()
-    ):
-        assert (
-            f"The checksum of line {number} of"
-            in read_journal(journal, TraceSpec(SAMPLES)).set_aside
-        )
 
 
 def test_a_line_that_was_cut_while_it_was_written_is_dropped_said_and_cut_off(
