@@ -239,7 +239,10 @@ class Learner:
         if is_due:
             n_labels = max(self.labels.new_labels, len(self._window))
             is_due = n_labels >= self.live.newest.min_traces
-        lacks_steps = self._lacks_steps and not (once and self._report is not None)
+        # A training may have ended by its budget, as after a large import; then another begins
+        # without new labels. Peers would each train the same version, so they wait for labels.
+        is_alone = self._peers is None and self._was_accepted
+        lacks_steps = is_alone and self.live.lacks_steps and not (once and self._report is not None)
         if not (is_due or lacks_steps or self._is_requested):
             return None
         if self._outbox.fault:
@@ -248,20 +251,6 @@ class Learner:
             return self.retrain(wait=False)
         except StoreError:  # logged by the outbox; the labels wait in its journal
             return None
-
-    @property
-    def _lacks_steps(self) -> bool:
-        """Whether the newest version has training steps left, as after a large import.
-
-        While it has, the engine retrains without waiting for new labels. False in any of these
-        cases: no version is in use yet; the last retrain was dropped; the newest version's retrain
-        took no step; or the engine has peers, each of which would train the same version.
-        """
-        is_alone = self._peers is None and self.live.answering is not None
-        if not (is_alone and self._was_accepted):
-            return False
-        report = self.live.newest.report
-        return report.n_steps > 0 and report.n_steps_left > 0
 
     @property
     def is_swapping(self) -> bool:

@@ -53,6 +53,8 @@ class LiveModel:
         Largest number that a version ever had; after damage an earlier version may answer.
     trained_on : TrainedOn
         Labels that the answering version was trained on.
+    lacks_steps : bool
+        Whether the answering version's training took steps and has some left.
     corrected_to : int
         Number of the newest correction that the references have.
     overdue : set of str
@@ -76,6 +78,7 @@ class LiveModel:
         self.version = 0
         self.newest_version = 0
         self.trained_on = TrainedOn()
+        self.lacks_steps = False
         self.corrected_to = 0
         self.overdue: set[str] = set()
         self.overdue_to = 0
@@ -165,6 +168,8 @@ class LiveModel:
         self.version = version
         self.newest_version = max(version, self.newest_version)
         self.trained_on = trained_on
+        report = model.report
+        self.lacks_steps = report.n_steps > 0 and report.n_steps_left > 0
 
     def learn(self, stored: StoredDecision, success: bool, unobserved: int | None) -> Point | None:
         """Update the rule with an outcome, and make the trace a reference of the answering model.
