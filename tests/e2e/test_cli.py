@@ -27,12 +27,12 @@ POLICY = ["--alpha", "0.2", "--lower-bound", "0.8"]
 KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
 VERBS = sorted(main.commands)
 LESS = {  # so that an example takes seconds; its own options are all read
-    "compare": "--repeats 1 --cycles 60",
+    "compare": "--reducers pca --repeats 1 --cycles 60",
     "costs": "--alphas 0.5 --lower-bounds 0.8 --cycles 100 --n-jobs 1",
     "replay": "--repeats 1 --cycles 60",
     "run": "--cycles 6",
     "simulate": "--n 4",
-    "train": "--data small.npz",
+    "train": "--data small.npz --reducer pca",
 }
 OWN_REDUCERS = """
 import os, signal
@@ -186,6 +186,7 @@ def compare(data: Path, words: str) -> list[object]:
     return ["compare", "--data", data, "--cycles", 60, *words.split()]
 
 
+@pytest.mark.merge
 def test_the_papers_grid_writes_its_tables_its_figures_and_its_findings(
     data: Path, tmp_path: Path
 ) -> None:
@@ -213,6 +214,7 @@ main(["status", "Gdańsk.db"])
 """
 
 
+@pytest.mark.merge
 def test_a_character_that_the_screen_has_not_is_a_question_mark(
     trained: Path, tmp_path: Path
 ) -> None:

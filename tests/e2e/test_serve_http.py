@@ -558,6 +558,7 @@ def test_sizes_connections_and_rates_are_limited(stream: Dataset) -> None:
         assert answer.headers["retry-after"] == "1"
 
 
+@pytest.mark.merge
 def test_connections_without_a_token_keep_nobody_out_who_has_one(
     tmp_path: Path, stream: Dataset
 ) -> None:

@@ -7,11 +7,9 @@ import pytest
 
 from dengine.experiments.paper import (
     ALPHAS,
-    INTERVALS,
     LOWER_BOUNDS,
     PUBLISHED,
     findings,
-    grid_lines,
     paper_table,
 )
 
@@ -108,14 +106,3 @@ def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_not
     lines = findings(frame(certain=0, false_positive=0, first_certain=float("nan")))
     claims = ("share of false positives", "delays the first", "answer")
     assert [by_claim(lines, claim) for claim in claims] == [[True], [], []]
-
-
-def test_the_page_has_a_part_for_each_feedback() -> None:
-    page = "\n".join(grid_lines(pd.concat([frame(), frame("binomial", confirm=True)])))
-    counts = {
-        "## Guarantee local": 2,
-        "good accepted parts confirmed": 1,
-        "false positives / certain": 2,
-    }
-    assert {text: page.count(text) for text in counts} == counts
-    assert all(f"**conv, {interval}**" in page for interval in INTERVALS)
