@@ -41,7 +41,7 @@ REPEATS ?= 200
 # A hundred processes import the same modules: they are compiled once.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test test-merge test-all lint docs proof evidence audit dist clean
+.PHONY: setup demo test test-merge test-ci test-all lint docs proof evidence audit dist clean
 
 setup: $(VENV)/.dev
 
@@ -68,6 +68,10 @@ test: $(VENV)/.dev
 # The slow tests that each merge must pass; a PostgreSQL server is named by DENGINE_TEST_POSTGRES (.ci/postgres.sh).
 test-merge: $(VENV)/.dev
 	$(PYTEST) -m merge
+
+# `test` and `test-merge` in one go, whose workers start, import and collect once.
+test-ci: $(VENV)/.dev
+	$(PYTEST) -m "not slow or merge"
 
 # Everything: each page and notebook, umap-learn, fuzzing, outages, statistics.
 test-all: $(VENV)/.dev

@@ -74,6 +74,7 @@ MERGE = (
     "test_without_posix",
     "test_serve_process",
     "test_page",
+    "test_read_only",
     "test_cpp",
     "test_c_interface",
     "test_onnx_program",

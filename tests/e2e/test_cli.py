@@ -27,12 +27,12 @@ POLICY = ["--alpha", "0.2", "--lower-bound", "0.8"]
 KNOWN = [*POLICY, "--guarantee", "pooled", "--stops", "all"]
 VERBS = sorted(main.commands)
 LESS = {  # so that an example takes seconds; its own options are all read
-    "compare": "--repeats 1 --cycles 60",
+    "compare": "--reducers pca --repeats 1 --cycles 60",
     "costs": "--alphas 0.5 --lower-bounds 0.8 --cycles 100 --n-jobs 1",
     "replay": "--repeats 1 --cycles 60",
     "run": "--cycles 6",
     "simulate": "--n 4",
-    "train": "--data small.npz",
+    "train": "--data small.npz --reducer pca",
 }
 OWN_REDUCERS = """
 import os, signal
@@ -186,6 +186,7 @@ def compare(data: Path, words: str) -> list[object]:
     return ["compare", "--data", data, "--cycles", 60, *words.split()]
 
 
+@pytest.mark.merge
 def test_the_papers_grid_is_played_and_drawn_with_a_line_for_each_of_its_cells(
     data: Path, tmp_path: Path
 ) -> None:
@@ -208,6 +209,7 @@ main(["status", "Gdańsk.db"])
 """
 
 
+@pytest.mark.merge
 def test_a_character_that_the_screen_has_not_is_a_question_mark(
     trained: Path, tmp_path: Path
 ) -> None:
@@ -295,8 +297,9 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(
     assert len((tmp_path / "run.csv").read_text().splitlines()) == 111
     assert "resumed" in document(*words, "--cycles", 30, "--force")["title"]
     with DataEngine.open(store) as engine:
-        hashes = [past.content_hash for past in engine.history()]
-    assert len(hashes) == len({*hashes}) == 140
+        assert engine.status().ever.decisions == 140
+        hashes = engine.store.labelled().hashes.tolist()
+    assert len(hashes) == len({*hashes})
     more = dengine(*words, "--cycles", 60, "--force")
     assert more.exit_code == 1
     assert re.search(r"at most 2\d cycles, got 60", more.stderr)
@@ -408,7 +411,7 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     for name in ("sentence", "sentence_on_rejects"):
         assert shown["certificate"][name] in text
     assert re.search(r"safe mode too many .* safe mode time \d{4}-\d\d-\d\d ", text)
-    ended = well(*words, "--cycles", 380)
+    ended = well(*words[:-2], "--cycles", 380)  # the store knows its reducer
     assert re.search(r"(?m)^After cycle \d+: safe mode ended\.$", ended.stdout)
     assert "safe mode ended." in ended.stderr
     assert "safe mode too" not in line_of("status", store)

@@ -141,6 +141,7 @@ def test_it_ends_with_whoever_made_it_also_at_work(
         at_work.result(0)
 
 
+@pytest.mark.merge
 def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_taken_for_hung(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -158,6 +159,7 @@ def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_ta
         assert [report.accepted for report in engine.store.retrains()] == [True]
 
 
+@pytest.mark.merge
 @pytest.mark.parametrize("fault", ["killed", "hung"])
 def test_a_process_that_was_given_up_is_started_again_and_retrains(
     fault: str, data: Dataset, monkeypatch: pytest.MonkeyPatch

@@ -557,6 +557,7 @@ def test_sizes_and_connections_are_limited(
         assert client.get("/healthz").status_code == 200
 
 
+@pytest.mark.merge
 def test_a_hundred_idle_clients_keep_nobody_out_and_a_wrong_token_is_logged_once(
     tmp_path: Path, stream: Dataset
 ) -> None:

@@ -7,12 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Reason, ReplayCell
-from dengine.errors import BusyError, StoreError, TraceError
-from dengine.serve.demo import drive
+from dengine import DataEngine, Dataset, Reason
+from dengine.errors import StoreError, TraceError
 from dengine.serve.service import CellService
 from tests.support.driving import Counting, evidence
 from tests.support.serving import RECIPE, WAIT, a_service, busy_engine
@@ -126,21 +124,3 @@ def test_a_service_whose_second_connection_fails_closes_its_engine_and_ends_its_
         CellService(lambda: DataEngine.open_or_create(tmp_path / "a.db"), tmp_path / "no" / "b.db")
     assert "dengine-engine" not in [thread.name for thread in threading.enumerate()]
     DataEngine.open(tmp_path / "a.db").close()
-
-
-def test_a_demonstration_goes_on_after_a_report_that_found_the_queue_full(
-    stream: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with a_service() as service:
-        report = service.report
-        full = iter([True])
-
-        async def busy_once(decision_id: str, success: bool) -> object:
-            if next(full, False):
-                raise BusyError("The queue is full.")
-            return await report(decision_id, success)
-
-        monkeypatch.setattr(service, "report", busy_once)
-        asyncio.run(drive(service, ReplayCell(stream, np.arange(5)), speed=1.0))
-        status = asyncio.run(service.read(lambda store: store.status()))
-        assert (status["decisions"], status["labels"]) == (5, 4)

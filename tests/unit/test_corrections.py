@@ -15,7 +15,6 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import Action, DataEngine, Dataset, Reason, Recipe
 from dengine.errors import SettingError
-from dengine.export.bundle import exportable
 from dengine.folds import fold_of
 from tests.support.driving import RECIPE, Counting, evidence, make
 from tests.support.driving import drive as play
@@ -162,26 +161,6 @@ def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
     assert engine.certificate().accepted.upper > before.upper
     engine.correct(stopped[1].id, True)
     assert engine.certificate().accepted.n_bad == before.n_bad
-
-
-def test_what_is_so_already_is_said_and_changes_nothing(data: Dataset) -> None:
-    engine = make()
-    play(engine, data, 0, 60, confirm=True)
-    name = labelled(engine, 1)
-    engine.forget(name)
-    assert engine.release().event is None
-    engine.rollback(engine.version)
-    before = (state(engine), len(engine.store.events()))
-    stored = labelled(engine, 2)
-    answers = [
-        engine.forget(name),
-        engine.correct(stored, engine.store.get_decision(stored).success),
-        engine.rollback(engine.version),
-        engine.set_policy(engine.policy),
-    ]
-    assert [answer.event for answer in answers] == [None] * 4
-    assert all("nothing changed" in answer.text for answer in answers)
-    assert (state(engine), len(engine.store.events())) == before
 
 
 def test_a_part_that_came_twice_is_corrected_where_it_was_meant(data: Dataset) -> None:
@@ -388,30 +367,6 @@ def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_
         replace(engine.policy, audit_rate=0.5, stops="all")
     )  # what the engine does itself
     assert engine.policy.audit_rate == 0.5
-
-
-def test_another_policy_decides_from_now_on_and_earlier_decisions_keep_their_bounds(
-    data: Dataset,
-) -> None:
-    engine = make()
-    play(engine, data, 0, 150, confirm=True)
-    probe = data.X[160]
-    before = engine.decide(probe)
-    text = engine.set_policy(replace(engine.policy, alpha=0.001, lower_bound=0.99), author="kim")
-    after = engine.decide(probe)
-    assert (before.action, after.action) == (Action.ACCEPT, Action.VERIFY)
-    assert (after.n_success, after.n_failure) == (before.n_success, before.n_failure)
-    assert after.lower < before.lower
-    assert engine.store.get_decision(before.id).decision.lower == before.lower
-    assert text.text == "The policy's alpha 0.1 -> 0.001, lower_bound 0.9 -> 0.99."
-    event = engine.store.events(1)[0]
-    assert (event.data["old"]["alpha"], event.data["new"]["alpha"], event.author) == (
-        0.1,
-        0.001,
-        "kim",
-    )
-    assert exportable(engine).recipe == engine.recipe.to_toml()
-    assert "alpha = 0.001" in exportable(engine).recipe
 
 
 def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data: Dataset) -> None:

@@ -256,21 +256,6 @@ def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
     assert engine.store.status()["actions"]["verify"] == 130
 
 
-@pytest.mark.parametrize("message", ["singular matrix\nand more", ""])
-def test_a_candidate_that_cannot_be_trained_is_dropped_and_recorded(
-    data: Dataset, message: str
-) -> None:
-    engine = make(model=Failing("fit", ValueError(message)))
-    cycles = play(engine, data, 0, 90)
-    reports = [c.retrain for c in cycles if c.retrain is not None]
-    assert [r.accepted for r in reports] == [False, False]
-    assert all(
-        r.reason.startswith("dropped: ValueError") and "and more" not in r.reason for r in reports
-    )
-    assert engine.store.retrains() == reports
-    assert (engine.version, {c.decision.model_version for c in cycles}) == (0, {0})
-
-
 def test_a_dropped_candidate_leaves_the_old_version_answering(data: Dataset) -> None:
     engine = make()
     play(engine, data, 0, 120)

@@ -94,23 +94,20 @@ def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_pat
 
 def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path: Path) -> None:
     target = tmp_path / "model.ts"
-    for present in (target, sibling_path(target, "sha256")):
+    total = sibling_path(target, "sha256")
+    for present in (target, total):
         present.write_bytes(TEXT)
-        done = dengine("export", store, "--out", target)
-        assert (done.exit_code, present.read_bytes()) == (1, TEXT)
+        assert dengine("export", store, "--out", target).exit_code == 1
+        assert present.read_bytes() == TEXT
         assert [file.name for file in tmp_path.iterdir()] == [present.name]
         present.unlink()
     target.write_bytes(TEXT)
     (tmp_path / ".dengine-0000000000000000.partial").symlink_to(store)
     assert dengine("export", store, "--out", target, "--force").exit_code == 0
-    assert (
-        sibling_path(target, "sha256").read_text()
-        == f"{hashlib.sha256(target.read_bytes()).hexdigest()}  model.ts\n"
-    )
+    digest = hashlib.sha256(target.read_bytes()).hexdigest()
+    assert total.read_text() == f"{digest}  model.ts\n"
     assert load_exported(target).trace.samples == 100
-    sibling_path(target, "sha256").write_text(
-        "0" * 64 + "  model.ts\n"
-    )  # as if killed between the file and its sum
+    total.write_text("0" * 64 + "  model.ts\n")  # as if killed between the file and its sum
     with pytest.raises(ExportError, match="is damaged or truncated"):
         load_exported(target)
 

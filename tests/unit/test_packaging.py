@@ -65,6 +65,7 @@ def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
+@pytest.mark.merge
 def test_the_wheel_has_dengine_whole_and_no_other_top_level_name(wheel: Path, repo: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name.split("/")[0] for name in names} == {
@@ -116,6 +117,7 @@ def used(wheel: Path, target: Path) -> list[str]:
     return fresh(code, "-I", "-S", cwd=target.parent).splitlines()
 
 
+@pytest.mark.merge
 def test_the_wheel_works_where_there_is_no_checkout(
     used: list[str], target: Path, repo: Path
 ) -> None:
@@ -125,6 +127,7 @@ def test_the_wheel_works_where_there_is_no_checkout(
     assert (size, played) == ("1503 1000", "60")
 
 
+@pytest.mark.merge
 def test_an_engine_with_pca_in_memory_loads_nothing_heavy(used: list[str]) -> None:
     loaded = {*used[1].split()}
     assert {"dengine", "torch"} <= loaded

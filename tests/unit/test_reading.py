@@ -1,4 +1,6 @@
-"""Recordings are read back as they were written, in every layout, and damage is a named fault."""
+"""Recordings are read back as they were written, and damage is a named fault; the corpus of
+test_recordings_corpus.py has more layouts.
+"""
 
 import gzip
 import json
@@ -119,15 +121,8 @@ def write_parts(folder: Path, kind: str, stems: Cells, parts: list[Columns], sty
 
 def table_of(layout: str, objects: list[dict[str, Any]], about: Columns) -> pd.DataFrame:
     """Return the table of all parts in a layout."""
-    if layout.startswith("long"):
+    if layout == "long":
         return pd.concat(map(pd.DataFrame, objects))
-    if layout == "wide parquet":
-        return pd.DataFrame(objects).assign(verdict=about["verdict"])
-    if layout == "columns text":
-        names = map("run_{}_{}".format, about["part"], about["verdict"])
-        clock = {"time": objects[0]["time"]} if "time" in objects[0] else {}
-        samples = (part[CHANNELS[0]] for part in objects)
-        return pd.DataFrame({**clock, **dict(zip(names, samples, strict=True))})
     cells = [
         {
             f"{name}_{t}": cell
@@ -141,29 +136,21 @@ def table_of(layout: str, objects: list[dict[str, Any]], about: Columns) -> pd.D
 
 def described(layout: str, X: np.ndarray, style: Style, names: Cells, kind: str) -> Description:
     """Return the description of recordings that stand in single files, but for their files."""
-    n_channels = len(names)
-    in_path = {"part": PartSource(path=r"(\d+)_"), "label": replace(LABEL, path="_([A-Z]+)$")}
-    in_columns = {"part": PartSource(("part",)), "label": replace(LABEL, column="verdict")}
-    sources: dict[str, Any] = in_path if layout in ("files", "columns") else in_columns
-    if layout == "files" and style.label_column:
-        sources["label"] = in_columns["label"]
-    if (layout, kind) == ("files", "jsonl"):
-        sources = in_columns
-    columns = {
-        "columns": ["run*"],
-        "npz": [f"x.{c}" for c in range(n_channels)] if n_channels > 1 else ["x"],
-        "wide text": [f"{name}_*" for name in names],
-    }
-    found = columns.get(f"{layout} {kind}", columns.get(layout, names))
-    has_clock = style.has_clock and layout != "npz" and f"{layout} {kind}" != "wide text"
+    label = replace(LABEL, column="verdict")
+    part = PartSource(("part",))
+    if layout == "files" and kind != "jsonl":
+        part = PartSource(path=r"(\d+)_")
+        label = label if style.label_column else replace(LABEL, path="_([A-Z]+)$")
+    is_wide = layout == "wide"
     return Description(
         format=kind,
         layout=layout,
         text=style.form if kind == "text" else TextForm(),
-        time=Clock(("time",), rate_hz=RATE) if has_clock else Clock(),
-        channels=tuple(map(Channel, found)),
+        time=Clock(("time",), rate_hz=RATE) if style.has_clock and not is_wide else Clock(),
+        channels=tuple(Channel(f"{name}_*" if is_wide else name) for name in names),
         traces=TraceForm(X.shape[2]),
-        **sources,
+        part=part,
+        label=label,
     )
 
 
@@ -177,7 +164,6 @@ def write(
 ) -> Written:
     """Write recordings (n, C, T) with labels (n,) in a layout, the third part edited."""
     layout, kind = layout.split()
-    X = X[:, :1] if layout == "columns" else X
     is_blank = kind == "text" and style.form.delimiter == " "
     names = [n.replace(" ", "_") if is_blank else n for n in CHANNELS[: X.shape[1]]]
     parts = part_columns(X, y, style, names)
@@ -194,12 +180,10 @@ def write(
     is_many = layout == "files" and kind != "jsonl"
     if is_many:
         write_parts(folder, kind, stems, parts, style)
-    elif layout == "npz":
-        save_arrays(single, {"x": squeezed(X).tolist(), **about})
     elif layout == "files":
         single.write_text("\n".join(map(json.dumps, objects)))
     else:
-        table = table_of(f"{layout} {kind}", objects, about)
+        table = table_of(layout, objects, about)
         if kind == "text":
             write_text(single, table.to_dict("list"), style)
         elif kind == "parquet":
@@ -216,9 +200,9 @@ def write(
 
 # Round trips.
 
-TEXT_LAYOUTS = ("files text", "long text", "wide text", "columns text")
-OTHERS = ("files npz", "files json", "files jsonl", "npz npz")
-TABLES = ("long parquet", "long jsonl", "wide parquet")
+TEXT_LAYOUTS = ("files text", "long text", "wide text")
+OTHERS = ("files npz", "files json", "files jsonl")
+TABLES = ("long parquet", "long jsonl")
 LAYOUTS = (*TEXT_LAYOUTS, *OTHERS, *TABLES)
 QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
@@ -353,8 +337,7 @@ def test_a_cell_that_is_no_number_is_a_fault(
     written = write(tmp_path, layout, *some(), style, put(cell))
     is_text, is_wide = "text" in layout, layout == "wide text"
     lines = [written.row + 1 + (0 if is_wide else 7)] if is_text else []
-    column = {"wide text": "FZ_7", "columns text": "run_2_OK"}.get(layout, "FZ")
-    assert_only_fault(written, lines, column)
+    assert_only_fault(written, lines, "FZ_7" if is_wide else "FZ")
 
 
 @pytest.mark.parametrize("layout", BY_ROWS)
@@ -368,12 +351,12 @@ def test_rows_that_do_not_fit_are_a_fault(tmp_path: Path, layout: str, kind: str
 
 
 @pytest.mark.parametrize("value", [float("inf"), -float("inf")])
-@pytest.mark.parametrize("layout", [*TABLES, "files json", "files npz", "npz npz"])
+@pytest.mark.parametrize("layout", [*TABLES, "files json", "files npz"])
 def test_a_number_that_is_not_finite_is_a_fault(tmp_path: Path, layout: str, value: float) -> None:
     X, y = some()
-    X[BAD_PART, 0, 7] = value if layout == "npz npz" else 0
+    X[BAD_PART, 0, 7] = 0
     written = write(tmp_path, layout, X, y, PLAIN, put(value))
-    assert_only_fault(written, column="x.0" if layout == "npz npz" else "FZ")
+    assert_only_fault(written, column="FZ")
 
 
 LINES: dict[str, Callable[[Cells], Cells]] = {

@@ -291,26 +291,18 @@ def test_a_rule_with_a_variable_that_has_no_value_is_compiled(data: Dataset) -> 
 def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_asked_for_themselves(
     data: Dataset, tmp_path: Path, monkeypatch
 ) -> None:
-    accepts, rejects = (
-        rule_module(tmp_path, monkeypatch, name, action)
-        for name, action in (("rule_a", 1), ("rule_b", 2))
-    )
-    assert [says(module.MyRule, data)[0] for module in (accepts, rejects)] == [
-        Action.ACCEPT,
-        Action.REJECT,
-    ]
-    texts = []
+    answers = []
+    for name, action in (("rule_a", 1), ("rule_b", 2)):
+        module = rule_module(tmp_path, monkeypatch, name, action)
+        answers.append(says(module.MyRule, data)[0])
     for number, action in enumerate((1, 2, 0)):
-        cell, named = (
-            RULE.format(limits="math", accept=action).replace("math.LIMIT", "0.5"),
-            f"<cell {number}>",
-        )
-        monkeypatch.setitem(
-            linecache.cache, named, (len(cell), None, cell.splitlines(keepends=True), named)
-        )
+        cell = RULE.format(limits="math", accept=action).replace("math.LIMIT", "0.5")
+        lines, name = cell.splitlines(keepends=True), f"<cell {number}>"
+        monkeypatch.setitem(linecache.cache, name, (len(cell), None, lines, name))
         notebook: dict[str, type[DecisionRule]] = {"__name__": "__main__"}
-        exec(compile(cell, named, "exec"), notebook)  # as a notebook does
+        exec(compile(cell, name, "exec"), notebook)  # as a notebook does
         result, model = says(notebook["MyRule"], data)
         assert model.is_compiled
-        texts.append(result)
-    assert texts == [Action.ACCEPT, Action.REJECT, Action.VERIFY]
+        answers.append(result)
+    accept, reject, verify = Action.ACCEPT, Action.REJECT, Action.VERIFY
+    assert answers == [accept, reject, accept, reject, verify]

@@ -24,8 +24,6 @@ from dengine import (
     Recipe,
     TraceSpec,
     WilsonRadiusClassifier,
-    replay,
-    run_grid,
 )
 from dengine.engine.settings import EngineSettings
 from dengine.errors import ImportRefusedError, SettingError, StoreError
@@ -243,31 +241,6 @@ def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.syspath_prepend(str(tmp_path))
     yield "theirs:Own"
     sys.modules.pop("theirs", None)
-
-
-def test_an_own_reducer_enters_by_name_replay_grid_recipe_and_engine(
-    outside, data: Dataset, tmp_path: Path
-) -> None:
-    recipe = replace(
-        Recipe.from_toml(f'reducer = "{outside}"\n[params]\nn_components = 2\n'), policy=POLICY
-    )
-    assert set(replay(data, recipe, cycles=120).action) >= {"verify", "accept"}
-    frame = run_grid(data, [outside, "pca"], [0.2], [0.8], repeats=1, n_jobs=1, cycles=100)
-    assert list(frame["recipe"]) == [outside, "pca"]
-    run = replay(data, outside, cycles=120)  # it widens as it learns: as many components as traces
-    assert (run.position.shape, np.isfinite(run.position[100:]).all()) == ((120, 100), True)
-    import theirs
-
-    for i, reducer in enumerate(
-        (outside, theirs.Own(3))
-    ):  # by its name, and as an object that has one
-        with DataEngine(reducer, POLICY, store=tmp_path / f"{i}.db") as engine:
-            assert 'reducer = "theirs:Own"' in engine.recipe.to_toml()
-            drive(engine, data, 0, 60)
-            before = engine.decide(data.X[70])
-        with DataEngine.open(tmp_path / f"{i}.db", reducer=reducer) as engine:
-            assert engine.recipe.params.get("n_components") == (3 if i else None)
-            assert engine.decide(data.X[70]).embedding == before.embedding
 
 
 @pytest.mark.parametrize(

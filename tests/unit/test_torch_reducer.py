@@ -10,7 +10,15 @@ import torch
 from sklearn.base import clone
 from torch import nn
 
-from dengine import ConvReducer, DataEngine, Dataset, Recipe, RocketReducer, TorchReducer
+from dengine import (
+    ConvReducer,
+    DataEngine,
+    Dataset,
+    ModelPrediction,
+    Recipe,
+    RocketReducer,
+    TorchReducer,
+)
 from dengine.datasets.importing import import_labelled
 from dengine.decision.scripting import script
 from dengine.errors import SettingError, StoreError
@@ -448,17 +456,12 @@ def test_two_networks_of_one_name_in_one_process_answer_each_for_itself() -> Non
         return Network
 
     X, y = toy_traces(60)
-    embeddings = []
+    points = []
     for sign in (1.0, -1.0):
-        engine = DataEngine(reducer=own_reducer(network(sign)), replaying=True, radius=0.07)
-        for x, good in zip(X, y, strict=True):
-            engine.report(engine.decide(x).id, bool(good))
-        assert engine.retrain().accepted
-        decision = engine.decide(X[0])
-        expected = engine.model.spaces.embed(X[:1])[0]
-        np.testing.assert_allclose(decision.embedding, expected, atol=1e-6)
-        embeddings.append(expected)
-    assert not np.allclose(*embeddings)
+        model = ModelPrediction(own_reducer(network(sign)), folds=2).fit(X, y)
+        points.append([prediction.embedding for prediction in model.predict_many(X[:5])])
+        np.testing.assert_allclose(points[-1], model.spaces.embed(X[:5]), atol=1e-6)
+    assert not np.allclose(*points)
 
 
 def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps_are_complete(
