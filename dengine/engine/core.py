@@ -37,7 +37,8 @@ from ..records import (
     as_id,
     as_success,
 )
-from ..store.outbox import CLOSE_SECONDS, Outbox
+from ..store.journalled import CLOSE_SECONDS
+from ..store.opening import open_outbox
 from ..store.records import StoredDecision
 from ..traces import convert_trace
 from .decide import DecisionMaker, as_part, check_same_trace, verify_decision
@@ -156,7 +157,7 @@ class EngineCore:
         self.store = store
         self.clock = clock
         self.exclusive = ExclusiveUse()
-        self.outbox = Outbox(store, recipe.window, not reading, replaying)
+        self.outbox = open_outbox(store, recipe.window, reading=reading, patient=replaying)
         self.settings = SettingsInForce(settings, self.outbox)
         window = TrainingWindow(recipe.window)
         self.live = LiveModel(template, window, self.outbox, settings.evidence)
@@ -301,7 +302,7 @@ class EngineCore:
         except StoreError as error:
             return self._verify_unrecorded(id_, number, error)
         if stored is None:
-            if spec is None or self.store.wait is None:
+            if spec is None or not self.outbox.is_thread_safe:
                 return verify_decision(id_, number, self.live.version, Reason.LATE)
             reason = Reason.NO_STORE if self.outbox.verify_all_reason else Reason.LATE
             x = convert_trace(trace, spec, False)

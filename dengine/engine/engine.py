@@ -519,7 +519,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if isinstance(spec, TraceSpec):
             self._core.set_trace_spec(spec)
         with ExitStack() as ending:
-            ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
+            ending.callback(self.flush, LONG_WAIT)
             ending.enter_context(frozen_objects())
             for index in range(cycles):
                 yield self._cycle(cell, index)

@@ -436,15 +436,14 @@ class Learner:
 
         Returns a future of the version's number: the report's, or a higher one if a peer of the
         product stored a version first. Without a model only the report is stored, and the number is
-        the report's. Without a journal the store is written before this returns. Raises StoreError
-        where the store is unavailable, or without a journal fails.
+        the report's. Raises StoreError where the store is unavailable.
         """
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
         state = None
         if candidate.model is not None:
             state = self._state_of(candidate.model, candidate.trained_on)
-        return self._outbox.submit(lambda: self._store.put_version(report, newest_seq, state))
+        return self._outbox.store_version(report, newest_seq, state)
 
     def _state_of(self, model: EngineModel, trained_on: TrainedOn) -> dict[str, Any]:
         """Return the arrays of this model as a version, by name, for the store."""

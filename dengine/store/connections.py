@@ -332,8 +332,6 @@ class Database:
         Returns the time, in seconds since 1970, for the ledger's entries.
     product : str or None
         What a new cell makes; None: as the store says.
-    before_use : callable
-        Called before each read and most writes, so that waiting records are written first.
 
     Attributes
     ----------
@@ -345,6 +343,11 @@ class Database:
         The URL without its password.
     newest_entry : (int, str) or None
         Number and digest of the newest ledger entry that this process knows; None: no entry yet.
+    is_in_memory : bool
+        Whether it is SQLite in memory.
+    before_use : callable
+        Called before each read and each write, so that waiting records are written first; set by
+        the outbox.
     on_entry : callable
         Called after a transaction that added a ledger entry is committed; set by the outbox.
 
@@ -361,10 +364,10 @@ class Database:
         cell_id: str,
         clock: Callable[[], float],
         product: str | None,
-        before_use: Callable[[], None],
     ) -> None:
         self.cell_id = cell_id
-        self._before_use = before_use
+        self.is_in_memory = url is None
+        self.before_use: Callable[[], object] = lambda: None
         self._clock = clock
         self._closed = False
         self._pid = os.getpid()
@@ -413,7 +416,7 @@ class Database:
         not dengine's own.
         """
         self.check_open()
-        self._before_use()
+        self.before_use()
         with _store_errors("read", self.name), self._engine.begin() as connection:
             yield connection
 
@@ -577,7 +580,7 @@ class Database:
         if os.getpid() != self._pid:
             raise forked_error(self._pid, self.name)
 
-    def write(self, add_rows: Callable[[sa.Connection], T], flush_first: bool = True) -> T:
+    def write(self, add_rows: Callable[[sa.Connection], T]) -> T:
         """Call `add_rows` in a write transaction, commit it, and return what `add_rows` returned.
 
         This waits until another thread's transaction has ended. The commit includes a ledger entry
@@ -587,8 +590,6 @@ class Database:
         ----------
         add_rows : callable
             Takes the connection, and adds rows.
-        flush_first : bool, default True
-            Call `before_use` first, so that waiting records are written before these rows.
 
         Raises
         ------
@@ -598,8 +599,7 @@ class Database:
             nothing is written, except to an SQLite file that was replaced meanwhile.
         """
         self.check_open()
-        if flush_first:
-            self._before_use()  # before the lock is taken: it may write
+        self.before_use()  # before the lock is taken: it may write
         with self._writing:
             try:
                 with self._transaction() as connection:

@@ -57,7 +57,6 @@ from .records import (
     Event,
     LabelledTraces,
     ModelVersion,
-    NewLabel,
     OutcomeRecord,
     ProductNews,
     StoredDecision,
@@ -66,7 +65,6 @@ from .records import (
     as_data,
     as_text,
     check_state,
-    chunks,
     from_npz,
     from_row,
     keeps_state,
@@ -98,7 +96,6 @@ log = logging.getLogger("dengine")
 WAIT = 0.4  # seconds that an engine waits for its disk and for the database
 # Of the environment: seconds for all stores that are given none.
 WAIT_VARIABLE = "DENGINE_STORE_WAIT"
-MAX_UNWRITTEN_VERSIONS = 40  # of a store in memory, about 1.5 MB each
 
 
 class SqlStore(AbstractContextManager["SqlStore"]):
@@ -108,8 +105,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     ----------
     url : str or None
         A file (SQLite), or an SQLAlchemy URL of SQLite or PostgreSQL. None: SQLite in memory, for
-        replays and trials; such a store has no journal and no owner, stays open after `close`, and
-        is used by one thread at a time.
+        replays and trials; such a store stays open after `close`, and is used by one thread at a
+        time.
     cell_id : str, default "cell"
         Whose rows these are. Several cells share one database without seeing each other.
     clock : callable
@@ -129,9 +126,6 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     Attributes
     ----------
     database : Database
-    before_use : callable
-        Called before every use but `apply_records`, so that waiting records are written first; set
-        by the outbox.
 
     Raises
     ------
@@ -173,17 +167,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             StoreError,
         )
         self.keep_versions = keep_versions
-        self.wait = None if url is None else _checked_wait(wait)
+        self.wait = _checked_wait(wait)
         self.clock = clock
-        self.before_use: Callable[[], None] = self._write_memory
-        # Of a store in memory: what was given and is written to the database when it is first read.
-        self._unwritten: list[Record] = []
-        self._unwritten_versions: list[tuple[Any, ...]] = []
-        self._has_label: dict[str, bool] = {}  # of every decision, by id
-        self._newest_label = 0
-        self.database = Database(
-            url if url is None else str(url), cell_id, clock, product, lambda: self.before_use()
-        )
+        self.database = Database(url if url is None else str(url), cell_id, clock, product)
         self._read = self.database.read
         self._scope = self.database.scope
         self.product = self._scope.product
@@ -249,11 +235,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def flush(self) -> None:
         """Wait until the outbox's records are in the database, at most its time limit.
 
-        A store in memory writes what it was given. Nothing is raised if the database does not
-        answer; StoreError only if the store is closed.
+        Nothing is raised if the database does not answer; StoreError only if the store is closed.
         """
         self.database.check_open()
-        self.before_use()
+        self.database.before_use()
 
     def get_decision(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
         """Return a decision with its label after corrections.
@@ -582,6 +567,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Return the number of the cell's newest decision; 0 before the first."""
         return self._read(sa.select(n_decisions(self.cell_id)))[0][0] or 0
 
+    def newest_label(self) -> int:
+        """Return the number of the newest label of the cell or its product; 0 before the first."""
+        with self.database.reading() as connection:
+            return self._scope.newest(connection, LABEL.c.seq)
+
     def _unlabelled_query(
         self, action: Action, since_version: int, *columns: Any
     ) -> sa.Select[Any]:
@@ -652,12 +642,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     # Model versions
 
     def put_version(
-        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
+        self,
+        report: RetrainReport,
+        last_seq: int,
+        state: Mapping[str, NDArray[Any]] | None,
+        time: float | None = None,
     ) -> int:
         """Commit a retrain, and delete the states of older versions that are no longer kept.
-
-        A store in memory without a product keeps the copied arrays, and writes them when it is next
-        read, or when 40 retrains wait: packing them takes as long as many decisions.
 
         Parameters
         ----------
@@ -665,7 +656,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         last_seq : int
             Number of the newest label that the retrain knew of.
         state : mapping of str to array, or None
-            The version's arrays, which are copied; None for a dropped candidate.
+            The version's arrays; None for a dropped candidate.
+        time : float or None
+            When the retrain ended, in seconds since 1970; None: now.
 
         Returns
         -------
@@ -679,27 +672,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             For an accepted version without arrays, for an array of Python objects, and if the
             database fails.
         """
-        version = report, last_seq, check_state(report, state), float(self.clock())
-        if self.wait is not None or self.product is not None:
-            return self._commit_version(*version)
-        self._unwritten_versions.append(version)
-        if len(self._unwritten_versions) == MAX_UNWRITTEN_VERSIONS:
-            self._write_versions()
-        return report.version
-
-    def _commit_version(self, *version: Any) -> int:
-        """Commit a retrain, of which `_version_row` makes a row; return its version's number."""
-        row = self._version_row(*version)
-        return self.database.write(
-            lambda connection: self._insert_version(connection, row), flush_first=False
-        )
-
-    def _write_versions(self) -> None:
-        """Write the versions that a store in memory was given, and has not written yet."""
-        unwritten = self._unwritten_versions
-        self._unwritten_versions = []
-        for version in unwritten:
-            self._commit_version(*version)
+        row = self._version_row(report, last_seq, state, self.clock() if time is None else time)
+        return self.database.write(lambda connection: self._insert_version(connection, row))
 
     def _version_row(
         self,
@@ -1180,21 +1154,18 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
     # The one engine that owns the cell
 
-    def claim_cell(self) -> Journal | None:
+    def claim_cell(self) -> Journal:
         """Claim the cell for this engine, and open its journal; `close` gives both up.
 
         Returns
         -------
-        Journal or None
-            None for a store in memory, which has no owner.
+        Journal
 
         Raises
         ------
         StoreError
             If another engine owns the cell, or the store cannot be written.
         """
-        if self.wait is None:
-            return None
         in_file = self.database.url.get_backend_name() == "sqlite"
         if in_file:
             self.database.check_writable()
@@ -1214,8 +1185,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         A record that is stored already and is the same counts as taken. A line stop of a part that
         silence had confirmed corrects its label. Another decision with the same id, a label without
         its decision, or any other second label becomes an event, "dead letter": which one is right
-        is never guessed. A record that the database refuses becomes one, too. A store in memory
-        writes them when it is next read.
+        is never guessed. A record that the database refuses becomes one, too.
 
         Returns
         -------
@@ -1227,40 +1197,11 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         StoreError
             If the database fails.
         """
-        if self.wait is not None:
-            return self.database.apply_records(records)
-        numbers: list[tuple[str, int]] = []
-        for record in records:
-            if isinstance(record, StoredDecision) and record.decision.id not in self._has_label:
-                self._has_label[record.decision.id] = False
-            elif isinstance(record, NewLabel) and self._has_label.get(record.decision_id) is False:
-                numbers.append((record.decision_id, self._newest_label + len(numbers) + 1))
-                self._has_label[record.decision_id] = True
-            elif not isinstance(record, Event):  # it is stored already, or contradicts what is
-                numbers = self.database.apply_records(records)
-                self._has_label |= dict.fromkeys((id_ for id_, _ in numbers), True)
-                break
-        else:
-            self._unwritten += records
-        for _, number in numbers:
-            self._newest_label = max(self._newest_label, number)
-        return numbers
-
-    def _write_memory(self) -> None:
-        """Write the records that a store in memory was given to its database.
-
-        It is called before every read and most writes; a replay, which reads nothing, never calls
-        it.
-        """
-        self._write_versions()
-        unwritten = self._unwritten
-        self._unwritten = []
-        for part in chunks(unwritten):
-            self.database.apply_records(part)
+        return self.database.apply_records(records)
 
     def close(self) -> None:
         """Disconnect from the database, and free the cell; a store in memory stays open."""
-        if self.wait is not None:
+        if not self.database.is_in_memory:
             self.database.close()
         if self._journal is not None:
             self._journal.close()

@@ -345,27 +345,6 @@ def test_status_counts_what_was_put(store: SqlStore) -> None:
     assert store.tally().first <= store.tally().last <= store.tally().last_label
 
 
-def test_in_memory_a_label_has_its_number_before_anything_is_written() -> None:
-    store = SqlStore()
-    items = [StoredDecision(decision(name), trace(), 1, False, 1.0) for name in "abcd"]
-    store.apply_records(labelled(items[0], True)[:1])
-    assert store.apply_records(labelled(items[0], True)[1:]) == [("a", 1)]
-    assert store.apply_records(labelled(items[1], False) + labelled(items[2], True)) == [
-        ("b", 2),
-        ("c", 3),
-    ]
-    assert store.labelled().labels.tolist() == [1, 0, 1]
-    assert store.apply_records([*labelled(items[3], True), *labelled(items[1], False)]) == [
-        ("d", 4),
-        ("b", 2),
-    ]
-    assert (
-        store.apply_records(labelled(items[3], False)) == []
-    )  # a second label, which is set aside
-    assert store.labelled().seq.tolist() == [1, 2, 3, 4]
-    assert [event.kind for event in store.events()] == ["dead letter"]
-
-
 def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None:
     with SqlStore(*place) as store:
         values = put(store, "a")

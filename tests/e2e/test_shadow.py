@@ -11,7 +11,7 @@ import pytest
 
 from dengine import Action, DataEngine, Dataset, Source
 from dengine.errors import ReportError
-from dengine.store.outbox import BloomFilter
+from dengine.store.lookup import BloomFilter
 from tests.support.driving import RECIPE, drive
 
 

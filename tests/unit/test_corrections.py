@@ -61,7 +61,7 @@ def state(engine: DataEngine) -> tuple:
 def again(engine: DataEngine, place: Path, **options) -> DataEngine:
     """An engine opened on a copy of the store, as the first one is now."""
     engine.flush()
-    if engine.store.wait is None:  # in memory, where nobody owns it
+    if engine.store.database.is_in_memory:  # in memory, where nobody owns it
         return DataEngine.open(engine.store, replaying=True, **options)
     target = place / f"copy-{len(list(place.iterdir()))}.db"
     with (

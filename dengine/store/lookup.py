@@ -1,0 +1,171 @@
+"""`DecisionIndex`: the decisions that an engine can look up without its database. It holds the
+newest ones in memory, knows where in the journal the others are that the database lacks, and
+recognizes a new id by a `BloomFilter` over all ids. `JournalledStore` has one.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .journal import Journal, Record, decode_record
+from .recording import Entry
+from .records import NewLabel, StoredDecision
+
+N_RECENT = 1_000  # newest decisions kept in memory
+
+
+class BloomFilter:
+    """A set of decision ids in 2 MB, however many: it may report an id that was never added.
+
+    It never misses an id that was added. At a million ids, one new id in 500 is reported.
+
+    Parameters
+    ----------
+    ids : iterable of str
+        The first ids.
+
+    References
+    ----------
+    Bloom (1970), CACM 13(7).
+    """
+
+    def __init__(self, ids: Iterable[str] = ()) -> None:
+        self._bytes = np.zeros(2**21, dtype=np.uint8)
+        self.add(*ids)
+
+    def add(self, *ids: str) -> None:
+        """Add ids."""
+        byte, bit = self._bit_positions(ids)
+        np.bitwise_or.at(self._bytes, byte, bit)
+
+    def may_contain(self, decision_id: str) -> bool:
+        """Return False if the id was never added, True if it was or (rarely) if it was not."""
+        byte, bit = self._bit_positions([decision_id])
+        return bool((self._bytes[byte] & bit).all())
+
+    def _bit_positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the four bits of each id, each as an index of a byte and a byte with one bit set.
+
+        Both arrays have four entries per id; the second has dtype uint8.
+        """
+        digests = (
+            blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest() for id_ in ids
+        )
+        positions = np.frombuffer(b"".join(digests), dtype="<u4") % (8 * len(self._bytes))
+        return positions >> 3, np.left_shift(1, positions & 7, dtype=np.uint8, casting="unsafe")
+
+
+class DecisionIndex:
+    """Decisions and labels by id, as far as no database is needed for them.
+
+    It has no lock: whoever shares it between threads holds one.
+
+    Parameters
+    ----------
+    journal : Journal
+        From which decisions are read that are not in memory any more.
+
+    Attributes
+    ----------
+    has_all_ids : bool
+        Whether all ids of the database were added.
+    """
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self._recent: OrderedDict[str, StoredDecision] = OrderedDict()  # newest decisions
+        # Not drained, by decision: the newest record of the decision, and of its label.
+        self._decisions: dict[str, Entry] = {}
+        self._labels: dict[str, tuple[NewLabel, Entry]] = {}
+        self._ids = BloomFilter()
+        self.has_all_ids = False
+
+    def add(self, record: Record, entry: Entry) -> None:
+        """Add a record that was just recorded; an event, which has no id, changes nothing."""
+        if isinstance(record, StoredDecision):
+            id_ = record.decision.id
+            self._recent[id_] = record
+            self._decisions[id_] = entry
+            self._ids.add(id_)
+            if len(self._recent) > N_RECENT:
+                self._recent.popitem(last=False)
+        elif isinstance(record, NewLabel):
+            self._labels[record.decision_id] = record, entry
+
+    def is_replaced(self, entry: Entry) -> bool:
+        """Return whether a later record of the same decision replaces this undrained one."""
+        return bool(entry.decision_id) and self._decisions.get(entry.decision_id) is not entry
+
+    def remove_drained(self, entry: Entry) -> None:
+        """Forget a record that the database has now, or that is lost.
+
+        A decision among the newest N_RECENT stays in memory, and has its label from now on.
+        """
+        if not self.is_replaced(entry):
+            self._decisions.pop(entry.decision_id, None)
+        label = entry.record
+        if isinstance(label, NewLabel):
+            id_ = label.decision_id
+            if self._labels[id_][1] is entry:  # else a later label of the decision waits
+                del self._labels[id_]
+            item = self._recent.get(id_)
+            if item is not None:
+                self._recent[id_] = replace(item, success=label.success, source=label.source)
+
+    def recent(self, decision_id: str) -> StoredDecision | None:
+        """Return a decision that is in memory, without a label that is not drained; else None."""
+        return self._recent.get(decision_id)
+
+    def find(self, decision_id: str) -> StoredDecision | None:
+        """Return a decision from memory or from the journal, without a label that is not drained.
+
+        None if it is in neither. Raise StoreError if the journal is damaged there.
+        """
+        entry = self._decisions.get(decision_id)
+        item = self._recent.get(decision_id)
+        if item is None and entry is not None:
+            record: Any = entry.record or decode_record(self._journal.read(entry.offset))
+            item = record
+        return item
+
+    def find_label(self, decision_id: str, unsynced: bool) -> NewLabel | None:
+        """Return the undrained label of a decision; `unsynced` includes one not yet on disk."""
+        label, entry = self._labels.get(decision_id, (None, None))
+        is_counted = unsynced or (entry is not None and entry.is_synced)
+        return label if is_counted else None
+
+    def is_unsynced(self, decision_id: str) -> bool:
+        """Return whether a decision was recorded, and is not in the journal yet."""
+        entry = self._decisions.get(decision_id)
+        return entry is not None and not entry.is_synced
+
+    def evict(self, decision_id: str) -> None:
+        """Drop a decision from memory: whoever asks for it next finds it in the database."""
+        self._recent.pop(decision_id, None)
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether any label is not drained."""
+        return bool(self._labels)
+
+    def is_new(self, decision_id: str) -> bool:
+        """Return whether an id certainly has no decision; False if it may have one.
+
+        Until all ids are loaded, False for every id.
+        """
+        return self.has_all_ids and not self._ids.may_contain(decision_id)
+
+    def add_ids(self, ids: Sequence[str]) -> None:
+        """Add ids of decisions that the database has."""
+        self._ids.add(*ids)
+
+    def complete_ids(self) -> None:
+        """Note that all ids of the database were added: every new id is recognized from now on."""
+        self.has_all_ids = True
