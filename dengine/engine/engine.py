@@ -230,12 +230,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 on_safe_mode=on_safe_mode,
             )
             with self._closed_on_failure():
-                if opened.settings():  # now that the cell is owned, nobody else begins it
+                if opened.settings.read():  # now that the cell is owned, nobody else begins it
                     raise StoreError(
                         "The store is not empty; use DataEngine.open(url) to go on with it, "
                         "or name another store."
                     )
-                self.store.save_settings(self._core.settings.now.to_store())
+                self.store.settings.save(self._core.settings.now.to_store())
                 if opened.product is not None:
                     self._core.resume()  # with what its peers learned
 
@@ -316,7 +316,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         engine = cls.__new__(cls)
         with opening(url, must_exist=True, wait=wait) as store:
             name = str(url) if isinstance(url, str | os.PathLike) else "the store"
-            stored = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
+            stored = EngineSettings.from_store(
+                store.settings.read(), name, reducer, model, allow_import
+            )
             settings = replace(stored, trace=agreed_trace_spec(store, trace))
             settings.check_request({"trace": trace})
             engine._start(*settings.with_template(model), store, **options)
@@ -372,7 +374,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         with opening(store, wait=wait) as opened:
             allowed = allow_import or named_classes(**settings)
-            if not opened.settings():
+            if not opened.settings.read():
                 return cls(
                     store=opened, **fill_from_peers(settings | {"seed": seed}, opened, allowed)
                 )
@@ -614,7 +616,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self.flush()
         policy = self.policy
         since = self._core.settings.now.policy_since
-        tally = self.store.tally(since_version=since, within=policy.label_within)
+        tally = self.store.decisions.tally(since_version=since, within=policy.label_within)
         return policy.certificate(tally.outcomes)
 
     # Reading

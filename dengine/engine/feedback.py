@@ -110,16 +110,16 @@ class Feedback:
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
-        for stored in store.pending_decisions(self._settings.now.evidence.since):
+        for stored in store.decisions.pending(self._settings.now.evidence.since):
             if stored.number > self._live.overdue_to:
                 self._awaiting_check[stored.decision.id] = stored
         policy_since = self._settings.now.policy_since
-        ids = store.unreported_accepts(policy_since)
+        ids = store.decisions.unreported_accepts(policy_since)
         if not self._stops_all:
-            self._unobserved = len(ids) - store.silent_total(policy_since)
+            self._unobserved = len(ids) - store.labels.silent_total(policy_since)
             return
         for id_ in ids:
-            accepted = store.get_decision(id_)
+            accepted = store.decisions.get(id_)
             if accepted is not None:
                 self._unreported[id_] = accepted
 

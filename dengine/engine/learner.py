@@ -102,10 +102,12 @@ class Learner:
         begins in a thread to compute what the next retrain starts with. Raises StoreError where the
         store cannot be read.
         """
-        version = self._store.last_version()  # before the labels: a peer may store both meanwhile
-        labelled = self._store.labelled(self._window.capacity)
+        version = (
+            self._store.versions.newest()
+        )  # before the labels: a peer may store both meanwhile
+        labelled = self._store.labels.with_traces(self._window.capacity)
         self._window.refill(labelled)
-        reports = self._store.retrains()
+        reports = self._store.versions.retrains()
         for report in reports:
             self._note_outcome(report)
         newest_version = max((report.version for report in reports), default=0)
@@ -545,7 +547,7 @@ class Learner:
             news, has_newer_version = peers.fetch_news()
             if has_newer_version:
                 self.store_labels()  # the peers' version is to have them among its references
-                version = self._outbox.call_store(self._store.last_version)
+                version = self._outbox.call_store(self._store.versions.newest)
         except StoreError as error:
             peers.note_loss(error)
             return 0
@@ -593,7 +595,7 @@ class Learner:
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         last = self.labels.last_to_read
-        self._window.refill(self._store.labelled(self._window.capacity, last=last))
+        self._window.refill(self._store.labels.with_traces(self._window.capacity, last=last))
         is_done = self.live.apply_corrections()
         self.labels.recount(self.live.trained_on.counts_from)
         self.live.rebuild_rule()
@@ -644,7 +646,7 @@ class Learner:
         """
         self._outbox.check_integrity()
         begin = self._clock()
-        version = self._store.load_version(number)
+        version = self._store.versions.load(number)
         state = without_rule(version.state)  # the present rule goes on
         model = self.live.template.successor()
         trained_on = TrainedOn.from_state(version.state)
@@ -683,7 +685,7 @@ class Learner:
         if policy is not None:
             template, model = live.with_policy(policy, evidence)
         if model is None:
-            self._store.apply_change(event)
+            self._store.corrections.apply(event)
         else:
             self._store_and_swap_in(
                 event, model, live.trained_on, "another policy, the same model", 0.0
@@ -702,7 +704,9 @@ class Learner:
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)
         state = self._state_of(model, trained_on)
-        self._store.apply_change(replace(event, version=(report, self._window.newest_seq, state)))
+        self._store.corrections.apply(
+            replace(event, version=(report, self._window.newest_seq, state))
+        )
         self.live.swap_in(model, report.version, trained_on)
         self._report = report
         self._note_outcome(report)

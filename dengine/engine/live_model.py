@@ -145,7 +145,7 @@ class LiveModel:
         self.overdue_to = past.overdue_to
         if version is None or model is None:
             self._rebuild_rule_of(self.template, self._read_outcomes)
-            numbers = (correction.number for correction in store.corrections())
+            numbers = (correction.number for correction in store.corrections.after())
             self.corrected_to = max(numbers, default=0)
             return
         self.swap_in(model, version.version, TrainedOn.from_state(version.state))
@@ -257,7 +257,7 @@ class LiveModel:
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
-            lambda: store.outcomes_since(0, self.evidence.since, self.overdue_to)
+            lambda: store.labels.outcomes_since(0, self.evidence.since, self.overdue_to)
         )
         self._rebuild_rule_of(self.newest, lambda: outcomes)
 
@@ -274,7 +274,7 @@ class LiveModel:
         A failed check sets the outbox's `integrity_error`.
         """
         self.outbox.check_integrity(after)
-        return self.outbox.store.outcomes_since(after, self.evidence.since, self.overdue_to)
+        return self.outbox.store.labels.outcomes_since(after, self.evidence.since, self.overdue_to)
 
     def apply_corrections(self) -> bool:
         """Apply the store's newest corrections to the references of the answering model.
@@ -286,7 +286,7 @@ class LiveModel:
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
-        for correction in store.corrections(self.corrected_to):
+        for correction in store.corrections.after(self.corrected_to):
             if self.answering is not None:
                 is_done &= apply_correction(self.answering, store, correction)
             self.corrected_to = correction.number

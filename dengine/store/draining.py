@@ -311,16 +311,16 @@ class Drainer:
             for entry in damaged
             if not (entry.record or self._index.recent(entry.decision_id))
         ]
-        self.put_event(
+        self.report(
             DATA_LOST if lost else "journal",
             f"{len(damaged)} records of the journal were damaged on disk and are stored from "
             f"memory; decisions that are lost: {listed(lost) or 'none'}.",
         )
 
-    def put_event(self, kind: str, text: str) -> None:
+    def report(self, kind: str, text: str) -> None:
         """Log an error, and commit it to the store as an event, directly and not by the journal."""
         log.error("%s: %s%s", kind, text, f" {LOSS_REMEDY}" if kind == DATA_LOST else "")
-        self._store.put_event(kind, text)
+        self._store.events.put(kind, text)
 
     def save_newest_entry(self) -> None:
         """Write the ledger's newest entry to the journal's header and its head; errors are ignored.

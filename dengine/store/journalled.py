@@ -73,7 +73,7 @@ class JournalledStore(Outbox):
         try:
             self._compare_with_ledger()  # before anything is drained
             self._drain_leftovers()
-            self.n_decisions = store.n_decisions()
+            self.n_decisions = store.decisions.newest_number()
             store.database.on_entry = self._drainer.save_newest_entry
             self._drainer.save_newest_entry()
             self._begin_check()
@@ -97,14 +97,14 @@ class JournalledStore(Outbox):
         database = self.store.database
         missing = [entry for entry in journal.entries if not database.has_entry(*entry)]
         if missing:
-            self._drainer.put_event(
+            self._drainer.report(
                 DATA_LOST,
                 f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: the "
                 "store was cut off, or restored from a copy; labels may be missing.",
             )
             journal.drained_to = HEADER  # the journal may still hold some of them
         elif len(journal.entries) < 2 and database.newest_entry is not None:
-            self._drainer.put_event(
+            self._drainer.report(
                 "journal",
                 f"the journal {journal.path}, or its head beside it, is new here, and the store is "
                 "not: whether the store was cut off, or labels are elsewhere, is unknown; bring "
@@ -116,7 +116,7 @@ class JournalledStore(Outbox):
 
         Damage in the journal, or records that it lacks, become an event, which is an alarm.
         """
-        newest = self.store.decisions(HistoryFilter(), limit=1)
+        newest = self.store.decisions.select(HistoryFilter(), limit=1)
         since = "".join(
             f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
             for item in newest
@@ -127,9 +127,9 @@ class JournalledStore(Outbox):
         while not self.is_drained:
             self._drainer.drain_chunk()
         if self._journal.loss:
-            self._drainer.put_event(DATA_LOST, self._journal.loss + since)
+            self._drainer.report(DATA_LOST, self._journal.loss + since)
         elif self._journal.dropped:
-            self._drainer.put_event(
+            self._drainer.report(
                 "journal",
                 f"{self._journal.dropped} bytes at its end were dropped: a process was killed as "
                 "it wrote them",
@@ -253,7 +253,7 @@ class JournalledStore(Outbox):
             item = self._index.find(decision_id)
             label = self._index.find_label(decision_id, unsynced)
         if item is None and not self._index.is_new(decision_id):
-            item = self.call_store(lambda: self.store.get_decision(decision_id))
+            item = self.call_store(lambda: self.store.decisions.get(decision_id))
         if item is not None and label is not None:
             item = replace(item, success=label.success, source=label.source)
         return item
@@ -274,7 +274,7 @@ class JournalledStore(Outbox):
         """
         if self._index.has_all_ids:
             return
-        for ids in self.store.decision_ids():
+        for ids in self.store.decisions.ids():
             with self._changed:
                 self._index.add_ids(ids)
         self._index.complete_ids()
@@ -301,7 +301,7 @@ class JournalledStore(Outbox):
     def store_version(
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
     ) -> Future[int]:
-        return self._drainer.submit(lambda: self.store.put_version(report, last_seq, state))
+        return self._drainer.submit(lambda: self.store.versions.put(report, last_seq, state))
 
     def wait_for_result(self, future: Future[T]) -> T:
         return self._drainer.wait_for_result(future)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..records import RetrainReport
 from .journal import Record
 from .outbox import Outbox
-from .records import Event, NewLabel, StoredDecision, as_text, check_state, chunks
+from .records import NewLabel, StoredDecision, check_state, chunks, new_event
 
 if TYPE_CHECKING:
     from .sql import SqlStore
@@ -52,8 +52,8 @@ class MemoryStore(Outbox):
         self._label_numbers: list[tuple[str, int]] = []  # not yet collected
         self._note_integrity(store.database.check_pages())
         self.check_integrity()
-        self.n_decisions = store.n_decisions()
-        self._newest_label = store.newest_label()
+        self.n_decisions = store.decisions.newest_number()
+        self._newest_label = store.labels.newest()
         store.database.before_use = self._write
 
     def _write(self) -> None:
@@ -64,7 +64,7 @@ class MemoryStore(Outbox):
         self._unwritten = []
         self._decisions = {}
         for version in versions:
-            self.store.put_version(*version)
+            self.store.versions.put(*version)
         for part in chunks(records):
             self.store.apply_records(part)
 
@@ -95,7 +95,7 @@ class MemoryStore(Outbox):
                 self._decisions[label.decision_id] = labelled
 
     def record_event(self, kind: str, text: str) -> None:
-        self._unwritten.append(Event(0, self.store.clock(), as_text(kind), as_text(text)))
+        self._unwritten.append(new_event(kind, text, self.store.clock()))
         if self._reading:  # nobody may read the store again before it is closed
             self._write()
 
@@ -114,7 +114,7 @@ class MemoryStore(Outbox):
         return numbers
 
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
-        return self._decisions.get(decision_id) or self.store.get_decision(decision_id)
+        return self._decisions.get(decision_id) or self.store.decisions.get(decision_id)
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
         return self.find_decision(decision_id)

@@ -312,7 +312,7 @@ class Outbox(ABC):
     def store_version(
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
     ) -> Future[int]:
-        """Begin to commit a retrain, as `SqlStore.put_version` does, and return without waiting.
+        """Begin to commit a retrain, as `SqlStore.versions.put` does, and return without waiting.
 
         Returns
         -------

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 from ..errors import NotTakenError
 from .journal import Journal, LostJournalError, Record, encode_record
-from .records import Event, StoredDecision, as_text
+from .records import StoredDecision, new_event
 
 log = logging.getLogger("dengine")
 BATCH_SECONDS = 0.05  # a record waits so long for others before they are written together
@@ -152,7 +152,7 @@ class Recorder:
 
     def record_event(self, kind: str, text: str) -> None:
         """Add an event with the present time."""
-        self.record(Event(0, self._clock(), as_text(kind), as_text(text)))
+        self.record(new_event(kind, text, self._clock()))
 
     def adopt(self, record: Record, offset: int, end: int) -> Entry:
         """Add a record that an earlier process left in the journal, where it stands there."""

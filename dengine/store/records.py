@@ -360,6 +360,16 @@ class Event:
     when = property(_when)
 
 
+def new_event(
+    kind: str, text: str, time: float, data: Mapping[str, Any] | None = None, author: str = ""
+) -> Event:
+    """Return an event that is not numbered yet, in texts and data that every database takes.
+
+    Raise StoreError for data that JSON does not have.
+    """
+    return Event(0, float(time), as_text(kind), as_text(text), as_data(data), as_text(author))
+
+
 def open_losses(events: Iterable[Any]) -> list[Any]:
     """Return those of a cell's events, oldest first, that say that data was lost.
 

@@ -289,7 +289,7 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
     first, report = import_labelled(store, (X[:70], y[:70]), "pca"), import_labelled(store, (X, y))
     assert (first.imported, first.quarantined, report.imported, report.repeated) == (68, 2, 90, 70)
     np.testing.assert_array_equal(
-        store.labelled().labels, y[2:]
+        store.labels.with_traces().labels, y[2:]
     )  # bad ones are kept, and never trained on
 
 

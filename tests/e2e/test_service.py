@@ -56,7 +56,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
 
     with a_service(tmp_path / "cell.db") as service:
         asyncio.run(cell(service))
-        assert (service.read_store.status()["decisions"], service.late) == (3, 2)
+        assert (service.read_store.decisions.counts()["decisions"], service.late) == (3, 2)
 
 
 def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> None:
@@ -142,5 +142,5 @@ def test_a_demonstration_goes_on_after_a_report_that_found_the_queue_full(
 
         monkeypatch.setattr(service, "report", busy_once)
         asyncio.run(drive(service, ReplayCell(stream, np.arange(5)), speed=1.0))
-        status = asyncio.run(service.read(lambda store: store.status()))
+        status = asyncio.run(service.read(lambda store: store.decisions.counts()))
         assert (status["decisions"], status["labels"]) == (5, 4)

@@ -104,9 +104,9 @@ def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(
         assert [item.inside for item in explanation.neighbours] == [
             item <= explanation.radius for item in distances
         ]
-        custom = engine.store.get_decision(past.decision.id)
+        custom = engine.store.decisions.get(past.decision.id)
         for item in explanation.neighbours:
-            stored = engine.store.get_decision(item.decision_id)
+            stored = engine.store.decisions.get(item.decision_id)
             assert (stored.success, stored.source) == (item.success, item.source)
             assert (
                 stored.content_hash != custom.content_hash

@@ -20,11 +20,11 @@ from tests.support.stores import decision, execute, report
 
 def put(store: SqlStore, versions: int) -> None:
     for version in range(1, versions + 1):
-        store.put_version(report(version), version, {"w": np.full(20, version, np.float32)})
+        store.versions.put(report(version), version, {"w": np.full(20, version, np.float32)})
 
 
 def kept(store: SqlStore) -> list[int]:
-    return [row.report.version for row in store.versions() if row.kept]
+    return [row.report.version for row in store.versions.all() if row.kept]
 
 
 def test_the_newest_the_first_and_ever_fewer_of_the_older_ones_keep_their_states(
@@ -49,16 +49,16 @@ def test_a_new_state_takes_the_room_of_those_that_are_not_kept_any_more(tmp_path
     state = np.random.default_rng(0).random(2**17)  # 1 MiB
     with SqlStore(str(file), keep_versions=2) as store:
         for version in range(1, 10):
-            store.put_version(report(version), version, {"w": state})
+            store.versions.put(report(version), version, {"w": state})
         assert kept(store) == [1, 8, 9]
     assert 3 * 2**20 < file.stat().st_size < 3.6 * 2**20
 
 
 def test_integers_of_a_state_that_repeat_take_little_room(store: SqlStore) -> None:
     taps = np.tile(np.arange(9), 2000)
-    store.put_version(report(1), 1, {"taps": taps})
-    assert store.versions()[0].n_bytes < taps.nbytes / 10
-    np.testing.assert_array_equal(store.load_version(1).state["taps"], taps)
+    store.versions.put(report(1), 1, {"taps": taps})
+    assert store.versions.all()[0].n_bytes < taps.nbytes / 10
+    np.testing.assert_array_equal(store.versions.load(1).state["taps"], taps)
 
 
 @pytest.mark.parametrize("samples", [200, 600, 1000, 1900])
@@ -82,29 +82,29 @@ def test_traces_fill_the_pages_of_a_file(samples: int, tmp_path: Path) -> None:
 def test_a_version_is_loaded_by_its_number(store: SqlStore) -> None:
     put(store, 12)
     for version in (1, 10, 12):
-        result = store.load_version(version)
+        result = store.versions.load(version)
         assert (result.version, result.last_seq, result.state["w"].tolist()) == (
             version,
             version,
             [float(version)] * 20,
         )
     result.state["w"][:] = 0  # an array of its own
-    assert store.load_version(12).state["w"][0] == 12
+    assert store.versions.load(12).state["w"][0] == 12
     for version in (2, 13, 0):
         with pytest.raises(
             StoreError,
             match=rf"got {version}, which is not kept; load one of these: 1, 8, 9, 10, 11, 12",
         ):
-            store.load_version(version)
+            store.versions.load(version)
 
 
 def test_every_retrain_is_listed_for_ever(store: SqlStore) -> None:
-    store.clock = lambda: 7.5
+    store.database.clock = lambda: 7.5
     with pytest.raises(StoreError, match="load one of these: none"):
-        store.load_version(1)
+        store.versions.load(1)
     put(store, 7)
-    store.put_version(report(7, accepted=False), 9, None)
-    rows = store.versions()
+    store.versions.put(report(7, accepted=False), 9, None)
+    rows = store.versions.all()
     assert [(row.report.version, row.report.accepted, row.kept) for row in rows] == [
         (1, True, True),
         (2, True, False),
@@ -148,15 +148,15 @@ def test_a_damaged_version_is_passed_over_and_told_of_once(tmp_path: Path) -> No
     damage(file, 12, 11)
     for _ in range(2):
         with SqlStore(str(file)) as store:
-            assert store.last_version().version == 10
-            answers = [event.text for event in store.events() if event.kind == "damaged"]
+            assert store.versions.newest().version == 10
+            answers = [event.text for event in store.events.newest() if event.kind == "damaged"]
             assert ["version 12" in answers[0], "version 11" in answers[1], len(answers)] == [
                 True,
                 True,
                 2,
             ]
             with pytest.raises(StoreError, match=r"state of version 12.*bytes have changed"):
-                store.load_version(12)
+                store.versions.load(12)
 
 
 def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(
@@ -175,7 +175,7 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
         assert (
             engine.report(decision.id, True).version == 4
         )  # with the labels that came after version 2
-        assert [event.kind for event in engine.store.events()] == ["damaged"]
+        assert [event.kind for event in engine.store.events.newest()] == ["damaged"]
     with DataEngine.open(str(file)) as engine:
         assert engine.version == 4
 
@@ -194,6 +194,6 @@ def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damage
     execute(file, "UPDATE trace SET data = zeroblob(400) WHERE rowid = 7")
     with DataEngine.open(str(file), model=AgreeingNeighbours(Policy(0.1, 0.9))) as engine:
         assert (engine.version, engine.model) == (0, None)
-        assert [event.kind for event in engine.store.events()] == ["damaged"]
+        assert [event.kind for event in engine.store.events.newest()] == ["damaged"]
         engine.report(engine.decide(data.X[60]).id, bool(data.y[60]))
         assert engine.version == 2

@@ -59,7 +59,7 @@ def damage(folder: Path, *texts: bytes) -> None:
 
 
 def journal_events(box: Outbox) -> list[str]:
-    return [event.text for event in box.store.events() if event.kind == "journal"]
+    return [event.text for event in box.store.events.newest() if event.kind == "journal"]
 
 
 def test_a_damaged_label_that_waits_alone_is_stored_from_memory(
@@ -75,7 +75,7 @@ def test_a_damaged_label_that_waits_alone_is_stored_from_memory(
     assert not box.request_label_drain()
     assert box.fault == ""
     assert box.is_drained
-    assert box.store.get_decision("part 1").success is True
+    assert box.store.decisions.get("part 1").success is True
     assert box.pop_label_numbers() == [("part 1", 1)]
     (text,) = journal_events(box)
     assert text.startswith("1 records of ")
@@ -92,15 +92,15 @@ def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(
     box.sync()
     damage(tmp_path, b'part 0", "action', b'part 2", "action', b"NewLabel", b"the last")
     box.drain()
-    assert box.store.n_decisions() == 4
-    assert [box.store.get_decision(f"part {i}").success for i in range(4)] == [
+    assert box.store.decisions.newest_number() == 4
+    assert [box.store.decisions.get(f"part {i}").success for i in range(4)] == [
         True,
         True,
         None,
         None,
     ]
-    np.testing.assert_array_equal(box.store.get_decision("part 0").trace, items[0].trace)
-    assert [event.text for event in box.store.events() if event.kind == "hello"] == [
+    np.testing.assert_array_equal(box.store.decisions.get("part 0").trace, items[0].trace)
+    assert [event.text for event in box.store.events.newest() if event.kind == "hello"] == [
         "the first",
         "the last",
     ]
@@ -121,12 +121,12 @@ def test_a_damaged_decision_that_is_not_in_memory_any_more_is_named_in_an_event(
     box.drain()
     assert box.fault == ""
     assert not box.request_label_drain()
-    assert box.store.get_decision("part 1") is None
+    assert box.store.decisions.get("part 1") is None
     assert box.find_decision("part 1") is None
-    assert box.store.get_decision("part 2").success is True
-    (text,) = (event.text for event in box.store.events() if event.kind == "lost")
+    assert box.store.decisions.get("part 2").success is True
+    (text,) = (event.text for event in box.store.events.newest() if event.kind == "lost")
     assert text.endswith("decisions that are lost: part 1.")
-    (letter,) = (event.text for event in box.store.events() if event.kind == "dead letter")
+    (letter,) = (event.text for event in box.store.events.newest() if event.kind == "dead letter")
     assert "a label, success from verification, on 'part 1'" in letter
 
 
@@ -170,9 +170,9 @@ def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either: Outbo
     assert either.pop_label_numbers() == []
     either.record_event("hello", "there")
     either.drain()
-    labelled = either.store.labelled()
+    labelled = either.store.labels.with_traces()
     assert (labelled.seq.tolist(), labelled.labels.tolist()) == ([1, 2], [0, 1])
-    assert [event.text for event in either.store.events()] == ["there"]
+    assert [event.text for event in either.store.events.newest()] == ["there"]
     assert either.find_earlier("c").decision.id == "c"
     assert either.find_earlier("d") is None
     assert (either.is_drained, either.request_label_drain()) == (True, False)
@@ -190,9 +190,9 @@ def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either: Outbo
     either.record_labels([(confirmed, label("a", False, source=Source.STOP))])
     either.record_labels([(either.record_decision(stored("b")), label("b"))])
     assert dict(numbers(either))["b"] == 2
-    assert either.store.get_decision("a").success is False
+    assert either.store.decisions.get("a").success is False
     assert either.find_decision("a", unsynced=True).success is False
-    assert [event.kind for event in either.store.events()] == ["late stop"]
+    assert [event.kind for event in either.store.events.newest()] == ["late stop"]
 
 
 def test_a_version_is_stored_with_its_arrays_as_they_were(either: Outbox) -> None:
@@ -200,7 +200,7 @@ def test_a_version_is_stored_with_its_arrays_as_they_were(either: Outbox) -> Non
     future = either.store_version(report(1), 7, {"w": weights})
     assert either.wait_for_result(future) == 1
     weights += 1.0
-    version = either.store.last_version()
+    version = either.store.versions.newest()
     assert (version.version, version.last_seq, version.state["w"].tolist()) == (1, 7, [0.0] * 3)
 
 
@@ -216,7 +216,7 @@ def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(
     again = either.store
     if isinstance(either, JournalledStore):
         again = SqlStore(str(tmp_path / "cell.db"))
-    assert again.get_decision("a").success is True
+    assert again.decisions.get("a").success is True
     other = open_outbox(again, window=10)
     assert other.n_decisions == 1
     other.record_labels([(other.record_decision(stored("b")), label("b"))])
@@ -236,7 +236,7 @@ def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path: Path) -> 
         assert reader.find_decision("a").decision.id == "a"
         reader.record_event("export", "a file")
         reader.close()
-        assert [event.text for event in owner.store.events()] == ["a file"]
+        assert [event.text for event in owner.store.events.newest()] == ["a file"]
 
 
 @pytest.fixture
@@ -297,7 +297,7 @@ def test_a_drainer_alone_stores_what_is_synced_and_makes_calls(
     drainer.start()
     drainer.drain()
     assert (drainer.is_drained, index.has_labels, drainer.n_drained) == (True, False, 2)
-    assert drainer.wait_for_result(drainer.submit(store.n_decisions)) == 1
+    assert drainer.wait_for_result(drainer.submit(store.decisions.newest_number)) == 1
     with pytest.raises(ZeroDivisionError):
         drainer.wait_for_result(drainer.submit(lambda: 1 // 0))
     assert recorder.stop(10.0)

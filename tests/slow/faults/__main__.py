@@ -64,7 +64,7 @@ MUTATIONS = (  # what is broken, the file, a text that stands there once, what t
     ("any ledger holds any entry", STORE + "connections.py", "== [digest]", "!= [None]", "The store's file put back"),
     ("a fork may decide", STORE + "outbox.py", "        if os.getpid() != self._pid:\n", "        if False:\n",
      "A fork of the engine's process"),
-    ("the newest version is the latest by the clock", STORE + "sql.py", "return query.order_by(VERSION.c.retrain.desc())",
+    ("the newest version is the latest by the clock", STORE + "versions.py", "return query.order_by(VERSION.c.retrain.desc())",
      "return query.order_by(VERSION.c.time.desc())", "The clock set back"),
 )  # fmt: skip
 
