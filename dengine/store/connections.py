@@ -625,8 +625,10 @@ class Database:
 
     def insert(
         self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
-    ) -> range:
-        """Insert rows of this cell into a table, each with the next number; return these numbers.
+    ) -> list[int]:
+        """Insert rows of this cell into a table, each with a number; return these numbers.
+
+        That is the next number, or the one that the row has if that is larger.
 
         Parameters
         ----------
@@ -636,21 +638,27 @@ class Database:
             The table's column that takes the numbers. Decisions and events continue the numbers of
             the cell; labels, versions and corrections those of its product, if it has one.
         rows : sequence of mapping
-            Without `cell_id` and the number. They are not changed.
+            Without `cell_id`. They are not changed.
 
         Returns
         -------
-        range
+        list of int
             The numbers, in the order of the rows; empty without rows.
         """
-        if not rows:
-            return range(0)
-        first = self.scope.next_number(connection, column)
-        numbered = [
-            {**row, "cell_id": self.cell_id, column.name: i} for i, row in enumerate(rows, first)
-        ]
-        connection.execute(sa.insert(column.table), numbered)
-        return range(first, first + len(rows))
+        numbers: list[int] = []
+        if rows:
+            number = self.scope.next_number(connection, column)
+            for row in rows:
+                number = max(number, row.get(column.name, 0))
+                numbers.append(number)
+                number += 1
+            common = {"cell_id": self.cell_id}
+            numbered = [
+                {**row, **common, column.name: number}
+                for row, number in zip(rows, numbers, strict=True)
+            ]
+            connection.execute(sa.insert(column.table), numbered)
+        return numbers
 
     def rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]

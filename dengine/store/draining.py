@@ -70,7 +70,7 @@ class Drainer:
         self._changed = recorder.changed
         self._wanted = 0  # up to this record somebody waits for the database
         self._error = ""
-        self._label_numbers: list[tuple[str, int]] = []  # given by the database, not yet collected
+        self._label_numbers: list[tuple[str, int]] = []  # of a product, not yet collected
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="dengine-store", daemon=True)
@@ -282,7 +282,7 @@ class Drainer:
                 records.append(decode_record(self._journal.read(entry.offset)))
             except StoreError:
                 damaged.append(entry)
-                copy = entry.record or self._index.recent(entry.decision_id)
+                copy = entry.record or self._index.recent.get(entry.decision_id)
                 if copy is not None:
                     records.append(copy)
         numbers = self._store.apply_records(records)
@@ -291,7 +291,8 @@ class Drainer:
             self._journal.drained_to = chunk[-1].end
             self._journal.head.n_drained += len(chunk)
             self.save_newest_entry()
-            self._label_numbers += numbers
+            if self._store.product is not None:
+                self._label_numbers += numbers
             for entry in chunk:
                 self._recorder.synced.popleft()
                 self._index.remove_drained(entry)
@@ -309,7 +310,7 @@ class Drainer:
         lost = [
             entry.decision_id
             for entry in damaged
-            if not (entry.record or self._index.recent(entry.decision_id))
+            if not (entry.record or self._index.recent.get(entry.decision_id))
         ]
         self.report(
             DATA_LOST if lost else "journal",

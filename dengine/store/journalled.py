@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ..errors import NotTakenError, StoreError
 from ..records import RetrainReport
 from .draining import Drainer
-from .journal import HEADER, Record, decode_record
+from .journal import HEADER, decode_record
 from .lookup import DecisionIndex
 from .outbox import Outbox
 from .recording import RETRY_SECONDS, Recorder
@@ -39,6 +39,7 @@ LOCK_SECONDS = 0.001  # a wait for the lock that counts as none
 # Opening waits so long for SQLite's check; that of a large store goes on beside.
 CHECK_SECONDS = 0.1
 CLOSE_SECONDS = 5.0  # the longest that closing waits
+MAX_UNWRITTEN = 10_000  # records in memory while the disk hangs; later decisions are not recorded
 
 
 class JournalledStore(Outbox):
@@ -73,7 +74,7 @@ class JournalledStore(Outbox):
         try:
             self._compare_with_ledger()  # before anything is drained
             self._drain_leftovers()
-            self.n_decisions = store.decisions.newest_number()
+            self._continue_numbers()
             store.database.on_entry = self._drainer.save_newest_entry
             self._drainer.save_newest_entry()
             self._begin_check()
@@ -187,16 +188,16 @@ class JournalledStore(Outbox):
     def record_decision(self, item: StoredDecision) -> StoredDecision:
         id_ = item.decision.id
         with self._changed:
-            first = self._index.recent(id_)
+            first = self._index.recent.get(id_)
             if first is not None:
                 return first
             self._unrecorded.discard(id_)
-            if self._recorder.is_full:
+            if len(self._recorder.unwritten) >= MAX_UNWRITTEN:
                 self._unrecorded.add(id_)
                 return item
             self.n_decisions += 1
             item = replace(item, number=self.n_decisions)
-            self._record(item)
+            self._index.add(item, self._recorder.record(item))
         return item
 
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
@@ -208,7 +209,7 @@ class JournalledStore(Outbox):
             if not self._index.is_unsynced(id_):
                 return first
             item = replace(item, time=first.time, trace=first.trace, number=first.number)
-            self._record(item)
+            self._index.add(item, self._recorder.record(item))
         return item
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
@@ -216,14 +217,11 @@ class JournalledStore(Outbox):
             for item, label in labels:
                 now = self.store.clock()
                 hash_ = item.content_hash
-                self._record(replace(label, time=now, content_hash=hash_, decided=item.time))
+                label = replace(label, time=now, content_hash=hash_, decided=item.time)
+                self._index.add(label, self._recorder.record(label))
 
     def record_event(self, kind: str, text: str) -> None:
         self._recorder.record_event(kind, text)
-
-    def _record(self, record: Record) -> None:
-        """Record a decision or a label; the caller holds the lock."""
-        self._index.add(record, self._recorder.record(record))
 
     def sync(self, seconds: float | None = None) -> None:
         self._recorder.sync(seconds)
@@ -293,7 +291,7 @@ class JournalledStore(Outbox):
 
     def evict_decision(self, decision_id: str) -> None:
         with self._changed:
-            self._index.evict(decision_id)
+            self._index.recent.pop(decision_id, None)
 
     def call_store(self, call: Callable[[], T]) -> T:
         return self.wait_for_result(self._drainer.submit(call))

@@ -55,10 +55,10 @@ class BloomFilter:
 
         Both arrays have four entries per id; the second has dtype uint8.
         """
-        digests = (
-            blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest() for id_ in ids
-        )
-        positions = np.frombuffer(b"".join(digests), dtype="<u4") % (8 * len(self._bytes))
+        digests = bytearray()
+        for id_ in ids:
+            digests += blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest()
+        positions = np.frombuffer(digests, dtype="<u4") % (8 * len(self._bytes))
         return positions >> 3, np.left_shift(1, positions & 7, dtype=np.uint8, casting="unsafe")
 
 
@@ -74,13 +74,15 @@ class DecisionIndex:
 
     Attributes
     ----------
+    recent : dict of str to StoredDecision
+        The newest N_RECENT decisions by id, without labels that are not drained.
     has_all_ids : bool
         Whether all ids of the database were added.
     """
 
     def __init__(self, journal: Journal) -> None:
         self._journal = journal
-        self._recent: OrderedDict[str, StoredDecision] = OrderedDict()  # newest decisions
+        self.recent: OrderedDict[str, StoredDecision] = OrderedDict()
         # Not drained, by decision: the newest record of the decision, and of its label.
         self._decisions: dict[str, Entry] = {}
         self._labels: dict[str, tuple[NewLabel, Entry]] = {}
@@ -91,11 +93,11 @@ class DecisionIndex:
         """Add a record that was just recorded; an event, which has no id, changes nothing."""
         if isinstance(record, StoredDecision):
             id_ = record.decision.id
-            self._recent[id_] = record
+            self.recent[id_] = record
             self._decisions[id_] = entry
             self._ids.add(id_)
-            if len(self._recent) > N_RECENT:
-                self._recent.popitem(last=False)
+            if len(self.recent) > N_RECENT:
+                self.recent.popitem(last=False)
         elif isinstance(record, NewLabel):
             self._labels[record.decision_id] = record, entry
 
@@ -115,13 +117,9 @@ class DecisionIndex:
             id_ = label.decision_id
             if self._labels[id_][1] is entry:  # else a later label of the decision waits
                 del self._labels[id_]
-            item = self._recent.get(id_)
+            item = self.recent.get(id_)
             if item is not None:
-                self._recent[id_] = replace(item, success=label.success, source=label.source)
-
-    def recent(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision that is in memory, without a label that is not drained; else None."""
-        return self._recent.get(decision_id)
+                self.recent[id_] = replace(item, success=label.success, source=label.source)
 
     def find(self, decision_id: str) -> StoredDecision | None:
         """Return a decision from memory or from the journal, without a label that is not drained.
@@ -129,7 +127,7 @@ class DecisionIndex:
         None if it is in neither. Raise StoreError if the journal is damaged there.
         """
         entry = self._decisions.get(decision_id)
-        item = self._recent.get(decision_id)
+        item = self.recent.get(decision_id)
         if item is None and entry is not None:
             record: Any = entry.record or decode_record(self._journal.read(entry.offset))
             item = record
@@ -145,10 +143,6 @@ class DecisionIndex:
         """Return whether a decision was recorded, and is not in the journal yet."""
         entry = self._decisions.get(decision_id)
         return entry is not None and not entry.is_synced
-
-    def evict(self, decision_id: str) -> None:
-        """Drop a decision from memory: whoever asks for it next finds it in the database."""
-        self._recent.pop(decision_id, None)
 
     @property
     def has_labels(self) -> bool:

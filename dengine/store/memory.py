@@ -29,7 +29,7 @@ MAX_UNWRITTEN_VERSIONS = 40  # about 1.5 MB each
 class MemoryStore(Outbox):
     """An outbox without journal, disk and threads; nothing in it waits or is ever unavailable.
 
-    Labels are numbered as they are recorded. One thread uses it at a time.
+    One thread uses it at a time.
 
     Parameters
     ----------
@@ -49,11 +49,9 @@ class MemoryStore(Outbox):
         self._unwritten: list[Record] = []
         self._versions: list[tuple[Any, ...]] = []  # not written: arguments of `put_version`
         self._decisions: dict[str, StoredDecision] = {}  # not written, with their labels
-        self._label_numbers: list[tuple[str, int]] = []  # not yet collected
         self._note_integrity(store.database.check_pages())
         self.check_integrity()
-        self.n_decisions = store.decisions.newest_number()
-        self._newest_label = store.labels.newest()
+        self._continue_numbers()
         store.database.before_use = self._write
 
     def _write(self) -> None:
@@ -87,9 +85,6 @@ class MemoryStore(Outbox):
             now = self.store.clock()
             label = replace(label, time=now, content_hash=item.content_hash, decided=item.time)
             self._unwritten.append(label)
-            if item.source is None:  # else a late stop, which corrects the label that is there
-                self._newest_label += 1
-                self._label_numbers.append((label.decision_id, self._newest_label))
             if label.decision_id in self._decisions:
                 labelled = replace(item, success=label.success, source=label.source)
                 self._decisions[label.decision_id] = labelled
@@ -109,9 +104,8 @@ class MemoryStore(Outbox):
         return False
 
     def pop_label_numbers(self) -> list[tuple[str, int]]:
-        numbers = self._label_numbers
-        self._label_numbers = []
-        return numbers
+        """Return an empty list: a store in memory has no product."""
+        return []
 
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
         return self._decisions.get(decision_id) or self.store.decisions.get(decision_id)

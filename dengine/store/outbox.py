@@ -62,6 +62,7 @@ class Outbox(ABC):
         self.limit = limit
         self.n_decisions = 0
         self.integrity_error = ""
+        self._newest_label = 0
         self._window = window
         self._reading = reading
         self._pid = os.getpid()
@@ -165,17 +166,31 @@ class Outbox(ABC):
             by now.
         """
 
+    def number_label(self) -> int:
+        """Return a number for a new label, the next one of the cell's journal.
+
+        In a product it is negative and only provisional, since the store numbers the labels of all
+        cells: `pop_label_numbers` says which number a label got.
+        """
+        self._newest_label += 1 if self.store.product is None else -1
+        return self._newest_label
+
+    def _continue_numbers(self) -> None:
+        """Go on with the numbers of decisions and labels that the store holds."""
+        self.n_decisions = self.store.decisions.newest_number()
+        if self.store.product is None:
+            self._newest_label = self.store.labels.newest()
+
     @abstractmethod
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
         """Record labels of decisions without waiting; the labels that are passed are not changed.
 
-        Each gets the present time, and the hash and the time of its decision. `pop_label_numbers`
-        later returns the numbers that they get in the store.
+        Each gets the present time, and the hash and the time of its decision.
 
         Parameters
         ----------
         labels : iterable of (StoredDecision, NewLabel)
-            Each label with its decision as it was before.
+            Each label, with a number of `number_label`, and its decision.
         """
 
     @abstractmethod
@@ -244,9 +259,9 @@ class Outbox(ABC):
 
     @abstractmethod
     def pop_label_numbers(self) -> list[tuple[str, int]]:
-        """Return (decision id, label number) of the labels that were numbered since the last call.
+        """Return (decision id, label number) of a product's labels that the store has numbered.
 
-        They are in the order of their numbers. Each is returned once.
+        They are those since the last call, in the order of their numbers. Empty without a product.
         """
 
     # What the engine asks

@@ -20,7 +20,6 @@ from .records import StoredDecision, new_event
 log = logging.getLogger("dengine")
 BATCH_SECONDS = 0.05  # a record waits so long for others before they are written together
 RETRY_SECONDS = 1.0  # between two attempts after a failure
-MAX_UNWRITTEN = 10_000  # records in memory while the disk hangs; later decisions are not recorded
 LONG = 8 << 20  # bytes of a journal that is to be cleared
 
 
@@ -41,15 +40,10 @@ class Entry:
     """
 
     record: Record | None
-    decision_id: str = ""
+    decision_id: str
     offset: int = 0
     end: int = 0
     time: float = field(default_factory=time.monotonic)
-
-    @classmethod
-    def of(cls, record: Record) -> Entry:
-        """Return a new entry for a record."""
-        return cls(record, record.decision.id if isinstance(record, StoredDecision) else "")
 
     @property
     def is_synced(self) -> bool:
@@ -81,8 +75,9 @@ class Recorder:
     ----------
     changed : threading.Condition
         With a reentrant lock. It guards the recorder, and is notified of every change.
-    synced : deque of Entry
-        Synced records, oldest first; who drains them takes them out.
+    unwritten, synced : deque of Entry
+        Records that are not on disk, and those that are, oldest first; who drains the latter takes
+        them out.
     n_recorded, n_synced : int
         Numbers of records so far.
     """
@@ -95,7 +90,7 @@ class Recorder:
         self._clock = clock
         self._limit = limit
         self.changed = threading.Condition(threading.RLock())
-        self._unwritten: deque[Entry] = deque()
+        self.unwritten: deque[Entry] = deque()
         self._wanted = 0  # up to this record somebody waits for a sync
         self._n_failed = 0  # writes
         self._began = math.inf  # the sync under way, by `time.monotonic`
@@ -120,11 +115,6 @@ class Recorder:
         return not math.isinf(self._began)
 
     @property
-    def is_full(self) -> bool:
-        """Whether so many records wait since the disk hangs that no decision is to be recorded."""
-        return len(self._unwritten) >= MAX_UNWRITTEN
-
-    @property
     def needs_clearing(self) -> bool:
         """Whether the journal is so long that its records are to be drained at once."""
         return self._journal.end > LONG
@@ -135,19 +125,20 @@ class Recorder:
 
         None if there is none.
         """
-        for entries in (self.synced, self._unwritten):
+        for entries in (self.synced, self.unwritten):
             if entries:
                 return entries[0].time
         return None
 
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it."""
-        entry = Entry.of(record)
+        id_ = record.decision.id if isinstance(record, StoredDecision) else ""
+        entry = Entry(record, id_)
         with self.changed:
             self.n_recorded += 1
-            if not self._unwritten:  # else the thread is awake already
+            if not self.unwritten:  # else the thread is awake already
                 self.changed.notify_all()
-            self._unwritten.append(entry)
+            self.unwritten.append(entry)
         return entry
 
     def record_event(self, kind: str, text: str) -> None:
@@ -155,12 +146,14 @@ class Recorder:
         self.record(new_event(kind, text, self._clock()))
 
     def adopt(self, record: Record, offset: int, end: int) -> Entry:
-        """Add a record that an earlier process left in the journal, where it stands there."""
-        entry = Entry.of(record)
+        """Add a record that an earlier process left in the journal, where it stands there.
+
+        The thread must not have been started.
+        """
+        entry = self.record(record)
         entry.place(offset, end)
-        self.n_recorded += 1
         self.n_synced += 1
-        self.synced.append(entry)
+        self.synced.append(self.unwritten.popleft())
         return entry
 
     def request_sync(self) -> None:
@@ -175,7 +168,8 @@ class Recorder:
         with self.changed:
             place = self.n_recorded
             n_failed = self._n_failed
-            self.request_sync()
+            self._wanted = place
+            self.changed.notify_all()
             self.changed.wait_for(
                 lambda: self.n_synced >= place or self._n_failed > n_failed, limit
             )
@@ -209,11 +203,11 @@ class Recorder:
         """
         while True:
             with self.changed:
-                self.changed.wait_for(lambda: self._unwritten or self._stopped)
+                self.changed.wait_for(lambda: self.unwritten or self._stopped)
                 self.changed.wait_for(
                     lambda: self._wanted > self.n_synced or self._stopped, BATCH_SECONDS
                 )
-                batch = list(self._unwritten)
+                batch = list(self.unwritten)
                 if not batch:
                     return
                 self._began = time.monotonic()
@@ -251,7 +245,7 @@ class Recorder:
             ends = [*offsets[1:], self._journal.end]
             for entry, offset, end in zip(batch, offsets, ends, strict=True):
                 entry.place(offset, end)
-                self.synced.append(self._unwritten.popleft())
+                self.synced.append(self.unwritten.popleft())
             self.n_synced += len(batch)
             self._error = ""
             self._began = math.inf

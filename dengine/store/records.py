@@ -175,6 +175,9 @@ class NewLabel:
     overdue_to : int or None
         Number of the newest decision whose check was overdue when the rule was updated with this
         label; None if unknown.
+    seq : int
+        Number of the label in its cell's journal, 1, 2, ...; the store keeps it. 0 or less: the
+        store gives the next number of the cell, or of its product.
     """
 
     decision_id: str
@@ -187,6 +190,7 @@ class NewLabel:
     content_hash: int = 0
     decided: float = 0.0
     overdue_to: int | None = None
+    seq: int = 0
 
 
 @dataclass(frozen=True, slots=True)

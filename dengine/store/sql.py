@@ -107,6 +107,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             f"leave it at {KEEP}",
             StoreError,
         )
+        alone = product is None or url is not None
+        do = "name a file or a server, which its cells share"
+        expect(alone, "no product of a store in memory", product, do, StoreError)
         self.wait = _checked_wait(wait)
         self.clock = clock
         self.database = Database(url if url is None else str(url), cell_id, clock, product)

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,7 @@ def test_a_damaged_label_that_waits_alone_is_stored_from_memory(
     assert box.fault == ""
     assert box.is_drained
     assert box.store.decisions.get("part 1").success is True
-    assert box.pop_label_numbers() == [("part 1", 1)]
+    assert box.store.labels.newest() == 1
     (text,) = journal_events(box)
     assert text.startswith("1 records of ")
     assert text.endswith("are stored from memory; decisions that are lost: none.")
@@ -153,9 +154,9 @@ def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Outbox]:
     box.close()
 
 
-def numbers(box: Outbox) -> list[tuple[str, int]]:
-    box.drain()
-    return box.pop_label_numbers()
+def numbered(box: Outbox, *labels: NewLabel) -> list[NewLabel]:
+    """Labels with the next numbers of a cell."""
+    return [replace(label, seq=box.number_label()) for label in labels]
 
 
 def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either: Outbox) -> None:
@@ -164,14 +165,15 @@ def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either: Outbo
     assert [item.number for item in items] == [1, 2, 3]
     assert either.n_decisions == 3
     assert either.find_decision("b").decision.id == "b"
-    either.record_labels([(items[1], label("b", False)), (items[0], label("a"))])
+    labels = numbered(either, label("b", False), label("a"))
+    assert [label.seq for label in labels] == [1, 2]
+    either.record_labels(zip((items[1], items[0]), labels, strict=True))
     assert either.find_decision("b", unsynced=True).success is False
-    assert numbers(either) == [("b", 1), ("a", 2)]
-    assert either.pop_label_numbers() == []
     either.record_event("hello", "there")
     either.drain()
     labelled = either.store.labels.with_traces()
     assert (labelled.seq.tolist(), labelled.labels.tolist()) == ([1, 2], [0, 1])
+    assert either.pop_label_numbers() == []
     assert [event.text for event in either.store.events.newest()] == ["there"]
     assert either.find_earlier("c").decision.id == "c"
     assert either.find_earlier("d") is None
@@ -185,11 +187,12 @@ def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either: Outbo
     )
     item = either.record_decision(accepted)
     either.record_labels([(item, label("a", True, source=Source.CONFIRMED))])
-    assert numbers(either) == [("a", 1)]
+    either.drain()
     confirmed = either.find_decision("a")
     either.record_labels([(confirmed, label("a", False, source=Source.STOP))])
     either.record_labels([(either.record_decision(stored("b")), label("b"))])
-    assert dict(numbers(either))["b"] == 2
+    either.drain()
+    assert either.store.decisions.get("b").label_seq == 2
     assert either.store.decisions.get("a").success is False
     assert either.find_decision("a", unsynced=True).success is False
     assert [event.kind for event in either.store.events.newest()] == ["late stop"]
@@ -208,7 +211,8 @@ def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(
     either: Outbox, tmp_path: Path
 ) -> None:
     either.check_usable()
-    either.record_labels([(either.record_decision(stored("a")), label("a"))])
+    item = either.record_decision(stored("a"))
+    either.record_labels([(item, *numbered(either, label("a")))])
     either.close()
     either.close()
     with pytest.raises(StoreError, match="after close"):
@@ -218,10 +222,31 @@ def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(
         again = SqlStore(str(tmp_path / "cell.db"))
     assert again.decisions.get("a").success is True
     other = open_outbox(again, window=10)
-    assert other.n_decisions == 1
-    other.record_labels([(other.record_decision(stored("b")), label("b"))])
-    assert numbers(other) == [("b", 2)]
+    assert (other.n_decisions, other.number_label()) == (1, 2)
     other.close()
+
+
+def test_a_label_keeps_its_number_whatever_the_one_before_was(either: Outbox) -> None:
+    skipped, kept = numbered(either, label("a"), label("a"))
+    assert (skipped.seq, kept.seq) == (1, 2)
+    either.record_labels([(either.record_decision(stored("a")), kept)])
+    either.record_labels([(either.record_decision(stored("b")), label("b"))])  # as of before
+    either.drain()
+    assert [either.store.decisions.get(name).label_seq for name in "ab"] == [2, 3]
+
+
+def test_labels_of_a_product_are_numbered_by_the_store(tmp_path: Path) -> None:
+    store = SqlStore(str(tmp_path / "cell.db"), product="gear", wait=10.0)
+    box = open_outbox(store, window=10)
+    labels = numbered(box, label("a"), label("b"))
+    assert [label.seq for label in labels] == [-1, -2]
+    box.record_labels((box.record_decision(stored(one.decision_id)), one) for one in labels)
+    box.drain()
+    assert box.pop_label_numbers() == [("a", 1), ("b", 2)]
+    assert box.pop_label_numbers() == []
+    box.close()
+    with pytest.raises(StoreError, match="no product of a store in memory"):
+        SqlStore(product="gear")
 
 
 def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path: Path) -> None:
@@ -316,7 +341,7 @@ def test_an_index_finds_decisions_in_memory_and_in_the_journal_until_they_are_dr
     recorder.start()
     recorder.sync()
     index.add(second, recorder.record(second))
-    assert index.recent("a") is None
+    assert "a" not in index.recent
     np.testing.assert_array_equal(index.find("a").trace, first.trace)
     assert (index.is_unsynced("a"), index.find("b") is second) == (False, True)
     index.remove_drained(entry)
