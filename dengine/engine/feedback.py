@@ -297,6 +297,8 @@ class Feedback:
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within
+        if overdue_to <= self._live.overdue_to:
+            return
         pending = self._awaiting_check
         while pending and next(iter(pending.values())).number <= overdue_to:
             _, stored = pending.popitem(last=False)

@@ -220,7 +220,7 @@ class Drainer:
             if call is not None:
                 self._make_call(*call)
             with self._changed:
-                has_ended = self._error or not self._has_synced
+                has_ended = self._error or not self._recorder.synced
                 if self._stopped and has_ended and not self._calls:
                     return
                 if self._error:
@@ -232,21 +232,17 @@ class Drainer:
         Return the oldest call, None if there is none.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._calls or self._has_synced or self._stopped)
+            self._changed.wait_for(lambda: self._calls or self._recorder.synced or self._stopped)
             self._changed.wait_for(
-                lambda: self._calls or self._is_wanted or self._stopped, DRAIN_SECONDS
+                lambda: (
+                    self._calls
+                    or self._stopped
+                    or self._wanted > self.n_drained
+                    or self._recorder.needs_clearing
+                ),
+                DRAIN_SECONDS,
             )
             return self._calls.popleft() if self._calls else None
-
-    @property
-    def _has_synced(self) -> bool:
-        """Whether there are synced records that are not drained."""
-        return bool(self._recorder.synced)
-
-    @property
-    def _is_wanted(self) -> bool:
-        """Whether somebody waits for the database, or the journal is to be cleared."""
-        return self._wanted > self.n_drained or self._recorder.needs_clearing
 
     def _note_error(self, error: Exception) -> None:
         """Keep an error of the database for `fault`, and wake those who wait; log the first."""
@@ -258,9 +254,9 @@ class Drainer:
 
     def _drain_synced(self) -> None:
         """Drain everything that is synced. Raise StoreError if the database refuses it."""
-        if self._has_synced:
+        if self._recorder.synced:
             self._journal.sync_head()
-        while self._has_synced:
+        while self._recorder.synced:
             self.drain_chunk()
         self._error = ""
 

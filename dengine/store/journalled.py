@@ -203,7 +203,7 @@ class JournalledStore(Outbox):
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
         id_ = item.decision.id
         with self._changed:
-            first = self._index.find(id_)
+            first, _ = self._index.find(id_)
             if first is None:
                 raise KeyError(id_)
             if not self._index.is_unsynced(id_):
@@ -248,8 +248,7 @@ class JournalledStore(Outbox):
                     "not be looked up, and was "
                     "verified unrecorded; decide on the part again."
                 )
-            item = self._index.find(decision_id)
-            label = self._index.find_label(decision_id, unsynced)
+            item, label = self._index.find(decision_id, unsynced)
         if item is None and not self._index.is_new(decision_id):
             item = self.call_store(lambda: self.store.decisions.get(decision_id))
         if item is not None and label is not None:

@@ -121,23 +121,22 @@ class DecisionIndex:
             if item is not None:
                 self.recent[id_] = replace(item, success=label.success, source=label.source)
 
-    def find(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision from memory or from the journal, without a label that is not drained.
+    def find(
+        self, decision_id: str, unsynced: bool = False
+    ) -> tuple[StoredDecision | None, NewLabel | None]:
+        """Return a decision from memory or from the journal, and its undrained label.
 
-        None if it is in neither. Raise StoreError if the journal is damaged there.
+        None for each that is in neither, and for a label that is not on disk yet unless `unsynced`.
+        Raise StoreError if the journal is damaged where the decision stands.
         """
-        entry = self._decisions.get(decision_id)
         item = self.recent.get(decision_id)
+        entry = self._decisions.get(decision_id)
         if item is None and entry is not None:
             record: Any = entry.record or decode_record(self._journal.read(entry.offset))
             item = record
-        return item
-
-    def find_label(self, decision_id: str, unsynced: bool) -> NewLabel | None:
-        """Return the undrained label of a decision; `unsynced` includes one not yet on disk."""
-        label, entry = self._labels.get(decision_id, (None, None))
-        is_counted = unsynced or (entry is not None and entry.is_synced)
-        return label if is_counted else None
+        label, place = self._labels.get(decision_id, (None, None))
+        is_counted = unsynced or (place is not None and place.is_synced)
+        return item, label if is_counted else None
 
     def is_unsynced(self, decision_id: str) -> bool:
         """Return whether a decision was recorded, and is not in the journal yet."""

@@ -360,7 +360,9 @@ def test_neither_a_restart_nor_a_correction_sends_a_healthy_cell_with_overdue_ch
 def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_not_know_of_overdue_checks(
     stream: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feedback, "NewLabel", lambda *given, overdue_to: NewLabel(*given))
+    monkeypatch.setattr(
+        feedback, "NewLabel", lambda *given, overdue_to, seq: NewLabel(*given, seq=seq)
+    )
     engine, checks = make(replace(POOLED, label_within=50), store=tmp_path / "e.db"), 0
     for x, success in zip(stream.X, stream.y.tolist(), strict=True):
         decision = engine.decide(x)

@@ -342,10 +342,10 @@ def test_an_index_finds_decisions_in_memory_and_in_the_journal_until_they_are_dr
     recorder.sync()
     index.add(second, recorder.record(second))
     assert "a" not in index.recent
-    np.testing.assert_array_equal(index.find("a").trace, first.trace)
-    assert (index.is_unsynced("a"), index.find("b") is second) == (False, True)
+    np.testing.assert_array_equal(index.find("a")[0].trace, first.trace)
+    assert (index.is_unsynced("a"), index.find("b")[0] is second) == (False, True)
     index.remove_drained(entry)
-    assert index.find("a") is None
+    assert index.find("a") == (None, None)
     assert not index.is_new("c")  # not all ids are known
     index.complete_ids()
     assert [index.is_new(name) for name in "abc"] == [False, False, True]
