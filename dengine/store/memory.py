@@ -6,9 +6,8 @@ never pays for that. An engine that only reads its store, a file or a server, al
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -41,13 +40,11 @@ class MemoryStore(Outbox):
     """
 
     is_thread_safe = False
-    lag = 0.0
-    is_drained = True
 
     def __init__(self, store: SqlStore, window: int, reading: bool = False) -> None:
         super().__init__(store, window, math.inf, reading)
         self._unwritten: list[Record] = []
-        self._versions: list[tuple[Any, ...]] = []  # not written: arguments of `put_version`
+        self._versions: list[tuple[Any, ...]] = []  # not written: arguments of `versions.put`
         self._decisions: dict[str, StoredDecision] = {}  # not written, with their labels
         self._note_integrity(store.database.check_pages())
         self.check_integrity()
@@ -65,9 +62,6 @@ class MemoryStore(Outbox):
             self.store.versions.put(*version)
         for part in chunks(records):
             self.store.apply_records(part)
-
-    def try_lock(self) -> AbstractContextManager[bool]:
-        return nullcontext(True)
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
         self.n_decisions += 1
@@ -94,33 +88,8 @@ class MemoryStore(Outbox):
         if self._reading:  # nobody may read the store again before it is closed
             self._write()
 
-    def sync(self, seconds: float | None = None) -> None:
-        """Do nothing: there is no disk."""
-
-    def drain(self) -> None:
-        """Do nothing: whoever reads the database has everything written first."""
-
-    def request_label_drain(self) -> bool:
-        return False
-
-    def pop_label_numbers(self) -> list[tuple[str, int]]:
-        """Return an empty list: a store in memory has no product."""
-        return []
-
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
         return self._decisions.get(decision_id) or self.store.decisions.get(decision_id)
-
-    def find_earlier(self, decision_id: str) -> StoredDecision | None:
-        return self.find_decision(decision_id)
-
-    def load_ids(self) -> None:
-        """Do nothing: the store is always at hand."""
-
-    def evict_decision(self, decision_id: str) -> None:
-        """Do nothing: the decision was written before it was corrected."""
-
-    def call_store(self, call: Callable[[], T]) -> T:
-        return call()
 
     def store_version(
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
@@ -136,9 +105,6 @@ class MemoryStore(Outbox):
         future: Future[int] = Future()
         future.set_result(report.version)
         return future
-
-    def wait_for_result(self, future: Future[T]) -> T:
-        return future.result()
 
     def close(self) -> None:
         """End the use by this engine; a store in memory stays open, also for another engine."""

@@ -11,7 +11,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ class Outbox(ABC):
     """Records what an engine decides and learns, and asks its store for it.
 
     Every `record_*` method returns at once; `sync` waits for the disk, `drain` for the database.
+    What is not abstract here is as for a store that is always at hand: nothing is waited for.
 
     Parameters
     ----------
@@ -121,18 +122,18 @@ class Outbox(ABC):
         return self.integrity_error
 
     @property
-    @abstractmethod
     def lag(self) -> float:
         """Age in seconds of the oldest record that is not drained; 0.0 if all are."""
+        return 0.0
 
     @property
-    @abstractmethod
     def is_drained(self) -> bool:
         """Whether the database has taken every record."""
+        return True
 
-    @abstractmethod
     def try_lock(self) -> AbstractContextManager[bool]:
         """Return a context manager that gives whether nothing has to be waited for in its block."""
+        return nullcontext(True)
 
     # What the engine records
 
@@ -205,8 +206,7 @@ class Outbox(ABC):
             For people.
         """
 
-    @abstractmethod
-    def sync(self, seconds: float | None = None) -> None:
+    def sync(self, seconds: float | None = None) -> None:  # noqa: B027  # a default
         """Wait until everything that was recorded so far is on the disk.
 
         Parameters
@@ -220,8 +220,7 @@ class Outbox(ABC):
             If that takes too long, or fails. Recording the same again is harmless.
         """
 
-    @abstractmethod
-    def drain(self) -> None:
+    def drain(self) -> None:  # noqa: B027  # a default
         """Wait until the database has taken everything recorded so far, at most `limit` seconds.
 
         Raises
@@ -250,19 +249,19 @@ class Outbox(ABC):
         with suppress(StoreError):
             self.drain()
 
-    @abstractmethod
     def request_label_drain(self) -> bool:
         """If any label is not drained, ask that everything be drained now; do not wait.
 
         Return whether any label is not drained.
         """
+        return False
 
-    @abstractmethod
     def pop_label_numbers(self) -> list[tuple[str, int]]:
         """Return (decision id, label number) of a product's labels that the store has numbered.
 
         They are those since the last call, in the order of their numbers. Empty without a product.
         """
+        return []
 
     # What the engine asks
 
@@ -292,7 +291,6 @@ class Outbox(ABC):
             a decision.
         """
 
-    @abstractmethod
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
         """Return the decision that an id already has, or None if the id is new.
 
@@ -304,24 +302,23 @@ class Outbox(ABC):
             If that cannot be looked up. The id is then remembered as answered but unrecorded: until
             a decision is recorded for it, `find_decision` raises StoreError.
         """
+        return self.find_decision(decision_id)
 
-    @abstractmethod
-    def load_ids(self) -> None:
+    def load_ids(self) -> None:  # noqa: B027  # a default
         """Load the ids of all decisions, so that a new id is recognized without the database.
 
         Another call does nothing. Raise StoreError if the database cannot be read.
         """
 
-    @abstractmethod
-    def evict_decision(self, decision_id: str) -> None:
+    def evict_decision(self, decision_id: str) -> None:  # noqa: B027  # a default
         """Drop a decision from memory, since it was corrected in the store."""
 
-    @abstractmethod
     def call_store(self, call: Callable[[], T]) -> T:
         """Run a call of the store, and return its result within `limit` seconds.
 
         Raise StoreError if the store is unavailable or takes too long, and whatever `call` raises.
         """
+        return call()
 
     @abstractmethod
     def store_version(
@@ -340,7 +337,6 @@ class Outbox(ABC):
             If the store is unavailable.
         """
 
-    @abstractmethod
     def wait_for_result(self, future: Future[T]) -> T:
         """Return the result of a future of `store_version`, or raise what the commit raised.
 
@@ -351,6 +347,7 @@ class Outbox(ABC):
             waited for some seconds more; if StoreError is raised after these, the version may still
             have been committed, or be so later.
         """
+        return future.result()
 
     @abstractmethod
     def close(self) -> None:
