@@ -183,7 +183,8 @@ class ProductLabels:
         if decision_id not in self._unnumbered:
             return
         stored, label = self._unnumbered.pop(decision_id)
-        self._live.newest.renumber_reference(label.seq, number)
+        if self._live.answering is not None:
+            self._live.answering.renumber_reference(label.seq, number)
         row = (stored.trace, int(label.success), stored.content_hash)
         self._waiting[number] = row
         self._updated_to = max(number, self._updated_to)

@@ -198,7 +198,8 @@ class LiveModel:
 
         The rule keeps the outcome: it must be rebuilt.
         """
-        self.newest.change_reference(number, stored.content_hash, None)
+        if self.answering is not None:
+            self.answering.change_reference(number, stored.content_hash, None)
 
     def count_overdue(self, decision: Decision) -> None:
         """Update the rule as if a decision was wrong, because its check was not reported in time.
