@@ -1,13 +1,12 @@
 """Connections to a store's database, and the class `Database` through which one cell writes to it.
 `make_engine` makes the SQLAlchemy engine for SQLite or PostgreSQL; `reading` opens a store for one
-block of reading. `Database` has the transactions, each of which ends with a ledger entry, the lock
-by which one engine owns a cell on a PostgreSQL server, and the insertion of journal records. It
-also notices a deleted file and a forked process, and leaves out rows that the database refuses.
-`SqlStore` is built on `Database`; backup, verification and the list of cells use `reading`.
+block of reading. `Database` has the transactions, each of which ends with a ledger entry, and the
+lock by which one engine owns a cell on a PostgreSQL server. It also notices a deleted file and a
+forked process. `SqlStore` and its tables are built on `Database`; backup, verification and the list
+of cells use `reading`.
 """
 
 import hashlib
-import logging
 import os
 import shutil
 import sqlite3
@@ -32,20 +31,9 @@ from .ledger import (
     newest_entry,
 )
 from .queries import Scope, join_product
-from .records import (
-    as_text,
-    chunks,
-)
-from .schema import (
-    CELL,
-    DECISION,
-    LEDGER,
-    check_schema,
-    lock,
-    prepare_tables,
-)
+from .records import as_text, chunks
+from .schema import CELL, DECISION, LEDGER, check_schema, lock, prepare_tables
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 
 # With these, libpq reports a server that has stopped answering after seconds, not hours.
@@ -621,7 +609,7 @@ class Database:
         self._writer.dispose()
         self._engine.dispose()
 
-    # Insertion
+    # Rows
 
     def insert(
         self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
