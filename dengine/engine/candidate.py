@@ -24,9 +24,7 @@ from .guard import GuardedModel
 from .trainer import Trained, TrainedOn, TrainingWindow
 
 log = logging.getLogger("dengine")
-PATIENCE = (
-    20  # steps that a candidate waits for the labels' numbers before it asks the store for them
-)
+PATIENCE = 20  # steps that a candidate waits for its labels to be stored before it blocks for that
 
 
 class Candidate:

@@ -55,7 +55,7 @@ class Feedback:
     live : LiveModel
         Learns from them.
     labels : CellLabels or ProductLabels
-        Takes each label that the store has numbered.
+        Takes each label that is recorded.
     settings : SettingsInForce
         Whether silence until the next decision confirms an accepted part, and since which version.
     on_safe_mode : callable, optional

@@ -155,8 +155,7 @@ class Learner:
         self._feedback.announce_safe_mode()
 
     def catch_up(self) -> None:
-        """Add labels that the store has numbered to the window, and do what `Feedback.remedy` asks
-        for.
+        """Take in the numbers that a product gave its labels, and do what `Feedback.remedy` asks.
 
         The remedy, a rebuild of the rule and perhaps a correction, is left to a later call while
         the store lacks records or has a fault. A correction first ends a retrain under way, as
