@@ -269,7 +269,7 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
         url = str(Path(folder) / "engine.db")
         with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
             list(engine.run(ReplayCell(Dataset(X, y.astype(np.int8))), 90))
-            first = engine.store.retrains()[0]
+            first = engine.store.versions.retrains()[0]
             assert first.accepted, f"the first retrain was dropped: {first.reason}"
             decisions = _decide_all(engine, X[90:])
         with DataEngine.open(url, reducer=clone(reducer)) as engine:

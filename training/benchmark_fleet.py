@@ -212,7 +212,7 @@ def run_cell(plan: Plan, data: Dataset, cell: int) -> dict[str, Any]:
         flush_within(engine, STORED_WITHIN_SECONDS)
         n_foreign = 0
         if plan.products:
-            learned = engine.store.labelled().traces
+            learned = engine.store.labels.with_traces().traces
             products = [plan.product(read_mark(trace)[0]) for trace in learned]
             n_foreign = sum(product != plan.product(cell) for product in products)
         return {
@@ -310,16 +310,16 @@ def check_rows(plan: Plan, run: CellRun) -> dict[str, Any]:
     wrong = 0
     mixed = run.n_foreign
     with plan.store(run.cell) as store:
-        stored = store.status()["labels"]
+        stored = store.decisions.counts()["labels"]
         for decision_id, (cycle, good) in run.sent.items():
-            record = store.get_decision(decision_id)
+            record = store.decisions.get(decision_id)
             if record is None:
                 lost += 1
                 continue
             lost += record.success is None
             wrong += record.success is (not good)
             mixed += read_mark(record.trace) != (run.cell, cycle)
-        learned = store.labelled(cell_only=True).traces
+        learned = store.labels.with_traces(cell_only=True).traces
         mixed += sum(read_mark(trace)[0] != run.cell for trace in learned)
     return {
         "cell": run.cell,

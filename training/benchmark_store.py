@@ -76,7 +76,7 @@ def main() -> None:
         raw = run_cell(file, arguments.data, arguments.reducer, arguments.parts, arguments.seed)
         sizes = read_sizes(file, raw)
         with DataEngine.open(str(file), reading=True) as engine:
-            versions = engine.store.versions()
+            versions = engine.store.versions.all()
     print(sizes.to_string(index=False))
     print(f"{len(versions)} retrains, {sum(version.kept for version in versions)} states")
     if arguments.out is not None:

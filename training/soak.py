@@ -182,8 +182,8 @@ def compare_with_store(path: Path, acknowledged: dict[str, bool]) -> dict[str, A
     """
     store = open_store(path, must_exist=True)
     try:
-        stored = {label.decision_id: label.success for label in store.past_labels(0)}
-        reports = store.retrains()
+        stored = {label.decision_id: label.success for label in store.labels.past(0)}
+        reports = store.versions.retrains()
     finally:
         store.close()
     seconds = [report.seconds for report in reports if report.accepted]

@@ -266,7 +266,7 @@ def train(
         budget = engine.recipe.budget
         n_steps_left = engine.model.report.n_steps_left
         report = reports[-1]
-        n_labels = engine.store.status()["labels"]
+        n_labels = engine.store.decisions.counts()["labels"]
     answers = "No version answers yet: every part is verified."
     if report.version:
         answers = f"Version {report.version} of {name} answers. {retrain_line(reports)}"

@@ -228,7 +228,7 @@ def _simulated_cell(
     def make(engine: DataEngine) -> tuple[Cell, str]:
         store = engine.store
         # Another seed for a resumed run: the same parts again would be counted twice.
-        seed = engine.seed + store.status()["decisions"]
+        seed = engine.seed + store.decisions.counts()["decisions"]
         if store.product is not None:
             # The cells of one product have one seed, but each makes other parts.
             seed += crc32(store.cell_id.encode())
@@ -259,9 +259,9 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
         store = engine.store
         # By the content of the traces: the store's own hash is one number for a part that comes
         # twice.
-        hashes = content_hash(store.labelled(cell_only=True).traces)
-        for id_ in store.unreported_accepts()[-1:]:
-            newest = store.get_decision(id_)
+        hashes = content_hash(store.labels.with_traces(cell_only=True).traces)
+        for id_ in store.decisions.unreported_accepts()[-1:]:
+            newest = store.decisions.get(id_)
             if newest is not None:
                 hashes = np.append(hashes, content_hash(newest.trace[None]))
         played = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))

@@ -112,8 +112,8 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
             text = f"Decision {id_} was {label} already; nothing changed."
             return Changed("report", text, None, engine.version)
         engine.report(id_, LABELS[label])
-        engine.store.put_event("report", f"decision {id_} was {label}", author=author)
-        event = engine.store.events(1)[-1].number
+        engine.store.events.put("report", f"decision {id_} was {label}", author=author)
+        event = engine.store.events.newest(1)[-1].number
         return Changed("report", f"Decision {id_} was {label}.", event, engine.version)
 
     _change_and_print(store, author, allow_import, change)
@@ -225,7 +225,7 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
     with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
         report = engine.retrain()
         text = f"trained by hand on {report.n_traces} traces: {report.reason}"
-        engine.store.put_event("retrain", text, asdict(report), author)
+        engine.store.events.put("retrain", text, asdict(report), author)
     answers = f"Version {report.version} answers." if report.version else "No version answers yet."
     print_result(
         {"store": store, "author": author, "retrain": report},
@@ -282,7 +282,7 @@ def verify(
         if acknowledge:
             for item in report.cells:
                 with SqlStore(store, item.cell_id) as opened:
-                    opened.acknowledge_losses(author)
+                    opened.events.acknowledge_losses(author)
             report = verify_history(store, cell, expect, advance)
     record = {"store": store, "ok": report.ok, "cells": report.cells, "faults": report.faults}
     print_result(record, *_verification_lines(report))

@@ -58,7 +58,7 @@ def in_form_of(store: "StoreLike", description: Description) -> Description:
     """
     try:
         with opening(store, must_exist=True) as opened:
-            spec = stored_trace_spec(opened.settings())
+            spec = stored_trace_spec(opened.settings.read())
     except StoreError:
         return description  # a new store; another error comes again when it is opened to be written
     if opened is not store:
@@ -224,7 +224,7 @@ def import_parts(
         new: dict[str, StoredDecision] = {}
         labels: list[NewLabel] = []
         for decision, trace, label in chunk:
-            earlier = new.get(decision.id) or store.get_decision(decision.id)
+            earlier = new.get(decision.id) or store.decisions.get(decision.id)
             if earlier is not None and earlier.source is not None:  # a forgotten one has a label
                 outcome = "repeated" if label == earlier.success else "contradicted"
                 counts[outcome] += label is not None
@@ -256,8 +256,8 @@ def _count_silent(store: "SqlStore", policy: Policy) -> int:
     """
     if policy.stops != "some":
         return 0
-    since = int(store.settings().get("policy_since", 0))
-    return len(store.unreported_accepts(since)) - store.silent_total(since)
+    since = int(store.settings.read().get("policy_since", 0))
+    return len(store.decisions.unreported_accepts(since)) - store.labels.silent_total(since)
 
 
 def _as_stored(

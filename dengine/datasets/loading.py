@@ -241,8 +241,8 @@ def _read_store(path: Path) -> Dataset:
         difference = store.database.check_integrity(0, since=0)
         do = "see `dengine verify`, and restore a copy"
         expect_data(not difference, f"{path} as its ledger has it", difference, do)
-        labelled = store.labelled()
-        spec = stored_trace_spec(store.settings())
+        labelled = store.labels.with_traces()
+        spec = stored_trace_spec(store.settings.read())
     store.close()
     if spec is None or not len(labelled.labels):
         do = "record some first, as in shadow mode"

@@ -246,7 +246,8 @@ class Corrections:
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
             raise SettingError(
-                f"Expected the number of a version, got {version!r}; `store.retrains()` lists them."
+                f"Expected the number of a version, got {version!r}; "
+                "`store.versions.retrains()` lists them."
             )
         self._bring_up_to_date()
         before = self._live.version
@@ -360,7 +361,7 @@ class Corrections:
         self._bring_up_to_date()
         decisions = []
         for id_ in decision_ids:
-            stored = self._store.get_decision(id_) if isinstance(id_, str) else None
+            stored = self._store.decisions.get(id_) if isinstance(id_, str) else None
             if stored is None:
                 raise unknown_decision(id_)
             if stored.source is None:
@@ -375,7 +376,7 @@ class Corrections:
         announced. Returns what was done, with the number of the change's event. Raises StoreError
         where the store does not answer.
         """
-        self._store.apply_change(change)
+        self._store.corrections.apply(change)
         for id_ in change.decisions:
             self._outbox.evict_decision(id_)
         self._learner.apply_corrections()
@@ -389,7 +390,7 @@ class Corrections:
         `reason_ended` is recorded as the reason if a safe mode ended. The result names the newest
         event of the store as the event of the change.
         """
-        number = self._store.events(1)[0].number
+        number = self._store.events.newest(1)[0].number
         self._feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._live.version)
 

@@ -231,7 +231,7 @@ class DecisionMaker:
         if earlier is not None:
             return earlier
         spec = self._settings.now.trace
-        if spec is None or self._outbox.store.wait is None:
+        if spec is None or not self._outbox.is_thread_safe:
             return verify_decision(id_, number, self._live.version, Reason.LATE)
         stored = self.record(convert_trace(trace, spec, False), number, id_, Reason.LATE)
         with suppress(NotTakenError):

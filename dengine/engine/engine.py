@@ -52,8 +52,9 @@ from ..records import (
 )
 from ..reducers.base import Reducer
 from ..representation import to_html
-from ..store.opening import LONG_WAIT, opening
-from ..store.outbox import CLOSE_SECONDS, Outbox
+from ..store.journalled import CLOSE_SECONDS
+from ..store.opening import LONG_WAIT, open_outbox, opening
+from ..store.outbox import Outbox
 from ..store.records import StoredDecision
 from ..traces import check_rate
 from .corrections import Changed, Corrections
@@ -199,12 +200,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 settings = replace(settings, trace=read_peers_trace_spec(opened))
             self._compose(settings, template, opened, **options)
             with self._closed_on_failure():
-                if opened.settings():  # now that the cell is owned, nobody else begins it
+                if opened.settings.read():  # now that the cell is owned, nobody else begins it
                     raise StoreError(
                         "The store is not empty; use DataEngine.open(url) to go on with it, "
                         "or name another store."
                     )
-                self.store.save_settings(settings.to_store())
+                self.store.settings.save(settings.to_store())
                 if opened.product is not None:
                     self._resume()  # with what its peers learned
 
@@ -236,7 +237,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self.resumed = False
         self._clock = clock
         self._exclusive = ExclusiveUse()
-        self._outbox = Outbox(store, recipe.window, not reading, replaying)
+        self._outbox = open_outbox(store, recipe.window, reading=reading, patient=replaying)
         self._settings = SettingsInForce(settings, self._outbox)
         window = TrainingWindow(recipe.window)
         self._live = LiveModel(template, window, self._outbox, settings.evidence)
@@ -355,7 +356,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         engine = cls.__new__(cls)
         with opening(url, must_exist=True, wait=wait) as store:
             name = str(url) if isinstance(url, str | os.PathLike) else "the store"
-            stored = EngineSettings.from_store(store.settings(), name, reducer, model, allow_import)
+            stored = EngineSettings.from_store(
+                store.settings.read(), name, reducer, model, allow_import
+            )
             settings = replace(stored, trace=agreed_trace_spec(store, trace))
             settings.check_request({"trace": trace})
             engine._compose(*settings.with_template(model), store, reading=reading, **options)
@@ -413,7 +416,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         with opening(store, wait=wait) as opened:
             allowed = allow_import or named_classes(**settings)
-            if not opened.settings():
+            if not opened.settings.read():
                 return cls(
                     store=opened, **fill_from_peers(settings | {"seed": seed}, opened, allowed)
                 )
@@ -710,7 +713,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             with self._exclusive:
                 self._maker.set_trace_spec(spec)
         with ExitStack() as ending:
-            ending.callback(self.flush, LONG_WAIT if self.store.wait is not None else None)
+            ending.callback(self.flush, LONG_WAIT)
             ending.enter_context(frozen_objects())
             for index in range(cycles):
                 yield self._cycle(cell, index)
@@ -860,7 +863,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self.flush()
         policy = self.policy
         since = self._settings.now.policy_since
-        tally = self.store.tally(since_version=since, within=policy.label_within)
+        tally = self.store.decisions.tally(since_version=since, within=policy.label_within)
         return policy.certificate(tally.outcomes)
 
     # Reading

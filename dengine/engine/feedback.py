@@ -11,7 +11,7 @@ the part counts as unobserved, which is no success.
 
 import logging
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from enum import Enum
 
 from ..records import Action, Reason, Source, source_of
@@ -55,7 +55,7 @@ class Feedback:
     live : LiveModel
         Learns from them.
     labels : CellLabels or ProductLabels
-        Takes each label that the store has numbered.
+        Takes each label that is recorded.
     settings : SettingsInForce
         Whether silence until the next decision confirms an accepted part, and since which version.
     on_safe_mode : callable, optional
@@ -110,16 +110,16 @@ class Feedback:
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
-        for stored in store.pending_decisions(self._settings.now.evidence.since):
+        for stored in store.decisions.pending(self._settings.now.evidence.since):
             if stored.number > self._live.overdue_to:
                 self._awaiting_check[stored.decision.id] = stored
         policy_since = self._settings.now.policy_since
-        ids = store.unreported_accepts(policy_since)
+        ids = store.decisions.unreported_accepts(policy_since)
         if not self._stops_all:
-            self._unobserved = len(ids) - store.silent_total(policy_since)
+            self._unobserved = len(ids) - store.labels.silent_total(policy_since)
             return
         for id_ in ids:
-            accepted = store.get_decision(id_)
+            accepted = store.decisions.get(id_)
             if accepted is not None:
                 self._unreported[id_] = accepted
 
@@ -206,13 +206,13 @@ class Feedback:
             label = NewLabel(decision.id, False, source, self._live.version, None)
             self._outbox.record_labels([(stored, label)])
             return True
-        was_confirmed = self._pending.pop(decision.id, None) is not None
+        confirmation = self._pending.pop(decision.id, None)
+        was_confirmed = confirmation is not None
         self.store_pending()
-        if was_confirmed:
-            self._live.unlearn(stored)
+        if confirmation is not None:
+            self._live.unlearn(stored, confirmation[1].seq)
             self._labels.count_unlearned()
-        label = self._learn(stored, success, source)
-        self._outbox.record_labels([(stored, label)])
+        self._record([(stored, self._learn(stored, success, source))])
         self._unreported.pop(decision.id, None)
         self._awaiting_check.pop(decision.id, None)
         if self._live.clear_overdue(decision.id) or was_confirmed:
@@ -229,20 +229,30 @@ class Feedback:
         """
         decision = stored.decision
         version = self._live.version
+        number = self._outbox.number_label()
         point = None
         silent = 0
         if stored.quarantined:
             pass  # an unusable trace teaches nothing
         elif source is Source.INSPECTION:
-            point = self._live.learn(stored, success, None)
+            point = self._live.learn(stored, success, number, None)
             self._labels.count_learned()
         else:
             silent = self._unobserved - self._was_unobserved(stored)
             self._unobserved = 0
-            point = self._live.learn(stored, success, silent)
+            point = self._live.learn(stored, success, number, silent)
             self._labels.count_learned()
         overdue_to = self._live.overdue_to
-        return NewLabel(decision.id, success, source, version, point, silent, overdue_to=overdue_to)
+        return NewLabel(
+            decision.id, success, source, version, point, silent, overdue_to=overdue_to, seq=number
+        )
+
+    def _record(self, labels: Collection[tuple[StoredDecision, NewLabel]]) -> None:
+        """Hand learned labels to the outbox, and add those of usable traces to the window."""
+        self._outbox.record_labels(labels)
+        for stored, label in labels:
+            if not stored.quarantined:
+                self._labels.add(stored, label)
 
     def _was_unobserved(self, stored: StoredDecision) -> bool:
         """Return whether this part is one of those counted as unobserved.
@@ -259,29 +269,24 @@ class Feedback:
     def store_pending(self) -> bool:
         """Hand the labels of silently confirmed parts to the outbox, without waiting.
 
-        Returns False, and does nothing, if there are none; else True, and labels that the store has
-        numbered by now enter the training window.
+        Returns False, and does nothing, if there are none; else True.
         """
         if not self._pending:
             return False
-        self._outbox.record_labels(self._pending.values())
+        self._record(self._pending.values())
         self._pending.clear()
         self.number_labels()
         return True
 
     def number_labels(self) -> None:
-        """Hand learned labels that the store has newly numbered on to the training window.
+        """In a product, give learned labels the numbers that the store has newly assigned.
 
-        Their references get the same numbers. Labels of traces with a fault are left out. In a
-        product a label enters the window only after those before it. The rule is updated with
-        checks that have become overdue.
+        The rule is updated with checks that have become overdue.
         """
         self._count_overdue()
-        for id_, seq in self._outbox.pop_label_numbers():
-            learned = self._live.assign_number(id_, seq)
-            if learned is not None:
-                stored, success = learned
-                self._labels.add(stored.trace, int(success), stored.content_hash, seq)
+        if isinstance(self._labels, ProductLabels) and self._labels.has_unnumbered:
+            for id_, number in self._outbox.pop_label_numbers():
+                self._labels.assign_number(id_, number)
 
     def _count_overdue(self) -> None:
         """Make the rule count as wrong each decision whose check is overdue.
@@ -292,6 +297,8 @@ class Feedback:
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within
+        if overdue_to <= self._live.overdue_to:
+            return
         pending = self._awaiting_check
         while pending and next(iter(pending.values())).number <= overdue_to:
             _, stored = pending.popitem(last=False)

@@ -85,7 +85,7 @@ class Peers:
         """
         store = self._outbox.store
         newest = self._window.newest_seq
-        news = self._outbox.call_store(lambda: store.news_since(newest, MOST))
+        news = self._outbox.call_store(lambda: store.labels.news_since(newest, MOST))
         has_newer_version = news.version > max(self._live.version, self._refused)
         if has_newer_version or len(news.labelled.seq):
             self._outbox.call_store(lambda: self._outbox.check_integrity(since=newest))

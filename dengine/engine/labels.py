@@ -13,6 +13,7 @@ import numpy as np
 from ..model.base import EngineModel
 from ..records import TraceArray
 from ..reducers.base import State
+from ..store.records import NewLabel, StoredDecision
 from .guard import NO_REFERENCE, guarded
 from .live_model import LiveModel
 from .trainer import TrainingWindow
@@ -24,7 +25,7 @@ class CellLabels:
     Parameters
     ----------
     window : TrainingWindow
-        Takes each label that the store has numbered.
+        Takes each label that is recorded.
 
     Attributes
     ----------
@@ -52,9 +53,9 @@ class CellLabels:
         """Count a label no more that was learned and taken back before the store had it."""
         self.new_labels -= 1
 
-    def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
-        """Add a learned label that the store has numbered to the window."""
-        self._window.add(trace, label, hash_, seq)
+    def add(self, stored: StoredDecision, label: NewLabel) -> None:
+        """Add a learned label, which is recorded, to the window."""
+        self._window.add(stored.trace, int(label.success), stored.content_hash, label.seq)
 
     def is_due(self, retrain_every: int) -> bool:
         """Return whether there are enough new labels for a retrain."""
@@ -87,6 +88,9 @@ class ProductLabels:
     def __init__(self, window: TrainingWindow, live: LiveModel) -> None:
         self._window = window
         self._live = live
+        # This cell's labels that the store has not numbered, by decision: the decision, and the
+        # label with its provisional number.
+        self._unnumbered: dict[str, tuple[StoredDecision, NewLabel]] = {}
         # This cell's labels whose predecessors are missing, by number: trace, label, hash.
         self._waiting: dict[int, tuple[TraceArray, int, int]] = {}
         # Labels since the newest retrain began: number, and whether the label is this cell's.
@@ -131,17 +135,34 @@ class ProductLabels:
     def count_unlearned(self) -> None:
         """Do nothing: a label counts when it enters the window."""
 
-    def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
-        """Keep a label of this cell, which is a reference already, with the number that the store
-        gave it.
+    @property
+    def has_unnumbered(self) -> bool:
+        """Whether labels of this cell wait for their numbers."""
+        return bool(self._unnumbered)
+
+    def add(self, stored: StoredDecision, label: NewLabel) -> None:
+        """Keep a recorded label of this cell, which is a reference already, until it is numbered.
+
+        Until then its reference has the label's provisional number.
+        """
+        self._unnumbered[label.decision_id] = stored, label
+
+    def assign_number(self, decision_id: str, number: int) -> None:
+        """Give a label of this cell, and its reference, the number that the store gave it.
 
         It enters the window at once if its number is the next one, else when the peers' labels
-        before it have come.
+        before it have come. Nothing happens for a label that taught nothing.
         """
-        self._waiting[seq] = trace, label, hash_
-        self._updated_to = max(seq, self._updated_to)
-        if seq == self._window.newest_seq + 1:
-            self.admit(trace, label, hash_, seq)
+        if decision_id not in self._unnumbered:
+            return
+        stored, label = self._unnumbered.pop(decision_id)
+        if self._live.answering is not None:
+            self._live.answering.renumber_reference(label.seq, number)
+        row = (stored.trace, int(label.success), stored.content_hash)
+        self._waiting[number] = row
+        self._updated_to = max(number, self._updated_to)
+        if number == self._window.newest_seq + 1:
+            self.admit(*row, number)
 
     def admit(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add the product's next label to the window.

@@ -102,10 +102,12 @@ class Learner:
         begins in a thread to compute what the next retrain starts with. Raises StoreError where the
         store cannot be read.
         """
-        version = self._store.last_version()  # before the labels: a peer may store both meanwhile
-        labelled = self._store.labelled(self._window.capacity)
+        version = (
+            self._store.versions.newest()
+        )  # before the labels: a peer may store both meanwhile
+        labelled = self._store.labels.with_traces(self._window.capacity)
         self._window.refill(labelled)
-        reports = self._store.retrains()
+        reports = self._store.versions.retrains()
         for report in reports:
             self._note_outcome(report)
         newest_version = max((report.version for report in reports), default=0)
@@ -135,8 +137,7 @@ class Learner:
     # Labels
 
     def catch_up(self) -> None:
-        """Add labels that the store has numbered to the window, and do what `Feedback.remedy` asks
-        for.
+        """Take in the numbers that a product gave its labels, and do what `Feedback.remedy` asks.
 
         The remedy, a rebuild of the rule and perhaps a correction, is left to a later call while
         the store lacks records or has a fault. A correction first ends a retrain under way, as
@@ -415,15 +416,14 @@ class Learner:
 
         Returns a future of the version's number: the report's, or a higher one if a peer of the
         product stored a version first. Without a model only the report is stored, and the number is
-        the report's. Without a journal the store is written before this returns. Raises StoreError
-        where the store is unavailable, or without a journal fails.
+        the report's. Raises StoreError where the store is unavailable.
         """
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
         state = None
         if candidate.model is not None:
             state = self._state_of(candidate.model, candidate.trained_on)
-        return self._outbox.submit(lambda: self._store.put_version(report, newest_seq, state))
+        return self._outbox.store_version(report, newest_seq, state)
 
     def _state_of(self, model: EngineModel, trained_on: TrainedOn) -> dict[str, Any]:
         """Return the arrays of this model as a version, by name, for the store."""
@@ -520,7 +520,7 @@ class Learner:
             news, has_newer_version = peers.fetch_news()
             if has_newer_version:
                 self.store_labels()  # the peers' version is to have them among its references
-                version = self._outbox.call_store(self._store.last_version)
+                version = self._outbox.call_store(self._store.versions.newest)
         except StoreError as error:
             peers.note_loss(error)
             return 0
@@ -569,7 +569,7 @@ class Learner:
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         # In a product, labels after the window's newest come as news.
         last = None if self._peers is None else self._window.newest_seq
-        self._window.refill(self._store.labelled(self._window.capacity, last=last))
+        self._window.refill(self._store.labels.with_traces(self._window.capacity, last=last))
         is_done = self.live.apply_corrections()
         self.labels.recount(self.live.trained_on.counts_from)
         self.live.rebuild_rule()
@@ -623,7 +623,7 @@ class Learner:
         """
         begin = self._clock()
         self._outbox.check_integrity()
-        version = self._store.load_version(number)
+        version = self._store.versions.load(number)
         model, trained_on = self._restore_with_rule_in_force(version)
         add_labels_since(model, self._store, version, self._window)
         trained_on = replace(trained_on, counts_from=self._window.newest_seq, pinned=number)
@@ -671,7 +671,7 @@ class Learner:
         if policy is not None:
             template, model = live.with_policy(policy, evidence)
         if model is None:
-            self._store.apply_change(event)
+            self._store.corrections.apply(event)
         else:
             self._store_and_swap_in(
                 event, model, live.trained_on, "another policy, the same model", 0.0
@@ -690,7 +690,9 @@ class Learner:
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)
         state = self._state_of(model, trained_on)
-        self._store.apply_change(replace(event, version=(report, self._window.newest_seq, state)))
+        self._store.corrections.apply(
+            replace(event, version=(report, self._window.newest_seq, state))
+        )
         self.live.swap_in(model, report.version, trained_on)
         self._report = report
         self._note_outcome(report)

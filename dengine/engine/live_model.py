@@ -4,7 +4,6 @@ Outcomes come from `feedback.Feedback`; `learner.Learner` says which version ans
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -82,10 +81,6 @@ class LiveModel:
         self.corrected_to = 0
         self.overdue: set[str] = set()
         self.overdue_to = 0
-        # Learned labels that the store has not numbered, by decision: the decision, the label, and
-        # the provisional number of the reference; 0 where there is no reference.
-        self._unnumbered: dict[str, tuple[StoredDecision, bool, int]] = {}
-        self._provisional = itertools.count(-1, -1)
 
     @property
     def newest(self) -> EngineModel:
@@ -148,7 +143,7 @@ class LiveModel:
         self.overdue_to = past.overdue_to
         if version is None or model is None:
             self._rebuild_rule_of(self.template, self._read_outcomes)
-            numbers = (correction.number for correction in store.corrections())
+            numbers = (correction.number for correction in store.corrections.after())
             self.corrected_to = max(numbers, default=0)
             return
         self.swap_in(model, version.version, TrainedOn.from_state(version.state))
@@ -171,14 +166,15 @@ class LiveModel:
         report = model.report
         self.lacks_steps = report.n_steps > 0 and report.n_steps_left > 0
 
-    def learn(self, stored: StoredDecision, success: bool, unobserved: int | None) -> Point | None:
+    def learn(
+        self, stored: StoredDecision, success: bool, number: int, unobserved: int | None
+    ) -> Point | None:
         """Update the rule with an outcome, and make the trace a reference of the answering model.
 
-        `unobserved` is the number of accepted parts without an outcome since the previous update;
-        with None, or for a decision before the present rule began, the rule is not updated. The
-        reference has a provisional number until `assign_number`. Returns the reference point,
-        float32 of shape (d,), to be stored with the label; None where there is none: no model yet,
-        a failure, or a baseline.
+        `number` is that of the label. `unobserved` is the number of accepted parts without an
+        outcome since the previous update; with None, or for a decision before the present rule
+        began, the rule is not updated. Returns the reference point, float32 of shape (d,), to be
+        stored with the label; None where there is none: no model yet, a failure, or a baseline.
         """
         decision = stored.decision
         if unobserved is not None and decision.model_version >= self.evidence.since:
@@ -194,8 +190,6 @@ class LiveModel:
                 decision.inclusion_probability,
             )
         model = self.answering
-        number = 0 if model is None else next(self._provisional)
-        self._unnumbered[decision.id] = stored, success, number
         if model is None:
             return None
         # An embedding that this very version computed for the decision is not computed again.
@@ -211,28 +205,14 @@ class LiveModel:
         )
         return point if model.keeps_references else None
 
-    def unlearn(self, stored: StoredDecision) -> None:
+    def unlearn(self, stored: StoredDecision, number: int) -> None:
         """Remove the reference of a part that was confirmed wrongly, before the store has its
-        label.
+        label, which has this number.
 
         The rule keeps the outcome: it must be rebuilt.
         """
-        *_, number = self._unnumbered.pop(stored.decision.id)
-        if number:
-            self.newest.change_reference(number, stored.content_hash, None)
-
-    def assign_number(self, decision_id: str, seq: int) -> tuple[StoredDecision, bool] | None:
-        """Give the reference of a learned label the sequence number that the store assigned.
-
-        Returns the decision and its label, for the training window. Returns None, and changes
-        nothing, for a label that taught nothing or has its number already.
-        """
-        if decision_id not in self._unnumbered:
-            return None
-        stored, success, number = self._unnumbered.pop(decision_id)
-        if number:
-            self.newest.renumber_reference(number, seq)
-        return stored, success
+        if self.answering is not None:
+            self.answering.change_reference(number, stored.content_hash, None)
 
     def count_overdue(self, decision: Decision) -> None:
         """Update the rule as if a decision was wrong, because its check was not reported in time.
@@ -270,7 +250,7 @@ class LiveModel:
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
-            lambda: store.outcomes_since(0, self.evidence.since, self.overdue_to)
+            lambda: store.labels.outcomes_since(0, self.evidence.since, self.overdue_to)
         )
         self._rebuild_rule_of(self.newest, lambda: outcomes)
 
@@ -287,7 +267,7 @@ class LiveModel:
         A failed check sets the outbox's `integrity_error`.
         """
         self.outbox.check_integrity(after)
-        return self.outbox.store.outcomes_since(after, self.evidence.since, self.overdue_to)
+        return self.outbox.store.labels.outcomes_since(after, self.evidence.since, self.overdue_to)
 
     def apply_corrections(self) -> bool:
         """Apply the store's newest corrections to the references of the answering model.
@@ -299,7 +279,7 @@ class LiveModel:
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
-        for correction in store.corrections(self.corrected_to):
+        for correction in store.corrections.after(self.corrected_to):
             if self.answering is not None:
                 is_done &= apply_correction(self.answering, store, correction)
             self.corrected_to = correction.number

@@ -54,11 +54,11 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     outbox.check_integrity(
         first - 1
     )  # the traces are older than the newest ones, which were checked
-    data = store.labelled(first=first, last=last, corrected_to=trained_on.corrected_to)
+    data = store.labels.with_traces(first=first, last=last, corrected_to=trained_on.corrected_to)
     kept = np.isin(data.seq, trained_on.seq)
     corrected = {
         correction.seq: correction.success
-        for correction in store.corrections()
+        for correction in store.corrections.after()
         if correction.number <= trained_on.corrected_to
     }
     # A forgotten label is not among the data although nothing is damaged.
@@ -79,7 +79,7 @@ def find_clean_start(
     weights; the note says so. A model that begins anew with each training stays. Raises StoreError
     where the store cannot be read.
     """
-    corrections = {correction.seq: correction for correction in store.corrections()}
+    corrections = {correction.seq: correction for correction in store.corrections.after()}
 
     def is_clean(trained_on: TrainedOn) -> bool:
         """Whether it has seen no forgotten label; a training after one was forgotten has not."""
@@ -92,9 +92,9 @@ def find_clean_start(
 
     if is_clean(trained_on) or not newest.keeps_references:
         return newest, ""
-    for stored in reversed(store.versions()):
+    for stored in reversed(store.versions.all()):
         with suppress(StoreError):  # of a version that is not kept, or damaged
-            version = store.load_version(stored.report.version)
+            version = store.versions.load(stored.report.version)
             model = template.successor()
             if model.needs_refit(version.state):
                 return newest, ""
@@ -132,17 +132,17 @@ def add_labels_since(
     # model gets it as it was when the version was stored, and then the corrections.
     as_of = corrected_to if model.keeps_references else None
     # Up to the newest label in the window: what peers stored since then comes as their news.
-    since = store.labelled(
+    since = store.labels.with_traces(
         window.capacity,
         first=newest_reference(version) + 1,
         last=window.newest_seq,
         corrected_to=as_of,
     )
-    corrections = deque(store.corrections(corrected_to))
+    corrections = deque(store.corrections.after(corrected_to))
     newest = corrections[-1].number if corrections else corrected_to
     points = {
         label.seq: label.point
-        for label in store.past_labels(version.last_seq)
+        for label in store.labels.past(version.last_seq)
         if label.model_version == version.version
     }
     rows = zip(since.seq.tolist(), since.traces, since.labels, since.hashes.tolist(), strict=True)
@@ -169,11 +169,11 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
         return True
     # The row as it was reported, of whichever cell; no row where the part was quarantined or the
     # trace is damaged.
-    data = store.labelled(first=correction.seq, last=correction.seq, corrected_to=0)
+    data = store.labels.with_traces(first=correction.seq, last=correction.seq, corrected_to=0)
     if len(data.seq):
         hash_ = int(data.hashes[0])
     else:
-        decision = store.get_decision(correction.decision_id, trace=False)
+        decision = store.decisions.get(correction.decision_id, trace=False)
         if decision is None or decision.quarantined:
             return True
         hash_ = decision.content_hash

@@ -105,7 +105,7 @@ class EngineSettings:
             ForceLimitsGate(self.recipe.policy.windows, self.trace)  # raises before it is in force
 
     def to_store(self) -> dict[str, str]:
-        """Return the settings as texts by name, as `SqlStore.save_settings` takes them.
+        """Return the settings as texts by name, as `SqlStore.settings.save` takes them.
 
         Settings at their defaults are left out, except the recipe and the seed; dengine's own
         version is added.
@@ -366,7 +366,7 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
     """Return the trace contract of a product's other cells; None where there is none, or no
     product.
     """
-    specs = map(stored_trace_spec, store.peers_settings().values())
+    specs = map(stored_trace_spec, store.settings.of_peers().values())
     return next(filter(None, specs), None)
 
 
@@ -375,7 +375,7 @@ def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec 
 
     It is the store's own, else the peers', else the stated one.
     """
-    agreed = stored_trace_spec(store.settings()) or read_peers_trace_spec(store)
+    agreed = stored_trace_spec(store.settings.read()) or read_peers_trace_spec(store)
     return stated if agreed is None else agreed.completed(stated)
 
 
@@ -389,7 +389,7 @@ def fill_from_peers(
     that was given an object without a name has no recipe to take. Raises ImportRefusedError where
     the recipe names a class that may not be imported.
     """
-    peer = next(iter(store.peers_settings().values()), {})
+    peer = next(iter(store.settings.of_peers().values()), {})
     filled = dict(request)
     if filled.get("seed") is None:
         filled["seed"] = int(peer.get("seed", 0))
@@ -476,7 +476,7 @@ class SettingsInForce:
         """
         texts = self.now.to_store()
         try:
-            self._outbox.call_store(lambda: self._outbox.store.save_settings(texts))
+            self._outbox.call_store(lambda: self._outbox.store.settings.save(texts))
             self.is_unsaved = False
         except StoreError:
             self.is_unsaved = True

@@ -201,8 +201,8 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
         windows=engine.policy.limits,
         model_version=engine.version,
         recipe=engine.recipe.to_toml(),
-        examples=engine.store.labelled(N_EXAMPLES).traces,
-        note=engine.store.put_event,
+        examples=engine.store.labels.with_traces(N_EXAMPLES).traces,
+        note=engine.store.events.put,
     )
 
 

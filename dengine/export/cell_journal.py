@@ -317,14 +317,16 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
         # An engine that runs would never learn these labels.
         if (owned := opened.claim_cell()) is not None:
             claim.callback(owned.close)
-        settings = opened.settings()
+        settings = opened.settings.read()
         spec = stored_trace_spec(settings)
         if spec is None or "recipe" not in settings:
             wanted = "Expected the store that the model was exported from"
             raise StoreError(f"{wanted}, {store} knows no trace contract.")
         policy = Recipe.from_toml(settings["recipe"]).policy
         journal = read_journal(path, spec)
-        exports = {event.text.split()[0] for event in opened.events() if event.kind == EXPORTED}
+        exports = {
+            event.text.split()[0] for event in opened.events.newest() if event.kind == EXPORTED
+        }
         if exports and journal.sum not in exports and not any_model:
             wanted = "Expected a journal of a model that was exported from this store"
             actual = f"{path} belongs to {journal.sum[:12]}…, which is none of its exports"

@@ -161,10 +161,10 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     ReportConflictError
         If there are several; the message has their ids.
     """
-    decisions = store.decisions(HistoryFilter(part=part), 20)
+    decisions = store.decisions.select(HistoryFilter(part=part), 20)
     not_rejected = [item for item in decisions if item.decision.action is not Action.REJECT]
     matches = not_rejected or decisions
-    if not matches and (item := store.get_decision(part, trace=False)) is not None:
+    if not matches and (item := store.decisions.get(part, trace=False)) is not None:
         matches = [item]
     if not matches:
         actual = f"{shortened(part)}, which is unknown; `dengine history STORE` lists them"
@@ -205,20 +205,20 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         For a store that no engine has used, and for a damaged trace of the decision or of a
         neighbour.
     """
-    settings = store.settings()
+    settings = store.settings.read()
     if "recipe" not in settings:
         raise StoreError(
             "Expected a store that an engine has used, this one is empty; make a DataEngine "
             "with it."
         )
-    item = store.get_decision(decision_id) or store.get_decision(
+    item = store.decisions.get(decision_id) or store.decisions.get(
         find_decision_id(store, decision_id)
     )
     if item is None:
         raise unknown_decision(decision_id)
     decision = item.decision
     recipe = Recipe.from_store(settings)
-    change = store.policy_change_after(decision.id)
+    change = store.events.policy_change_after(decision.id)
     if change is not None and change.data is not None:  # the policy that was in force then
         recipe = replace(recipe, policy=Policy.from_values(change.data["old"]))
     channels, samples = item.trace.shape
@@ -260,7 +260,7 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
         return ""
     began = (
         event.text
-        for event in reversed(store.events())
+        for event in reversed(store.events.newest())
         if event.kind == SAFE_MODE_BEGAN and event.time <= item.time
     )
     return next(began, "")
@@ -301,7 +301,7 @@ def _find_neighbours(
             return
         label = version.labels[slot]
         decision_id = None if label is None else label.decision_id
-        stored = None if decision_id is None else store.get_decision(decision_id)
+        stored = None if decision_id is None else store.decisions.get(decision_id)
         yield Neighbour(
             decision_id=decision_id,
             part=None if stored is None else stored.decision.part,
@@ -324,7 +324,7 @@ def _find_envelope(
     None if these are too few, too, or of another shape.
     """
     for last in (None if version is None else version.last_seq, None):
-        labelled = store.labelled(MAX_ENVELOPE_LABELS, last=last)
+        labelled = store.labels.with_traces(MAX_ENVELOPE_LABELS, last=last)
         is_other_success = (labelled.labels == 1) & (labelled.hashes != item.content_hash)
         envelope = envelope_of(labelled.traces[is_other_success], item.trace)
         if envelope is not None:

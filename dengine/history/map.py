@@ -89,7 +89,7 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
         those that this version made and embedded. A part that is both is drawn once, as a newest
         one.
     """
-    recent = store.decisions(HistoryFilter(), N_NAMED)
+    recent = store.decisions.select(HistoryFilter(), N_NAMED)
     newest = list(_newest_marks(recent[-N_NEWEST:], version))
     newest_ids = {mark.id for mark in newest}
     parts = {item.decision.id: item.decision.part for item in recent}

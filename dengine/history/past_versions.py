@@ -84,22 +84,22 @@ def load_past_version(
         baseline.
     """
     try:
-        stored = store.load_version(version)
+        stored = store.versions.load(version)
     except VersionError:
         return None
     if "points" not in stored.state:  # a baseline keeps no references
         return None
     later_retrains = [
         retrain.last_seq
-        for retrain in store.versions(cell_only=True)
+        for retrain in store.versions.all(cell_only=True)
         if retrain.report.accepted and retrain.report.version > version
     ]
     last = min([*later_retrains[:1], stored.last_seq + MAX_LABELS])
-    later = store.past_labels(stored.last_seq, last)
+    later = store.labels.past(stored.last_seq, last)
     if item is not None:
         stops_all = recipe.policy.stops == "all"
         later = [label for label in later if _was_known(label, item, stops_all)]
-    before = store.past_labels(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
+    before = store.labels.past(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
     by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
     added = [label for label in later if label.model_version == version]
     index = _restore_index(stored, added, recipe)
@@ -214,8 +214,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
         None before the first version, and if its rule cannot be restored from what is stored: its
         state is not kept (a peer's never is) or is stale, or its class is not imported.
     """
-    stored = store.last_version()
-    settings = store.settings()
+    stored = store.versions.newest()
+    settings = store.settings.read()
     if stored is None or (rule := _restore_rule(stored, policy)) is None:
         return None
     since = int(settings.get("evidence_since", 0))
@@ -225,7 +225,7 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     if not progress.last_seq:  # rebuilt from all outcomes, as when an engine is opened
         rule = rule.clone()
         rule.start_in_safe_mode(began_in)
-    for outcome in store.outcomes_since(progress.last_seq, since, progress.overdue_to):
+    for outcome in store.labels.outcomes_since(progress.last_seq, since, progress.overdue_to):
         _update_rule(rule, outcome)
     return rule
 

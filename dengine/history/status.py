@@ -375,7 +375,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     StoreError
         For a store that no engine has used.
     """
-    settings = store.settings()
+    settings = store.settings.read()
     if "recipe" not in settings:
         raise StoreError(
             f"Expected a store that an engine has used, cell {store.cell_id!r} of this one is "
@@ -383,19 +383,21 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         )
     recipe = Recipe.from_store(settings)
     policy = recipe.policy
-    tally = store.tally(within=policy.label_within)  # seconds, in a store of a million decisions
-    counts = store.status(tally)
+    tally = store.decisions.tally(
+        within=policy.label_within
+    )  # seconds, in a store of a million decisions
+    counts = store.decisions.counts(tally)
     outcomes = tally.outcomes
-    events = store.events()
+    events = store.events.newest()
     losses = [event.text for event in open_losses(events)]
     mode = next((event for event in reversed(events) if event.kind in MODES), None)
-    retrains = store.versions(cell_only=True)
+    retrains = store.versions.all(cell_only=True)
     last_seq = retrains[-1].last_seq if retrains else 0
-    accepted = [report for report in store.retrains() if report.accepted]
+    accepted = [report for report in store.versions.retrains() if report.accepted]
     since = int(settings.get("policy_since", 0))
     in_force = tally
     if since:
-        in_force = store.tally(since_version=since, within=policy.label_within)
+        in_force = store.decisions.tally(since_version=since, within=policy.label_within)
     return Status(
         cell=store.cell_id,
         product=store.product,
@@ -408,9 +410,9 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         shadow=policy.shadow,
         safe_mode=mode.text if mode is not None and mode.kind == SAFE_MODE_BEGAN else "",
         safe_mode_time=None if mode is None else mode.time,
-        new_labels=sum(not label.quarantined for label in store.past_labels(last_seq)),
+        new_labels=sum(not label.quarantined for label in store.labels.past(last_seq)),
         last=last,
-        newest=_count_span(store.tally(last), retrains, policy),
+        newest=_count_span(store.decisions.tally(last), retrains, policy),
         ever=_count_span(tally, retrains, policy),
         unreported=outcomes.accepted - outcomes.false_accepts - outcomes.confirmed,
         certificate=policy.certificate(in_force.outcomes),
@@ -426,7 +428,7 @@ def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
     """Return the number of the version that was rolled back to and answers; 0: none is pinned."""
     if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
         return 0
-    version = store.last_version()
+    version = store.versions.newest()
     return 0 if version is None else int(version.state.get("pinned", 0))
 
 
@@ -579,7 +581,7 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
         side = (safe_mode - 1) % 2
         n, n_wrong = evidence.member_counts_since_alarm[side].sum(0).tolist()
         # With the part that raised the alarm.
-        n_parts = 1 + len(store.decisions(HistoryFilter(since=mode.time), MAX_SINCE_ALARM))
+        n_parts = 1 + len(store.decisions.select(HistoryFilter(since=mode.time), MAX_SINCE_ALARM))
         n_more = evidence.members_to_recovery(side) * n_parts / (n + 1)
         end = f"like this it ends after about {n_more:.0f} more"
         if n_more <= 0.0:
@@ -639,10 +641,10 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     Course
         With the newest 120 stretches at most.
     """
-    modes = [event for event in store.events() if event.kind in MODES]
-    n = max(1, min(MAX_STRETCHES, store.n_decisions() // MIN_STRETCH))
-    stretches = store.stretches(n, **by)[-MAX_STRETCHES:]
-    retrains = store.versions(cell_only=True)
+    modes = [event for event in store.events.newest() if event.kind in MODES]
+    n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
+    stretches = store.decisions.stretches(n, **by)[-MAX_STRETCHES:]
+    retrains = store.versions.all(cell_only=True)
     return Course(stretches, retrains, modes, recipe.policy.tolerances[0], last)
 
 
@@ -706,7 +708,7 @@ def iterate_decisions(
     StoredDecision
         Without its trace.
     """
-    while page := store.decisions(where, page_size, start_after, newest_first):
+    while page := store.decisions.select(where, page_size, start_after, newest_first):
         yield from reversed(page) if newest_first else page
         start_after = (page[0] if newest_first else page[-1]).decision.id
 
@@ -756,8 +758,8 @@ def read_retrains_and_events(
     first = since or float("-inf")
     end = float("inf") if until is None else until
     past: dict[str, list[Any]] = {
-        "retrains": store.versions(cell_only=True),
-        "events": store.events(),
+        "retrains": store.versions.all(cell_only=True),
+        "events": store.events.newest(),
     }
     return {
         name: [item for item in items if first <= item.time < end] for name, items in past.items()

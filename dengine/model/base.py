@@ -229,7 +229,7 @@ class EngineModel(ABC):
         hash_ : int
             Hash of the trace's part, or of its content.
         number : int
-            Sequence number of the label; negative while the store has given none.
+            Sequence number of the label; negative while the store of a product has given none.
         embedding : tuple, shape (K, d), optional
             The trace's embedding by this version, where it was computed for the decision.
         point : array of float32, shape (d,), optional
@@ -243,7 +243,7 @@ class EngineModel(ABC):
         """
 
     def renumber_reference(self, old: int, new: int) -> None:  # noqa: B027  # a default
-        """Replace the provisional number of a reference by the sequence number of its label.
+        """Replace the provisional number of a reference by that which a product gave its label.
 
         The default does nothing.
         """

@@ -289,9 +289,9 @@ class HttpApi:
                 text = "A retrain is under way already; nothing changed."
                 return Changed("retrain", text, None, engine.version)
             engine.release(by)
-            engine.store.put_event("retrain", "asked for by hand", author=by)
+            engine.store.events.put("retrain", "asked for by hand", author=by)
             engine.retrain(wait=False)
-            event = engine.store.events(1)[-1]
+            event = engine.store.events.newest(1)[-1]
             return Changed("retrain", "The retrain has begun.", event.number, engine.version)
 
         return await self._change(author, begin)
@@ -315,7 +315,7 @@ class HttpApi:
         source = await self.service.call(copy_model)
         content = await asyncio.to_thread(_zip_export, source)
         text = f"version {source.model_version} was downloaded"
-        await self.service.call(lambda engine: engine.store.put_event("export", text, author=by))
+        await self.service.call(lambda engine: engine.store.events.put("export", text, author=by))
         name = f"model_{source.model_version}.zip"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/zip", headers=headers)
@@ -416,12 +416,12 @@ class HttpApi:
 
     async def versions(self) -> Json:
         """Return every retrain, dropped ones included; one that is kept can be rolled back to."""
-        versions = await self.service.read(lambda store: store.versions())
+        versions = await self.service.read(lambda store: store.versions.all())
         return response_fields("Versions", versions=versions)
 
     async def events(self, limit: Limit = 20) -> Json:
         """Return the events beside decisions and who caused them, newest first."""
-        events = await self.service.read(lambda store: store.events(limit))
+        events = await self.service.read(lambda store: store.events.newest(limit))
         return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
@@ -531,7 +531,7 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     """
     explanation = explain(store, id_)
     trace = explanation.trace
-    labelled = store.labelled(N_LABELS)
+    labelled = store.labels.with_traces(N_LABELS)
     bads = labelled.traces[labelled.labels == 0][-N_BADS:]
     if bads.shape[1:] != trace.shape:
         bads = np.zeros((0, *trace.shape))
@@ -544,7 +544,7 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
         for name, values in (arrays | {"bads": bads}).items()
     }
     decision_id = explanation.decision.decision.id
-    corrections = [item for item in store.corrections() if item.decision_id == decision_id]
+    corrections = [item for item in store.corrections.after() if item.decision_id == decision_id]
     return response_fields(
         "Explanation", explanation, trace=trace, corrections=corrections, **rounded
     )

@@ -303,7 +303,7 @@ class CellService:
             retrain = engine.report(decision_id, label)
             if author:
                 text = f"decision {decision_id} was {'good' if label else 'bad'}"
-                engine.store.put_event("report", text, author=author)
+                engine.store.events.put("report", text, author=author)
             return False, retrain
 
         repeated, retrain = await self.call(work)

@@ -1,13 +1,12 @@
 """Connections to a store's database, and the class `Database` through which one cell writes to it.
 `make_engine` makes the SQLAlchemy engine for SQLite or PostgreSQL; `reading` opens a store for one
-block of reading. `Database` has the transactions, each of which ends with a ledger entry, the lock
-by which one engine owns a cell on a PostgreSQL server, and the insertion of journal records. It
-also notices a deleted file and a forked process, and leaves out rows that the database refuses.
-`SqlStore` is built on `Database`; backup, verification and the list of cells use `reading`.
+block of reading. `Database` has the transactions, each of which ends with a ledger entry, and the
+lock by which one engine owns a cell on a PostgreSQL server. It also notices a deleted file and a
+forked process. `SqlStore` and its tables are built on `Database`; backup, verification and the list
+of cells use `reading`.
 """
 
 import hashlib
-import logging
 import os
 import shutil
 import sqlite3
@@ -22,7 +21,7 @@ from typing import Any, TypeVar
 import sqlalchemy as sa
 
 from ..errors import DengineError, StoreError, expect
-from .journal import Record, describe_process, forked_error, owned_error, sqlite_file
+from .journal import describe_process, forked_error, owned_error, sqlite_file
 from .ledger import (
     LedgerEntry,
     chain_writes,
@@ -31,33 +30,10 @@ from .ledger import (
     ledger_key,
     newest_entry,
 )
-from .queries import WITH_LABELS, WITH_TRACES, Scope, corrected_label, join_product
-from .records import (
-    FORGOTTEN,
-    LATE_STOP,
-    Event,
-    NewLabel,
-    StoredDecision,
-    as_text,
-    chunks,
-    decision_row,
-    to_row,
-    trace_row,
-)
-from .schema import (
-    CELL,
-    CORRECTION,
-    DECISION,
-    EVENT,
-    LABEL,
-    LEDGER,
-    TRACE,
-    check_schema,
-    lock,
-    prepare_tables,
-)
+from .queries import Scope, join_product
+from .records import as_text, chunks
+from .schema import CELL, DECISION, LEDGER, check_schema, lock, prepare_tables
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 
 # With these, libpq reports a server that has stopped answering after seconds, not hours.
@@ -332,8 +308,6 @@ class Database:
         Returns the time, in seconds since 1970, for the ledger's entries.
     product : str or None
         What a new cell makes; None: as the store says.
-    before_use : callable
-        Called before each read and most writes, so that waiting records are written first.
 
     Attributes
     ----------
@@ -345,6 +319,11 @@ class Database:
         The URL without its password.
     newest_entry : (int, str) or None
         Number and digest of the newest ledger entry that this process knows; None: no entry yet.
+    is_in_memory : bool
+        Whether it is SQLite in memory.
+    before_use : callable
+        Called before each read and each write, so that waiting records are written first; set by
+        the outbox.
     on_entry : callable
         Called after a transaction that added a ledger entry is committed; set by the outbox.
 
@@ -361,11 +340,11 @@ class Database:
         cell_id: str,
         clock: Callable[[], float],
         product: str | None,
-        before_use: Callable[[], None],
     ) -> None:
         self.cell_id = cell_id
-        self._before_use = before_use
-        self._clock = clock
+        self.is_in_memory = url is None
+        self.before_use: Callable[[], object] = lambda: None
+        self.clock = clock
         self._closed = False
         self._pid = os.getpid()
         self._writing = threading.RLock()  # one write transaction at a time in this process
@@ -413,7 +392,7 @@ class Database:
         not dengine's own.
         """
         self.check_open()
-        self._before_use()
+        self.before_use()
         with _store_errors("read", self.name), self._engine.begin() as connection:
             yield connection
 
@@ -435,7 +414,7 @@ class Database:
                 lock(connection, CELL, self.cell_id)
                 entry = LedgerEntry(connection, self.cell_id, self._key)
                 yield connection.execution_options(dengine_entry=entry)
-                newest = entry.append(self._clock)
+                newest = entry.append(self.clock)
                 if not getattr(self._commits, "is_wanted", lambda: True)():
                     raise StoreError(
                         f"Could not write to {self.name} in time, and was given up; nothing "
@@ -568,6 +547,10 @@ class Database:
                 holder[0] if holder else "another engine", f"cell {self.cell_id!r} of {self.name}"
             )
 
+    def own(self, table: sa.FromClause) -> sa.ColumnElement[bool]:
+        """Return the SQL condition that a row of a table is this cell's."""
+        return table.c.cell_id == self.cell_id
+
     def check_open(self) -> None:
         """Raise a StoreError after `close`, and in a process forked after the opening."""
         if self._closed:
@@ -577,7 +560,7 @@ class Database:
         if os.getpid() != self._pid:
             raise forked_error(self._pid, self.name)
 
-    def write(self, add_rows: Callable[[sa.Connection], T], flush_first: bool = True) -> T:
+    def write(self, add_rows: Callable[[sa.Connection], T]) -> T:
         """Call `add_rows` in a write transaction, commit it, and return what `add_rows` returned.
 
         This waits until another thread's transaction has ended. The commit includes a ledger entry
@@ -587,8 +570,6 @@ class Database:
         ----------
         add_rows : callable
             Takes the connection, and adds rows.
-        flush_first : bool, default True
-            Call `before_use` first, so that waiting records are written before these rows.
 
         Raises
         ------
@@ -598,8 +579,7 @@ class Database:
             nothing is written, except to an SQLite file that was replaced meanwhile.
         """
         self.check_open()
-        if flush_first:
-            self._before_use()  # before the lock is taken: it may write
+        self.before_use()  # before the lock is taken: it may write
         with self._writing:
             try:
                 with self._transaction() as connection:
@@ -629,12 +609,14 @@ class Database:
         self._writer.dispose()
         self._engine.dispose()
 
-    # Insertion
+    # Rows
 
     def insert(
         self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
-    ) -> range:
-        """Insert rows of this cell into a table, each with the next number; return these numbers.
+    ) -> list[int]:
+        """Insert rows of this cell into a table, each with a number; return these numbers.
+
+        That is the next number, or the one that the row has if that is larger.
 
         Parameters
         ----------
@@ -644,68 +626,29 @@ class Database:
             The table's column that takes the numbers. Decisions and events continue the numbers of
             the cell; labels, versions and corrections those of its product, if it has one.
         rows : sequence of mapping
-            Without `cell_id` and the number. They are not changed.
+            Without `cell_id`. They are not changed.
 
         Returns
         -------
-        range
+        list of int
             The numbers, in the order of the rows; empty without rows.
         """
-        if not rows:
-            return range(0)
-        first = self.scope.next_number(connection, column)
-        numbered = [
-            {**row, "cell_id": self.cell_id, column.name: i} for i, row in enumerate(rows, first)
-        ]
-        connection.execute(sa.insert(column.table), numbered)
-        return range(first, first + len(rows))
+        numbers: list[int] = []
+        if rows:
+            number = self.scope.next_number(connection, column)
+            for row in rows:
+                number = max(number, row.get(column.name, 0))
+                numbers.append(number)
+                number += 1
+            common = {"cell_id": self.cell_id}
+            numbered = [
+                {**row, **common, column.name: number}
+                for row, number in zip(rows, numbers, strict=True)
+            ]
+            connection.execute(sa.insert(column.table), numbered)
+        return numbers
 
-    def insert_corrections(
-        self,
-        connection: sa.Connection,
-        event: Event,
-        success: bool | None,
-        labels: Mapping[str, bool | None],
-    ) -> int:
-        """Insert an event and the corrections that it records, in a write transaction.
-
-        Parameters
-        ----------
-        connection : sqlalchemy.Connection
-        event : Event
-        success : bool or None
-            The new label of all decisions; None: forgotten.
-        labels : mapping of str to bool or None
-            Label until now of each decision, by id; None if it was forgotten.
-
-        Returns
-        -------
-        int
-            Number of the event.
-        """
-        (number,) = self.insert(connection, EVENT.c.number, [to_row(event)])
-        if labels:
-            newest = self.scope.next_number(connection, LABEL.c.seq) - 1
-            common = {"event": number, "author": event.author, "time": event.time}
-            common |= {"success": success, "newest_seq": newest}
-            rows = [common | {"decision_id": id_, "was": was} for id_, was in labels.items()]
-            self.insert(connection, CORRECTION.c.number, rows)
-        return number
-
-    def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
-        """Return, by id, a row for each of the given decisions that the cell has stored.
-
-        A row has content_hash, quarantined and time of the decision, and of its label success,
-        source, seq and `corrected`: the label after corrections, 0, 1 or FORGOTTEN. These four are
-        None without a label. Ids that are not stored are left out.
-        """
-        label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
-        query = sa.select(
-            *DECISION.c["id", "content_hash", "quarantined", "time"], *label
-        ).select_from(WITH_LABELS)
-        return self._rows_by_id(connection, query, ids)
-
-    def _rows_by_id(
+    def rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
     ) -> dict[str, Any]:
         """Run a query over this cell's decisions for the given ids, at most CHUNK ids at a time.
@@ -718,139 +661,3 @@ class Database:
             for part in chunks(ids)
             for row in connection.execute(query.where(DECISION.c.id.in_(part)))
         }
-
-    def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
-        """Commit records of a journal; return (decision id, label number) of their labels.
-
-        All are committed in one transaction. A record that is stored already changes nothing, and
-        its label is returned, too. One that contradicts the store becomes an event of kind "dead
-        letter", but a line stop corrects a label "confirmed" by silence. If the database refuses a
-        value, the records are halved, each half in a transaction of its own, until the refused
-        record is alone; that becomes a dead letter, too. Any other failure raises StoreError.
-        """
-        try:
-            return self.write(lambda connection: self._insert_records(connection, records))
-        except StoreError as error:
-            if not isinstance(error.__cause__, ROW_ERRORS):
-                raise
-            if len(records) > 1:  # the database refuses one of them
-                half = len(records) // 2
-                return self.apply_records(records[:half]) + self.apply_records(records[half:])
-            text = f"{_describe(records[0])}, which the database refused: {error.__cause__}"
-        event = self._dead_letter(text)
-        self.write(lambda connection: self.insert(connection, EVENT.c.number, [to_row(event)]))
-        return []
-
-    def _insert_records(
-        self, connection: sa.Connection, records: Sequence[Record]
-    ) -> list[tuple[str, int]]:
-        """Insert the decisions, labels and events that are not stored yet; this does not commit.
-
-        Return (decision id, number) of each label, new or stored before with the same success and
-        source. A record that contradicts a stored one, or a label without its decision, becomes an
-        event of kind "dead letter". A line stop of a part whose label was "confirmed" by silence
-        corrects that label to failure, and the label's number is returned, too; if that label was
-        forgotten, the line stop is a dead letter.
-        """
-        events = self._new_events(
-            connection, [record for record in records if isinstance(record, Event)]
-        )
-        decisions = [record for record in records if isinstance(record, StoredDecision)]
-        events += self._insert_decisions(connection, decisions)
-        labels = [record for record in records if isinstance(record, NewLabel)]
-        stored = self.stored_labels(connection, [label.decision_id for label in labels])
-        new_labels: dict[str, NewLabel] = {}
-        labelled: list[str] = []  # ids of decisions that have this label, now or before
-        stopped: list[str] = []  # ids of decisions whose labels a late stop corrects
-        for label in labels:
-            id_ = label.decision_id
-            row = stored.get(id_)
-            if row is None or (row.content_hash, row.time) != (label.content_hash, label.decided):
-                problem = (
-                    "which the store does not hold"
-                    if row is None
-                    else "of which the store holds another decision"
-                )
-                events.append(self._dead_letter(f"{_describe(label)}, {problem}"))
-                continue
-            first = new_labels.setdefault(id_, label) if row.seq is None else row
-            old = (first.success, first.source)
-            new = (label.success, label.source)
-            is_late_stop = (old, new) == LATE_STOP and row.corrected != FORGOTTEN
-            if old == new or is_late_stop:
-                labelled.append(id_)
-                if is_late_stop and row.corrected != 0:  # else it is corrected already
-                    stopped.append(id_)
-            else:
-                events.append(
-                    self._dead_letter(f"a second label: {_describe(label)}, which has one")
-                )
-        rows = [
-            to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
-            for label in new_labels.values()
-        ]
-        numbers = {id_: row.seq for id_, row in stored.items()}
-        numbers |= zip(new_labels, self.insert(connection, LABEL.c.seq, rows), strict=True)
-        self.insert(connection, EVENT.c.number, [to_row(event) for event in events])
-        text = "counts as a failure, was a success: its stop came after its confirmation"
-        for id_ in dict.fromkeys(stopped):
-            event = Event(0, float(self._clock()), "late stop", f"decision {as_text(id_)} {text}")
-            self.insert_corrections(connection, event, False, {id_: True})
-        return [(id_, numbers[id_]) for id_ in dict.fromkeys(labelled)]
-
-    def _insert_decisions(
-        self, connection: sa.Connection, decisions: Sequence[StoredDecision]
-    ) -> list[Event]:
-        """Insert the decisions that are not stored yet, with their traces.
-
-        Return an event of kind "dead letter", not inserted yet, for each whose id is stored with
-        other values.
-        """
-        trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
-        query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
-        stored = self._rows_by_id(connection, query, [item.decision.id for item in decisions])
-        new = [item for item in decisions if item.decision.id not in stored]
-        self.insert(connection, DECISION.c.number, [decision_row(item) for item in new])
-        if new:
-            rows = [{"cell_id": self.cell_id} | trace_row(item) for item in new]
-            connection.execute(sa.insert(TRACE), rows)
-        events = []
-        for item in decisions:
-            if (row := stored.get(item.decision.id)) is not None:
-                given = decision_row(item) | trace_row(item)
-                different = [name for name, value in given.items() if row._mapping[name] != value]
-                if different:
-                    text = (
-                        f"{_describe(item)}, of which the store holds another: "
-                        f"{', '.join(different)} differ"
-                    )
-                    events.append(self._dead_letter(text))
-        return events
-
-    def _new_events(self, connection: sa.Connection, events: Sequence[Event]) -> list[Event]:
-        """Return the events that the cell has not stored yet, compared by time, kind and text."""
-        if not events:
-            return []
-        query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text)
-        times = [event.time for event in events]
-        query = query.where(EVENT.c.cell_id == self.cell_id, EVENT.c.time.in_(times))
-        stored = {tuple(row) for row in connection.execute(query)}
-        return [event for event in events if (event.time, event.kind, event.text) not in stored]
-
-    def _dead_letter(self, text: str) -> Event:
-        """Log an error for a record that cannot be stored; return an event of kind "dead letter".
-
-        The event is not inserted here.
-        """
-        log.error("dead letter: %s", text)
-        return Event(0, self._clock(), "dead letter", as_text(text))
-
-
-def _describe(record: Record) -> str:
-    """Return a record (event, decision or label) in a few words, for the text of a dead letter."""
-    if isinstance(record, Event):
-        return f"an event, {record.text!r}"
-    if isinstance(record, StoredDecision):
-        return f"a decision, {record.decision.id!r}"
-    result = "success" if record.success else "failure"
-    return f"a label, {result} from {record.source.value}, on {record.decision_id!r}"

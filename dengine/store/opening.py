@@ -4,6 +4,8 @@ that raises. The engine, the data sets and the command line use them.
 
     store = open_store("engine.db")      # an SqlStore; open_store(None) is one in memory
 
+`open_outbox` returns an engine's way to such a store while it runs.
+
 SQLAlchemy is imported only when a store is opened, so that importing this module is fast.
 """
 
@@ -15,6 +17,9 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from ..errors import StoreError, expect
+from .journalled import JournalledStore
+from .memory import MemoryStore
+from .outbox import Outbox
 from .records import CellAddress
 
 if TYPE_CHECKING:
@@ -88,3 +93,34 @@ def opening(
         if opened is not store:
             opened.close()
         raise
+
+
+def open_outbox(
+    store: SqlStore, window: int, *, reading: bool = False, patient: bool = False
+) -> Outbox:
+    """Open what an engine records and looks up by, as it fits the store.
+
+    Parameters
+    ----------
+    store : SqlStore
+    window : int
+        Number of newest labels that the engine reads.
+    reading : bool, default False
+        The engine only reads, so it does not own the cell.
+    patient : bool, default False
+        Wait for disk and database without a time limit.
+
+    Returns
+    -------
+    Outbox
+        A `MemoryStore` for a store in memory, and for an engine that only reads; else a
+        `JournalledStore`.
+
+    Raises
+    ------
+    StoreError
+        Where another engine owns the cell, and where the store cannot be read or written.
+    """
+    if reading or store.database.is_in_memory:
+        return MemoryStore(store, window, reading)
+    return JournalledStore(store, window, patient)

@@ -175,6 +175,9 @@ class NewLabel:
     overdue_to : int or None
         Number of the newest decision whose check was overdue when the rule was updated with this
         label; None if unknown.
+    seq : int
+        Number of the label in its cell's journal, 1, 2, ...; the store keeps it. 0 or less: the
+        store gives the next number of the cell, or of its product.
     """
 
     decision_id: str
@@ -187,6 +190,7 @@ class NewLabel:
     content_hash: int = 0
     decided: float = 0.0
     overdue_to: int | None = None
+    seq: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,6 +362,16 @@ class Event:
     author: str = ""
 
     when = property(_when)
+
+
+def new_event(
+    kind: str, text: str, time: float, data: Mapping[str, Any] | None = None, author: str = ""
+) -> Event:
+    """Return an event that is not numbered yet, in texts and data that every database takes.
+
+    Raise StoreError for data that JSON does not have.
+    """
+    return Event(0, float(time), as_text(kind), as_text(text), as_data(data), as_text(author))
 
 
 def open_losses(events: Iterable[Any]) -> list[Any]:

@@ -65,8 +65,10 @@ def read_rule_progress(
         0 if there is no version, or if the rule must be rebuilt from all outcomes.
     """
     state = {} if version is None else version.state
-    overdue_to = max(store.overdue_to(within, policy_since), int(state.get("overdue_to", 0)))
-    pending = store.pending_decisions(since_version) if overdue_to > 0 else []
+    overdue_to = max(
+        store.decisions.overdue_to(within, policy_since), int(state.get("overdue_to", 0))
+    )
+    pending = store.decisions.pending(since_version) if overdue_to > 0 else []
     overdue_ids = frozenset(
         item.decision.id
         for item in pending
@@ -78,6 +80,6 @@ def read_rule_progress(
     last_seq = int(state.get("rule_last_seq", version.last_seq))
     is_incomplete = not state.keys().isdisjoint(("rule_is_stale", "includes_overdue"))
     is_earlier = version.version < since_version
-    is_corrected = bool(store.corrections(int(state.get("corrected_to", 0))))
+    is_corrected = bool(store.corrections.after(int(state.get("corrected_to", 0))))
     must_rebuild = bool(overdue_ids) or is_incomplete or is_earlier or is_corrected
     return RuleProgress(0 if must_rebuild else last_seq, overdue_to, overdue_ids)

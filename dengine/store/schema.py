@@ -95,7 +95,6 @@ TRACE = _table(  # apart from `decision`, so that counting decisions does not re
 LABEL = _table(
     "label",
     *_columns(NewLabel, key="decision_id"),
-    sa.Column("seq", sa.BigInteger, nullable=False),
     *_columns(StoredDecision, "quarantined"),  # a copy of the decision's, for the index
     sa.UniqueConstraint("cell_id", "seq", name="label_seq"),
     sa.Index("label_training", "cell_id", "quarantined", "seq"),

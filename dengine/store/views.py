@@ -1,6 +1,6 @@
 """Records for looking back on a store: filters, past labels, and counts of decisions by outcome.
 `HistoryFilter` selects decisions; `PastLabel`, `Tally` (counts in `DecisionGroup`s) and `Stretch`
-are what `SqlStore.past_labels`, `tally` and `stretches` return. The status, the history and the
+are what `SqlStore.labels.past`, `tally` and `stretches` return. The status, the history and the
 explanations are computed from them.
 """
 

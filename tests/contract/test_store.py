@@ -43,7 +43,7 @@ def put(
 
 
 def test_a_decision_is_found_as_it_was_put(store: SqlStore) -> None:
-    assert store.get_decision("a") is None
+    assert store.decisions.get("a") is None
     values = trace()
     given = Decision(
         "a",
@@ -62,11 +62,11 @@ def test_a_decision_is_found_as_it_was_put(store: SqlStore) -> None:
     )
     put_decision(store, given, values, -(2**63), False)
     put_decision(store, decision("flat"), values[0], 1, False)
-    result = store.get_decision("a")
+    result = store.decisions.get("a")
     assert (result.decision, result.content_hash, result.quarantined) == (given, -(2**63), False)
     assert (result.success, result.source) == (None, None)
     np.testing.assert_array_equal(result.trace, values)
-    assert store.get_decision("flat").trace.shape == (1, 30)
+    assert store.decisions.get("flat").trace.shape == (1, 30)
 
 
 @settings(
@@ -85,7 +85,7 @@ def test_any_trace_returns_bit_for_bit(
     name = uuid.uuid4().hex
     put_decision(store, decision(name), values, content_hash, quarantined)
     store.flush()
-    result = store.get_decision(name)
+    result = store.decisions.get(name)
     assert result.trace.tobytes() == values.tobytes()
     assert result.trace.shape == values.shape
     assert (result.content_hash, result.quarantined) == (content_hash, quarantined)
@@ -98,9 +98,12 @@ def test_labels_in_one_batch_are_numbered_in_the_order_given(store: SqlStore) ->
     point = np.array([0.5, 1.5], dtype=np.float32)
     batch = [NewLabel("c", False, Source.STOP, 3, point, 4), label("a"), label("b", False)]
     assert put_labels(store, *batch) == [2, 3, 4]
-    assert store.labelled().labels.tolist() == [1, 0, 1, 0]
-    assert (store.get_decision("c").success, store.get_decision("c").source) == (False, Source.STOP)
-    (added,) = (past_label for past_label in store.past_labels(0) if past_label.point is not None)
+    assert store.labels.with_traces().labels.tolist() == [1, 0, 1, 0]
+    assert (store.decisions.get("c").success, store.decisions.get("c").source) == (
+        False,
+        Source.STOP,
+    )
+    (added,) = (past_label for past_label in store.labels.past(0) if past_label.point is not None)
     assert (added.seq, added.model_version, added.point.tolist()) == (2, 3, [0.5, 1.5])
 
 
@@ -113,8 +116,8 @@ def test_a_batch_longer_than_a_chunk_is_taken_whole(store: SqlStore) -> None:
         ]
     )
     assert put_labels(store, *(label(name, silent=1) for name in names)) == list(range(1, 1204))
-    assert store.labelled().hashes.tolist() == list(range(1203))
-    assert store.silent_total() == 1203
+    assert store.labels.with_traces().hashes.tolist() == list(range(1203))
+    assert store.labels.silent_total() == 1203
 
 
 def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: SqlStore) -> None:
@@ -123,13 +126,13 @@ def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: S
     }
     for name in "ecbad":
         put_label(store, name, name != "b", Source.VERIFICATION, 0, None)
-    every = store.labelled()
+    every = store.labels.with_traces()
     assert every.seq.tolist() == [1, 3, 4, 5]
     assert every.labels.tolist() == [1, 0, 1, 1]
     assert every.hashes.tolist() == [104, 101, 100, 103]
     np.testing.assert_array_equal(every.traces, np.stack([traces[name] for name in "ebad"]))
-    assert len(store.labelled(0).seq) == 0
-    newest = store.labelled(2)
+    assert len(store.labels.with_traces(0).seq) == 0
+    newest = store.labels.with_traces(2)
     assert newest.seq.tolist() == [4, 5]
     np.testing.assert_array_equal(newest.traces, every.traces[2:])
     assert [a.dtype for a in (every.seq, every.traces, every.labels, every.hashes)] == [
@@ -142,10 +145,14 @@ def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: S
 
 @pytest.mark.parametrize("limit", [None, 0, 5])
 def test_an_empty_store_has_empty_arrays(store: SqlStore, limit: int | None) -> None:
-    result = store.labelled(limit)
+    result = store.labels.with_traces(limit)
     assert (result.seq.shape, result.traces.shape) == ((0,), (0, 0, 0))
-    assert (store.last_version(), store.retrains()) == (None, [])
-    assert (store.unreported_accepts(), store.silent_total(), store.tally().outcomes) == (
+    assert (store.versions.newest(), store.versions.retrains()) == (None, [])
+    assert (
+        store.decisions.unreported_accepts(),
+        store.labels.silent_total(),
+        store.decisions.tally().outcomes,
+    ) == (
         [],
         0,
         Outcomes(),
@@ -157,8 +164,8 @@ def test_traces_of_two_shapes_are_an_error_that_names_both(store: SqlStore) -> N
         put_decision(store, decision(name), trace(0, (1, samples)), 1, False)
         put_label(store, name, True, Source.VERIFICATION, 0, None)
     with pytest.raises(StoreError, match=r"\(1, 10\), \(1, 20\)"):
-        store.labelled()
-    assert store.labelled(1).traces.shape == (1, 1, 20)
+        store.labels.with_traces()
+    assert store.labels.with_traces(1).traces.shape == (1, 1, 20)
 
 
 def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: SqlStore) -> None:
@@ -174,8 +181,8 @@ def test_what_is_imported_is_labelled_and_numbered_after_what_was_there(store: S
             len(store.apply_records(labelled(StoredDecision(created, x, hash_, False, 1.0), good)))
             == 1
         )
-    assert [store.get_decision(name).decision for name in "bcd"] == decisions
-    result = store.labelled(3)
+    assert [store.decisions.get(name).decision for name in "bcd"] == decisions
+    result = store.labels.with_traces(3)
     np.testing.assert_array_equal(result.traces, traces)
     assert (result.seq.tolist(), result.hashes.tolist(), result.labels.tolist()) == (
         [2, 3, 4],
@@ -193,7 +200,7 @@ def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_qu
             store, replace(created, lower=0.1 * i, upper=0.2 * i), trace(i), i, quarantined
         )
         put_label(store, str(i), i % 2 == 0, Source.VERIFICATION, 1, None, silent=i)
-    result = store.outcomes_since(1)
+    result = store.labels.outcomes_since(1)
     assert result == [
         (3, 0.2, 0.4, True, False, 2, 0, 1.0),
         (4, 0.1 * 3, 0.2 * 3, False, True, 3, 0, 1.0),
@@ -208,8 +215,8 @@ def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_qu
         int,
         float,
     ]  # for compiled code
-    assert store.silent_total() == 0 + 2 + 3
-    assert store.outcomes_since(4) == []
+    assert store.labels.silent_total() == 0 + 2 + 3
+    assert store.labels.outcomes_since(4) == []
 
 
 def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(
@@ -223,12 +230,12 @@ def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_
         )
     put_decision(store, decision("verified"), trace(), 1, False)
     put_decision(store, decision("rejected", Action.REJECT, Reason.CERTAIN), trace(), 1, False)
-    assert store.unreported_accepts() == ["zoe", "amy", "kim", "bob", "ann"]
+    assert store.decisions.unreported_accepts() == ["zoe", "amy", "kim", "bob", "ann"]
     put_labels(
         store, label("bob", False, source=Source.STOP), label("zoe", source=Source.CONFIRMED)
     )
-    assert store.unreported_accepts() == ["amy", "kim", "ann"]
-    assert sorted(name for some in store.decision_ids() for name in some) == sorted(
+    assert store.decisions.unreported_accepts() == ["amy", "kim", "ann"]
+    assert sorted(name for some in store.decisions.ids() for name in some) == sorted(
         [*names, "verified", "rejected"]
     )
 
@@ -254,7 +261,7 @@ def test_outcomes_count_what_became_of_what_was_certain(store: SqlStore) -> None
         )
         if success is not None:
             put_label(store, str(i), success, Source.AUDIT, 0, None)
-    assert store.tally().outcomes == Outcomes(
+    assert store.decisions.tally().outcomes == Outcomes(
         accepted=6,
         false_accepts=2,
         confirmed=1,
@@ -267,19 +274,19 @@ def test_outcomes_count_what_became_of_what_was_certain(store: SqlStore) -> None
 
 
 def test_events_are_numbered_from_one_and_returned_oldest_first(store: SqlStore) -> None:
-    store.clock = iter([1.5, 2.5, 3.5]).__next__
+    store.database.clock = iter([1.5, 1.5, 2.5, 2.5, 3.5, 3.5]).__next__  # the ledger asks, too
     for kind in ("started", "safe_mode", "left"):
-        store.put_event(kind, f"was {kind}: ±")
-    every = store.events()
+        store.events.put(kind, f"was {kind}: ±")
+    every = store.events.newest()
     assert every[1] == Event(2, 2.5, "safe_mode", "was safe_mode: ±")
     assert [event.number for event in every] == [1, 2, 3]
-    assert store.events(2) == every[1:]
-    assert (store.events(0), store.events(9)) == ([], every)
+    assert store.events.newest(2) == every[1:]
+    assert (store.events.newest(0), store.events.newest(9)) == ([], every)
 
 
 def test_an_event_writes_what_every_database_refuses_with_escapes(store: SqlStore) -> None:
-    store.put_event(Reason.MODEL_ERROR, "read \0 and \ud800")
-    (event,) = store.events()
+    store.events.put(Reason.MODEL_ERROR, "read \0 and \ud800")
+    (event,) = store.events.newest()
     assert (event.kind, event.text) == ("model_error", "read \\0 and \\ud800")
     assert type(event.kind) is str
 
@@ -293,15 +300,15 @@ def test_the_newest_accepted_version_returns_bit_for_bit(store: SqlStore) -> Non
         "file": np.array(2.5),
         "empty": np.zeros((0, 3), dtype=np.float32),
     }
-    store.put_version(report(1), 10, {"w": np.zeros(2)})
-    store.put_version(report(2), 20, state)
-    store.put_version(report(2, accepted=False), 30, None)
-    last = store.last_version()
+    store.versions.put(report(1), 10, {"w": np.zeros(2)})
+    store.versions.put(report(2), 20, state)
+    store.versions.put(report(2, accepted=False), 30, None)
+    last = store.versions.newest()
     assert (last.version, last.last_seq, last.state.keys()) == (2, 20, state.keys())
     for name, values in state.items():
         assert last.state[name].dtype == values.dtype
         np.testing.assert_array_equal(last.state[name], values)
-    assert store.retrains() == [report(1), report(2), report(2, accepted=False)]
+    assert store.versions.retrains() == [report(1), report(2), report(2, accepted=False)]
 
 
 @pytest.mark.parametrize(
@@ -311,14 +318,14 @@ def test_an_accepted_version_needs_a_state_of_plain_arrays(
     store: SqlStore, state: dict | None, named: str
 ) -> None:
     with pytest.raises(StoreError, match=named):
-        store.put_version(report(1), 0, state)
+        store.versions.put(report(1), 0, state)
 
 
 def test_settings_are_replaced_as_a_whole(store: SqlStore) -> None:
-    assert store.settings() == {}
-    store.save_settings({"recipe": "a = 1\n", "spec": "é"})
-    store.save_settings({"recipe": "a = 2"})
-    assert store.settings() == {"recipe": "a = 2"}
+    assert store.settings.read() == {}
+    store.settings.save({"recipe": "a = 1\n", "spec": "é"})
+    store.settings.save({"recipe": "a = 2"})
+    assert store.settings.read() == {"recipe": "a = 2"}
 
 
 def test_status_counts_what_was_put(store: SqlStore) -> None:
@@ -327,7 +334,7 @@ def test_status_counts_what_was_put(store: SqlStore) -> None:
     put_decision(store, decision("c", Action.VERIFY, Reason.CONSTANT), trace(), 3, True)
     put_label(store, "a", False, Source.STOP, 0, None)
     put_label(store, "c", True, Source.VERIFICATION, 0, None)
-    status = store.status()
+    status = store.decisions.counts()
     assert (status["decisions"], status["labels"], status["quarantined"]) == (3, 2, 1)
     assert status["actions"] == {"verify": 2, "accept": 1, "reject": 0}
     assert (
@@ -342,58 +349,41 @@ def test_status_counts_what_was_put(store: SqlStore) -> None:
         "confirmed": 0,
         "inspection": 0,
     }
-    assert store.tally().first <= store.tally().last <= store.tally().last_label
-
-
-def test_in_memory_a_label_has_its_number_before_anything_is_written() -> None:
-    store = SqlStore()
-    items = [StoredDecision(decision(name), trace(), 1, False, 1.0) for name in "abcd"]
-    store.apply_records(labelled(items[0], True)[:1])
-    assert store.apply_records(labelled(items[0], True)[1:]) == [("a", 1)]
-    assert store.apply_records(labelled(items[1], False) + labelled(items[2], True)) == [
-        ("b", 2),
-        ("c", 3),
-    ]
-    assert store.labelled().labels.tolist() == [1, 0, 1]
-    assert store.apply_records([*labelled(items[3], True), *labelled(items[1], False)]) == [
-        ("d", 4),
-        ("b", 2),
-    ]
     assert (
-        store.apply_records(labelled(items[3], False)) == []
-    )  # a second label, which is set aside
-    assert store.labelled().seq.tolist() == [1, 2, 3, 4]
-    assert [event.kind for event in store.events()] == ["dead letter"]
+        store.decisions.tally().first
+        <= store.decisions.tally().last
+        <= store.decisions.tally().last_label
+    )
 
 
 def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None:
     with SqlStore(*place) as store:
         values = put(store, "a")
-        store.save_settings({"k": "v"})
+        store.settings.save({"k": "v"})
         put_label(store, "a", True, Source.VERIFICATION, 1, np.array([0.5], dtype=np.float32))
-        store.put_version(report(1), 1, {"w": values})
+        store.versions.put(report(1), 1, {"w": values})
         put_decision(
             store, replace(decision("accepted", Action.ACCEPT), part="SN-1"), trace(), 1, False
         )
         put_decision(store, decision("silent"), trace(), 1, False)
         put_label(store, "silent", True, Source.VERIFICATION, 0, None, silent=4)
-        store.put_event("started", "for the first time")
+        store.events.put("started", "for the first time")
         put(store, "unreported")
     with SqlStore(*place) as store:
-        assert store.settings() == {"k": "v"}
-        np.testing.assert_array_equal(store.get_decision("a").trace, values)
-        np.testing.assert_array_equal(store.last_version().state["w"], values)
-        assert store.past_labels(0, 1)[0].point.tolist() == [0.5]
-        assert store.get_decision("unreported") is not None
+        assert store.settings.read() == {"k": "v"}
+        np.testing.assert_array_equal(store.decisions.get("a").trace, values)
+        np.testing.assert_array_equal(store.versions.newest().state["w"], values)
+        assert store.labels.past(0, 1)[0].point.tolist() == [0.5]
+        assert store.decisions.get("unreported") is not None
         assert (
-            store.unreported_accepts(),
-            store.silent_total(),
-            store.tally().outcomes.accepted,
+            store.decisions.unreported_accepts(),
+            store.labels.silent_total(),
+            store.decisions.tally().outcomes.accepted,
         ) == (["accepted"], 4, 1)
-        assert store.get_decision("accepted").decision.part == "SN-1"
-        assert [event.text for event in store.events()] == ["for the first time"]
-        store.put_event("started", "again")
-        assert [event.number for event in store.events()] == [1, 2]
+        assert store.decisions.get("accepted").decision.part == "SN-1"
+        assert [event.text for event in store.events.newest()] == ["for the first time"]
+        store.events.put("started", "again")
+        assert [event.number for event in store.events.newest()] == [1, 2]
         assert put_label(store, "unreported", True, Source.VERIFICATION, 0, None) == 3
 
 
@@ -404,21 +394,29 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         put(other, "a", seed=2)
         assert put_label(ours, "a", True, Source.VERIFICATION, 1, np.zeros(2, np.float32)) == 1
         assert put_label(other, "a", False, Source.STOP, 1, np.ones(2, np.float32)) == 1
-        ours.put_version(report(1), 1, {"w": np.zeros(1)})
-        ours.save_settings({"k": "v"})
-        ours.put_event("note", "ours")
+        ours.versions.put(report(1), 1, {"w": np.zeros(1)})
+        ours.settings.save({"k": "v"})
+        ours.events.put("note", "ours")
         put_decision(ours, decision("b", Action.ACCEPT), trace(), 1, False)
         put_decision(ours, decision("c"), trace(), 1, False)
         put_label(ours, "c", True, Source.VERIFICATION, 0, None, silent=3)
-        assert (other.events(), other.unreported_accepts(), other.silent_total()) == ([], [], 0)
-        assert other.tally().outcomes.accepted == 0
-        other.put_event("note", "other's")
-        assert [(event.number, event.text) for event in other.events()] == [(1, "other's")]
-        assert (other.settings(), other.last_version(), other.retrains()) == ({}, None, [])
-        assert other.labelled().labels.tolist() == [0]
-        assert [past_label.point.tolist() for past_label in other.past_labels(0)] == [[1.0, 1.0]]
-        assert other.status()["labels"] == 1
-        np.testing.assert_array_equal(other.get_decision("a").trace, trace(2))
+        assert (
+            other.events.newest(),
+            other.decisions.unreported_accepts(),
+            other.labels.silent_total(),
+        ) == ([], [], 0)
+        assert other.decisions.tally().outcomes.accepted == 0
+        other.events.put("note", "other's")
+        assert [(event.number, event.text) for event in other.events.newest()] == [(1, "other's")]
+        assert (other.settings.read(), other.versions.newest(), other.versions.retrains()) == (
+            {},
+            None,
+            [],
+        )
+        assert other.labels.with_traces().labels.tolist() == [0]
+        assert [past_label.point.tolist() for past_label in other.labels.past(0)] == [[1.0, 1.0]]
+        assert other.decisions.counts()["labels"] == 1
+        np.testing.assert_array_equal(other.decisions.get("a").trace, trace(2))
 
 
 def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_other_committed(
@@ -430,14 +428,14 @@ def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_
         for i in range(15):
             put(store, f"{prefix}{i}")
             seqs.append(put_label(store, f"{prefix}{i}", True, Source.VERIFICATION, 0, None))
-            store.put_event("note", f"{prefix}{i}")
+            store.events.put("note", f"{prefix}{i}")
 
     with SqlStore(*place) as first, SqlStore(*place) as two:
         with ThreadPoolExecutor(2) as pool:
             list(pool.map(label, (first, two), "xy"))
         assert sorted(seqs) == list(range(1, 31))
-        assert first.labelled().seq.tolist() == list(range(1, 31))
-        assert [event.number for event in two.events()] == list(range(1, 31))
+        assert first.labels.with_traces().seq.tolist() == list(range(1, 31))
+        assert [event.number for event in two.events.newest()] == list(range(1, 31))
         read: list[int] = []
         result = verify_history(*place, on_rows=read.append)
         assert (result.ok, result.cells[0].rows) == (True, 120)  # one chain
@@ -448,7 +446,7 @@ def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None
     store = SqlStore(*place)
     store.close()
     store.close()
-    for call in (lambda: put(store, "a"), store.settings, store.flush):
+    for call in (lambda: put(store, "a"), store.settings.read, store.flush):
         with pytest.raises(StoreError, match="after close"):
             call()
 
@@ -458,11 +456,11 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
         put(store, "a")
         put_label(store, "a", True, Source.VERIFICATION, 0, None)
         with plans(tmp_path / "a.db") as result:
-            store.labelled(100)
-            store.get_decision("a")
-            store.outcomes_since(0)
-            store.silent_total()
-            store.events(5)
+            store.labels.with_traces(100)
+            store.decisions.get("a")
+            store.labels.outcomes_since(0)
+            store.labels.silent_total()
+            store.events.newest(5)
             put_label(store, "a", True, Source.VERIFICATION, 0, None)
     assert len(result) >= 7
     for statement, plan in result:
@@ -511,7 +509,7 @@ def test_a_store_of_another_version_is_refused_by_that_version_and_what_it_lacks
 ) -> None:
     file = tmp_path / "a.db"
     with SqlStore(str(file)) as store:
-        store.save_settings({"dengine": "0.8.2"})
+        store.settings.save({"dengine": "0.8.2"})
     execute(file, "ALTER TABLE label DROP COLUMN silent")
     with pytest.raises(StoreError, match=r"dengine 0\.8\.2, which lacks them; open") as refused:
         SqlStore(str(file))
@@ -546,7 +544,7 @@ def test_a_place_that_cannot_be_written_says_what_to_do(tmp_path: Path, name: st
 def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:
     file = tmp_path / "a.db"
     with SqlStore(str(file)) as store:
-        store.put_version(report(1), 0, {"w": np.zeros(1)})
+        store.versions.put(report(1), 0, {"w": np.zeros(1)})
     evil = tmp_path / "evil.npz"
     np.savez(evil, w=np.array([{}], dtype=object))
     assert zipfile.is_zipfile(evil)
@@ -557,9 +555,9 @@ def test_a_pickle_in_the_database_is_never_loaded(tmp_path: Path) -> None:
         )
     with SqlStore(str(file)) as store:
         with pytest.raises(StoreError, match="plain arrays"):
-            store.load_version(1)
-        assert store.last_version() is None
-        assert "plain arrays" in store.events()[0].text
+            store.versions.load(1)
+        assert store.versions.newest() is None
+        assert "plain arrays" in store.events.newest()[0].text
 
 
 def test_a_store_in_memory_does_not_depend_on_a_file_called_none(
@@ -569,5 +567,5 @@ def test_a_store_in_memory_does_not_depend_on_a_file_called_none(
     (tmp_path / "None").touch()
     with SqlStore() as store:
         (tmp_path / "None").unlink()
-        store.put_event("note", "still written")
-        assert [event.text for event in store.events()] == ["still written"]
+        store.events.put("note", "still written")
+        assert [event.text for event in store.events.newest()] == ["still written"]

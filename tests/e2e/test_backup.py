@@ -41,7 +41,7 @@ def in_use(tmp_path: Path, data: Dataset) -> Iterator[DataEngine]:
 
 def labels_of(file: Path) -> list[int]:
     with SqlStore(str(file)) as store:
-        return store.labelled().labels.tolist()
+        return store.labels.with_traces().labels.tolist()
 
 
 def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_verifies(
@@ -84,8 +84,8 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
                 backup_store(store, copy)
                 assert verify_history(copy).ok
                 with SqlStore(copy) as copied:
-                    labels = {label.decision_id for label in copied.past_labels(0)}
-                    kinds = [event.kind for event in copied.events()]
+                    labels = {label.decision_id for label in copied.labels.past(0)}
+                    kinds = [event.kind for event in copied.events.newest()]
                 assert len(before) >= 20 * n
                 assert before <= labels
                 assert "dead letter" not in kinds
@@ -105,7 +105,7 @@ def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(
     assert (second.decisions, second.labels) == (first.decisions, first.labels)
     assert labels_of(tmp_path / "second.db") == labels_of(tmp_path / "first.db")
     with SqlStore(str(tmp_path / "second.db")) as store:
-        assert [event.kind for event in store.events() if event.kind == "dead letter"] == []
+        assert [event.kind for event in store.events.newest() if event.kind == "dead letter"] == []
 
 
 def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_none(
@@ -154,7 +154,7 @@ def test_a_cell_moves_to_another_machine_by_backup_and_restore(
     caplog.clear()
     with DataEngine.open(str(there)) as engine:
         assert engine.status().labels == IN_STORE + IN_JOURNAL
-        assert (engine.status().alarm, engine.store.events()) == ("", [])
+        assert (engine.status().alarm, engine.store.events.newest()) == ("", [])
         learn(engine, data, range(70, 80))
     assert caplog.messages == []
     assert document("verify", there)["ok"]
@@ -227,4 +227,4 @@ def test_every_cell_of_a_file_is_in_its_backup(tmp_path: Path, data: Dataset) ->
     assert (report.decisions, report.labels, report.without_journal) == (30, 30, ())
     for name, n in (("A", 10), ("B", 20)):
         with SqlStore(str(tmp_path / "copy.db"), f"cell {name}") as store:
-            assert len(store.labelled().labels) == n
+            assert len(store.labels.with_traces().labels) == n

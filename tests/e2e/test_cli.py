@@ -249,7 +249,7 @@ def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_th
     first, report = import_labelled(store, (X[:70], y[:70]), "pca"), import_labelled(store, (X, y))
     assert (first.imported, first.quarantined, report.imported, report.repeated) == (68, 2, 90, 70)
     np.testing.assert_array_equal(
-        store.labelled().labels, y[2:]
+        store.labels.with_traces().labels, y[2:]
     )  # bad ones are kept, and never trained on
 
 
@@ -298,7 +298,7 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(
     assert "resumed" in document(*words, "--cycles", 30, "--force")["title"]
     with DataEngine.open(store) as engine:
         assert engine.status().ever.decisions == 140
-        hashes = engine.store.labelled().hashes.tolist()
+        hashes = engine.store.labels.with_traces().hashes.tolist()
     assert len(hashes) == len({*hashes})
     more = dengine(*words, "--cycles", 60, "--force")
     assert more.exit_code == 1

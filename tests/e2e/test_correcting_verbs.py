@@ -47,7 +47,7 @@ def ids(store: Path) -> list[str]:
 
 def labels(store: Path) -> dict[int, int]:
     with DataEngine.open(store) as engine:
-        labelled = engine.store.labelled()
+        labelled = engine.store.labels.with_traces()
     return dict(zip(labelled.seq.tolist(), labelled.labels.tolist(), strict=True))
 
 
@@ -69,8 +69,8 @@ def test_a_label_is_corrected_and_the_line_says_what_it_was(store: Path) -> None
         "kim",
     )
     with DataEngine.open(store) as engine:  # and a retrain by hand learns it
-        assert engine.store.last_version().state["labels"][0] == 1 - before
-        assert engine.store.events(1)[0].kind == "retrain"
+        assert engine.store.versions.newest().state["labels"][0] == 1 - before
+        assert engine.store.events.newest(1)[0].kind == "retrain"
 
 
 def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> None:
@@ -106,7 +106,7 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store: Pa
     assert sorted(labels(store)) == list(range(3, 61))
     assert document("status", store)["forgotten"] == 2
     with DataEngine.open(store) as engine:
-        (event,) = engine.store.events()
+        (event,) = engine.store.events.newest()
     assert (event.kind, event.author, event.data["reason"]) == (
         "forget",
         getpass.getuser(),

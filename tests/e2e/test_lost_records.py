@@ -130,7 +130,7 @@ def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it
     assert document("verify", store, "--acknowledge", "--author", "Kim")["ok"]
     with DataEngine.open(str(store)) as engine:
         assert engine.status().alarm == ""
-        assert engine.store.events(1)[-1].author == "Kim"
+        assert engine.store.events.newest(1)[-1].author == "Kim"
 
 
 def swap(file: Path, head: Path) -> None:

@@ -221,7 +221,7 @@ def test_where_every_version_is_damaged_the_engine_opens_without_one_and_says_so
             connection.execute("UPDATE model_version SET state = ?", (state,))
         with DataEngine.open(path) as engine:
             assert engine.decide(data.X[0]).reason is Reason.NO_MODEL
-            assert "damaged" in [event.kind for event in engine.store.events()]
+            assert "damaged" in [event.kind for event in engine.store.events.newest()]
 
 
 SETTINGS_OF_STORES = {

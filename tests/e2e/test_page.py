@@ -193,7 +193,7 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(
 ) -> None:
     with demo.store() as store:
         labelled = next(
-            past for past in store.decisions(HistoryFilter(label="good"), 1, newest=False)
+            past for past in store.decisions.select(HistoryFilter(label="good"), 1, newest=False)
         )
     opened(page, demo, f"part?id={labelled.decision.id}")
     page.get_by_role("button", name="It was bad").focus()
@@ -214,8 +214,8 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(
     )
     assert page.title().startswith("Part")  # what was typed stayed text
     with demo.store() as store:
-        assert store.get_decision(labelled.decision.id, trace=False).success is False
-        assert store.corrections()[-1].author == AUTHOR
+        assert store.decisions.get(labelled.decision.id, trace=False).success is False
+        assert store.corrections.after()[-1].author == AUTHOR
 
 
 @pytest.mark.slow
@@ -238,8 +238,8 @@ def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path:
     with ZipFile(tmp_path / "model.zip") as archive:
         archive.extractall(tmp_path)
     with demo.store() as store:
-        done = {event.kind for event in store.events(20) if event.author == "Robin"}
-        trace = store.get_decision(store.decisions(HistoryFilter(), 1)[0].decision.id).trace
+        done = {event.kind for event in store.events.newest(20) if event.author == "Robin"}
+        trace = store.decisions.get(store.decisions.select(HistoryFilter(), 1)[0].decision.id).trace
     assert done == {"retrain", "rollback", "release", "export"}
     assert load_exported(tmp_path / "model.ts").decide(trace).action in Action
 
@@ -278,7 +278,7 @@ def test_a_dialog_offers_what_there_is_now_and_not_when_the_page_was_opened(
         expect(page.get_by_role("button", name="Roll back")).to_be_enabled()
         for _ in range(2 * KEEP):  # those that were there at first are kept no longer
             service.submit(DataEngine.retrain).result()
-        versions = service.submit(lambda engine: engine.store.versions()).result()
+        versions = service.submit(lambda engine: engine.store.versions.all()).result()
         kept = [str(version.report.version) for version in versions if version.kept][-2::-1]
         for _ in range(100):  # the page follows within a moment
             if offered() == kept:
@@ -342,7 +342,7 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
                 opened(page, demo, nothing)
                 expect(page.locator("h1")).to_have_text("That cannot be shown")
     with demo.store() as store:
-        answers = [(event.kind, event.author) for event in store.events(4)]
+        answers = [(event.kind, event.author) for event in store.events.newest(4)]
     assert answers == [
         ("report", "Kim"),
         ("shadow", "Kim"),

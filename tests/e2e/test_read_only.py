@@ -42,9 +42,9 @@ from dengine.store import open_store
 for path in sys.argv[1:]:
     try:
         with open_store(path) as store:
-            store.put_event("note", "kept")
+            store.events.put("note", "kept")
         with open_store(path) as store:
-            print([event.kind for event in store.events()].count("note"))
+            print([event.kind for event in store.events.newest()].count("note"))
     except StoreError as error:
         print(" ".join(str(error).split()))
 """

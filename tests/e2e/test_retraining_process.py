@@ -156,7 +156,7 @@ def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_ta
             assert not process.ready.done()  # to be ready takes it seconds
         settle(engine)
         assert (engine.version, engine.policy.alpha) == (1, 0.2)
-        assert [report.accepted for report in engine.store.retrains()] == [True]
+        assert [report.accepted for report in engine.store.versions.retrains()] == [True]
 
 
 @pytest.mark.merge
@@ -179,7 +179,7 @@ def test_a_process_that_was_given_up_is_started_again_and_retrains(
             learn(engine, data, range(40))
             monkeypatch.setattr(trainer, "HUNG", 0.0)
             engine.poll()
-            assert not engine.store.retrains()[-1].accepted
+            assert not engine.store.versions.retrains()[-1].accepted
             engine.retrain(wait=False)
             monkeypatch.undo()
         settle(engine)

@@ -476,7 +476,7 @@ def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None
         must_be_problem(answer, 503)
         assert int(answer.headers["retry-after"]) >= 1
         assert service.busy == 1
-    assert service.read_store.status()["decisions"] == 0
+    assert service.read_store.decisions.counts()["decisions"] == 0
     with pytest.raises(BusyError, match="closing"):
         asyncio.run(service.decide(stream.X[0]))
 

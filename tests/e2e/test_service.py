@@ -54,7 +54,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
 
     with a_service(tmp_path / "cell.db") as service:
         asyncio.run(cell(service))
-        assert (service.read_store.status()["decisions"], service.late) == (3, 2)
+        assert (service.read_store.decisions.counts()["decisions"], service.late) == (3, 2)
 
 
 def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> None:

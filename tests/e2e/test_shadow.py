@@ -10,7 +10,7 @@ import pytest
 
 from dengine import Action, DataEngine, Dataset
 from dengine.errors import ReportError
-from dengine.store.outbox import BloomFilter
+from dengine.store.lookup import BloomFilter
 from tests.support.driving import RECIPE, drive
 
 
@@ -34,7 +34,7 @@ def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_s
         drive(engine, stream, 1, 200)
         assert engine.decide(stream.X[0]).model_version > 0
         assert engine.decide(stream.X[0], part="P1", decision_id="order-7") == first
-        assert engine.store.status()["decisions"] == 201
+        assert engine.store.decisions.counts()["decisions"] == 201
 
 
 KILLED = """
@@ -64,4 +64,4 @@ def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_onc
         for x, (id_, action, reason) in zip(stream.X, answers, strict=False):
             again = engine.decide(x, decision_id=id_)
             assert (again.id, again.action, again.reason) == (id_, action, reason)
-        assert engine.store.status()["decisions"] == 20
+        assert engine.store.decisions.counts()["decisions"] == 20

@@ -373,10 +373,10 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(
     assert result["cell"]["missing"] >= 2
     assert "incomplete 0" in shown
     with DataEngine.open(store) as engine:
-        kept = engine.store.labelled().traces[
+        kept = engine.store.labels.with_traces().traces[
             :, 0
         ]  # of a trace with a gap the label is counted, not the trace
-        assert engine.store.status()["decisions"] == 15
+        assert engine.store.decisions.counts()["decisions"] == 15
     assert {trace.tobytes() for trace in kept} == {
         x.tobytes() for i, x in enumerate(parts.X[:15]) if i != 3
     }
@@ -405,7 +405,7 @@ def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goe
         program.played.clear()  # somebody has filled it
         succeed(*run_on(fake, store), "--cycles", 4)
     with DataEngine.open(store) as engine:
-        assert engine.store.status()["decisions"] == 14
+        assert engine.store.decisions.counts()["decisions"] == 14
 
 
 @pytest.mark.parametrize(

@@ -206,7 +206,7 @@ def test_a_shift_of_the_program_decides_checks_and_reports(
     robot = Robot(data, len(data), cell)
     robot.play()
     asked = cell.service.submit(
-        lambda engine: (engine.flush(), engine.store.decisions(HistoryFilter(), 1000))[1]
+        lambda engine: (engine.flush(), engine.store.decisions.select(HistoryFilter(), 1000))[1]
     )
     result = asked.result(60)
     assert len(result) == len(data)

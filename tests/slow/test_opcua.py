@@ -43,7 +43,7 @@ class Plant:
 
     async def decisions(self) -> int:
         await self.service.call(lambda engine: engine.flush())
-        return self.service.read_store.status()["decisions"]
+        return self.service.read_store.decisions.counts()["decisions"]
 
     async def until(self, name: str, fits: Callable[[Any], bool]) -> Any:
         async with asyncio.timeout(60):
@@ -155,7 +155,9 @@ async def test_the_example_client_plays_a_shift_with_a_controllers_types_and_emp
                 f"opc.tcp://127.0.0.1:{server.bserver.port}/dengine", 120, empty
             )
             await service.call(lambda engine: engine.flush())
-        expected = [past.decision for past in service.read_store.decisions(HistoryFilter(), 1000)]
+        expected = [
+            past.decision for past in service.read_store.decisions.select(HistoryFilter(), 1000)
+        ]
     n = {
         action: sum(item.action == action for item in expected)
         for action in ("verify", "accept", "reject")

@@ -34,7 +34,7 @@ def test_cells_that_open_an_empty_database_at_once_all_succeed() -> None:
 
 def test_the_short_url_uses_psycopg_3() -> None:
     with SqlStore(URL.replace("postgresql+psycopg", "postgresql"), uuid.uuid4().hex) as store:
-        assert store.settings() == {}
+        assert store.settings.read() == {}
 
 
 def test_other_programs_tables_may_stand_beside_ours() -> None:

@@ -65,7 +65,7 @@ def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
     """Labels of decisions that are there; returns their numbers, in the order given."""
     now, taken = store.clock() if labels else 0.0, []
     for label in labels:
-        stored = store.get_decision(label.decision_id, trace=False)
+        stored = store.decisions.get(label.decision_id, trace=False)
         taken.append(
             replace(label, time=now, content_hash=stored.content_hash, decided=stored.time)
         )

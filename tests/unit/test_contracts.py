@@ -33,7 +33,7 @@ def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(
         learn(engine, data, range(len(data)))
         assert engine.trace == TraceSpec(100)
         assert engine.version == 1
-        assert engine.store.status()["quarantined"] == 2
+        assert engine.store.decisions.counts()["quarantined"] == 2
         assert engine.decide(data.X[0]).reason is not Reason.MODEL_ERROR
 
 
@@ -46,7 +46,7 @@ def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(
             TraceError, match=rf"got 1 x {samples}; record longer, or start with DataEngine\(trace="
         ):
             engine.decide(np.arange(samples))
-        assert (engine.trace, engine.store.status()["decisions"]) == (None, 0)
+        assert (engine.trace, engine.store.decisions.counts()["decisions"]) == (None, 0)
         buffer = np.arange(MIN_SAMPLES)
         first = engine.decide(buffer)
         buffer[:] = 0  # it is the caller's, and may be used again
@@ -62,7 +62,7 @@ def test_the_first_trace_of_a_lost_stop_sets_a_contract_as_any_other(place) -> N
         assert engine.trace is None
         engine.report("lost-2", False, trace=np.arange(50.0))
         assert engine.trace == TraceSpec(50)
-        assert engine.store.status()["sources"]["stop"] == 2
+        assert engine.store.decisions.counts()["sources"]["stop"] == 2
 
 
 def test_a_wrong_contract_that_nothing_was_learned_by_says_how_to_start_over(

@@ -41,7 +41,7 @@ def asked(engine: DataEngine, data: Dataset) -> list:
 
 def state(engine: DataEngine) -> tuple:
     """All that decides what an engine does next."""
-    stored = engine.store.labelled(engine.recipe.window)
+    stored = engine.store.labels.with_traces(engine.recipe.window)
     rule = engine.model and {name: t.tolist() for name, t in engine.model.rule.state_dict().items()}
     numbers = engine.model and sorted(engine.model.index.column("numbers").tolist())
     return (
@@ -60,7 +60,7 @@ def state(engine: DataEngine) -> tuple:
 def again(engine: DataEngine, place: Path, **options) -> DataEngine:
     """An engine opened on a copy of the store, as the first one is now."""
     engine.flush()
-    if engine.store.wait is None:  # in memory, where nobody owns it
+    if engine.store.database.is_in_memory:  # in memory, where nobody owns it
         return DataEngine.open(engine.store, replaying=True, **options)
     target = place / f"copy-{len(list(place.iterdir()))}.db"
     with (
@@ -107,7 +107,7 @@ def test_a_label_is_corrected_and_forgotten_for_the_very_next_decision_and_comes
     assert engine.model.index.column("spaces").tolist() == spaces.tolist()
     assert set(spaces) == set(fold_of(engine.model.index.column("parts"), engine.model.n_spaces))
     assert "counts as a failure, was a success" in text.text
-    event = engine.store.events(1)[0]
+    event = engine.store.events.newest(1)[0]
     assert (event.number, event.kind, event.author) == (text.event, "correct", "kim")
     assert event.data == {"decisions": {name: {"was": True, "now": False}}}
     text = engine.forget(name, author="kim", reason="another part lay in the fixture")
@@ -115,7 +115,7 @@ def test_a_label_is_corrected_and_forgotten_for_the_very_next_decision_and_comes
     assert (after.n_success, after.n_failure) == (before.n_success - 1, before.n_failure)
     assert len(engine.model.index) == n - 1
     assert text.text == f"The label of {name} is forgotten: another part lay in the fixture."
-    assert engine.store.get_decision(name).trace.shape == (1, data.X.shape[1])
+    assert engine.store.decisions.get(name).trace.shape == (1, data.X.shape[1])
     engine.correct(name, True)
     assert evidence(engine.decide(probe)) == evidence(before)
 
@@ -127,11 +127,11 @@ def test_what_is_forgotten_trains_nothing_any_more_and_what_is_corrected_trains_
     cycles = play(engine, data, 0, 1)
     engine.correct(cycles[0].decision.id, not cycles[0].success)  # before there is a model
     cycles += play(engine, data, 1, 100, confirm=True)
-    assert engine.store.load_version(1).state["labels"][0] == (not cycles[0].success)
+    assert engine.store.versions.load(1).state["labels"][0] == (not cycles[0].success)
     engine.forget(*(c.decision.id for c in cycles[:5]))
     engine.correct(cycles[5].decision.id, not cycles[5].success)
     engine.retrain()
-    trained = engine.store.last_version().state
+    trained = engine.store.versions.newest().state
     assert trained["trained_on"].tolist() == list(range(6, 101))
     assert trained["labels"][0] == (not cycles[5].success)
 
@@ -143,7 +143,11 @@ def test_the_rule_is_told_again_and_safe_mode_follows_the_labels_as_they_are_now
     play(engine, data, 0, 120, confirm=True)
     engine.forget(*break_stop_sensor(engine, data), reason="the stop sensor was broken")
     assert engine.safe_mode == ""
-    assert [e.kind for e in engine.store.events(3)] == ["safe mode", "forget", "safe mode ended"]
+    assert [e.kind for e in engine.store.events.newest(3)] == [
+        "safe mode",
+        "forget",
+        "safe mode ended",
+    ]
 
 
 def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
@@ -181,7 +185,7 @@ def test_a_full_ring_loses_the_forgotten_reference_and_keeps_the_age_of_the_othe
 ) -> None:
     engine = make(replace(RECIPE, window=60), store=tmp_path / "engine.db")
     play(engine, data, 0, 130, confirm=True)
-    oldest = int(engine.store.labelled(60).seq[0])
+    oldest = int(engine.store.labels.with_traces(60).seq[0])
     engine.forget(labelled(engine, oldest + 10), labelled(engine, oldest + 20))
     play(engine, data, 130, 139, confirm=True)
     with again(engine, tmp_path) as reopened:
@@ -205,15 +209,15 @@ STEPS = st.lists(
 
 
 def step(engine: DataEngine, data: Dataset, kind: str, value) -> None:
-    n = engine.store.status()["labels"] + engine.store.status()["forgotten"]
+    n = engine.store.decisions.counts()["labels"] + engine.store.decisions.counts()["forgotten"]
     if kind == "play":
-        start = engine.store.status()["decisions"]
+        start = engine.store.decisions.counts()["decisions"]
         play(engine, data, start, start + value)
     elif kind in ("correct", "forget") and n:
         name = labelled(engine, 1 + value % n)
         engine.forget(name) if kind == "forget" else engine.correct(name, value % 3 != 0)
     elif kind == "rollback":
-        kept = sorted(r.version for r in engine.store.retrains() if r.accepted)[-5:]
+        kept = sorted(r.version for r in engine.store.versions.retrains() if r.accepted)[-5:]
         if kept:
             engine.rollback(kept[value % len(kept)])
     elif kind in ("lower_bound", "audit_rate", "stops"):
@@ -231,7 +235,7 @@ def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(
         play(engine, data, 0, 90)
         for item in steps:
             step(engine, data, *item)
-        start = engine.store.status()["decisions"]
+        start = engine.store.decisions.counts()["decisions"]
         with again(engine, place) as reopened:
             assert asked(reopened, data) == asked(engine, data)
             assert state(reopened) == state(engine)
@@ -262,7 +266,7 @@ def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data: Datas
     engine.forget(cycles[4].decision.id, cycles[5].decision.id)
     reopened = DataEngine.open(engine.store, reducer=custom, replaying=True)
     assert asked(reopened, data) == asked(engine, data)
-    first = engine.store.retrains()[0].version
+    first = engine.store.versions.retrains()[0].version
     engine.rollback(first)
     reopened = DataEngine.open(engine.store, reducer=custom, replaying=True)
     assert asked(reopened, data) == asked(engine, data)
@@ -275,13 +279,17 @@ def test_an_earlier_version_answers_again_as_a_new_one_with_what_came_since(data
     old, number, version = engine.model.spaces, engine.version - 1, engine.version
     text = engine.rollback(number, author="kim")
     assert (engine.version, text.version, text.kind) == (version + 1, version + 1, "rollback")
-    assert engine.store.retrains()[-1].reason == f"rolled back to version {number}"
-    assert engine.store.events(1)[0].data == {"to": number, "was": version, "now": version + 1}
+    assert engine.store.versions.retrains()[-1].reason == f"rolled back to version {number}"
+    assert engine.store.events.newest(1)[0].data == {
+        "to": number,
+        "was": version,
+        "now": version + 1,
+    }
     assert engine.model.spaces is not old
-    assert len(engine.model.index) == len(engine.store.labelled().seq)
+    assert len(engine.model.index) == len(engine.store.labels.with_traces().seq)
     assert engine.state.new_labels == 0
     assert engine.decide(data.X[199]).model_version == version + 1
-    first = engine.store.load_version(number).state
+    first = engine.store.versions.load(number).state
     np.testing.assert_array_equal(engine.model.get_state()["scale"], first["scale"])
     np.testing.assert_array_equal(
         engine.model.index.column("points")[: first["points"].shape[1]], first["points"].T
@@ -356,9 +364,9 @@ def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_
     engine.correct(cycles[2].decision.id, not cycles[2].success)
     assert engine.version == version + 1
     engine.forget(cycles[11].decision.id)
-    assert engine.model.y.tolist() == engine.store.labelled().labels.tolist()
+    assert engine.model.y.tolist() == engine.store.labels.with_traces().labels.tolist()
     engine.rollback(1)
-    assert engine.model.y.tolist() == engine.store.labelled().labels.tolist()
+    assert engine.model.y.tolist() == engine.store.labels.with_traces().labels.tolist()
     again_ = DataEngine.open(engine.store, model=Remembering(), replaying=True)
     assert again_.model.y.tolist() == engine.model.y.tolist()
     with pytest.raises(SettingError, match="alpha would have no effect"):
@@ -406,7 +414,7 @@ def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(
     engine.correct(stopped[-1], True)  # told anew: it still began in safe mode
     assert engine.safe_mode == why
     engine.set_policy(replace(engine.policy, stops="some"))  # the paper's rule has no safe mode
-    assert (engine.safe_mode, engine.store.events(1)[0].text) == (
+    assert (engine.safe_mode, engine.store.events.newest(1)[0].text) == (
         "",
         "the rule of the new policy has no safe mode",
     )
@@ -415,7 +423,7 @@ def test_safe_mode_outlasts_a_change_of_policy_until_fresh_evidence(
 def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) -> None:
     engine = make()
     play(engine, data, 0, 150)
-    silent = len(engine.store.unreported_accepts())
+    silent = len(engine.store.decisions.unreported_accepts())
     assert silent > 5
     engine.set_policy(replace(engine.policy, stops="all"))
     reopened = DataEngine.open(engine.store, replaying=True)
@@ -423,4 +431,4 @@ def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) 
         item.decide(data.X[160])
         item.decide(data.X[161])
         item.flush()
-        assert len(item.store.unreported_accepts()) >= silent
+        assert len(item.store.decisions.unreported_accepts()) >= silent

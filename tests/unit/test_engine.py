@@ -66,7 +66,7 @@ def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data: Datase
     assert asked == [str(c.decision.action) for c in cycles]
     assert {c.decision.action for c in cycles} == set(Action)
     rejected = next(c.decision.id for c in cycles if c.decision.action is Action.REJECT)
-    assert engine.store.get_decision(rejected).source is None
+    assert engine.store.decisions.get(rejected).source is None
 
 
 @pytest.mark.parametrize(
@@ -137,7 +137,7 @@ def test_a_report_does_not_embed_again_what_its_version_decided_on(data: Dataset
 def test_a_trace_that_comes_again_has_no_vote_on_itself(trained: DataEngine, data: Dataset) -> None:
     decision = trained.decide(good(data))
     trained.report(decision.id, success=False)
-    assert (decision.action, trained.store.get_decision(decision.id).source) == (
+    assert (decision.action, trained.store.decisions.get(decision.id).source) == (
         Action.ACCEPT,
         Source.STOP,
     )
@@ -209,11 +209,11 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(
     decision = engine.decide(x)
     assert (decision.action, decision.reason, decision.embedding) == (Action.VERIFY, reason, None)
     assert engine.report(decision.id, success=True) is None
-    stored = engine.store.get_decision(decision.id)
+    stored = engine.store.decisions.get(decision.id)
     assert (stored.quarantined, stored.success) == (True, True)
     np.testing.assert_array_equal(stored.trace[0], x.astype(np.float32))
     assert (engine.version, engine.state.new_labels, len(engine.model.index)) == before
-    assert content_hash(x[None])[0] not in engine.store.labelled().hashes
+    assert content_hash(x[None])[0] not in engine.store.labels.with_traces().hashes
 
 
 def test_a_finite_trace_beyond_all_measure_is_verified(data: Dataset) -> None:
@@ -252,8 +252,8 @@ def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
     reasons = Counter(c.decision.reason for c in play(engine, data, 0, 130))
     later = Reason.MODEL_ERROR if at == "predict_interval" else Reason.UNCERTAIN
     assert reasons == {Reason.NO_MODEL: 40, later: 90}
-    assert (len(engine.store.labelled().labels), engine.version) == (130, 3)
-    assert engine.store.status()["actions"]["verify"] == 130
+    assert (len(engine.store.labels.with_traces().labels), engine.version) == (130, 3)
+    assert engine.store.decisions.counts()["actions"]["verify"] == 130
 
 
 def test_a_dropped_candidate_leaves_the_old_version_answering(data: Dataset) -> None:
@@ -265,7 +265,7 @@ def test_a_dropped_candidate_leaves_the_old_version_answering(data: Dataset) -> 
     assert (report.accepted, report.version) == (False, version)
     assert "PCA needs more than 500 traces" in report.reason
     assert evidence(engine.decide(good(data))) == before
-    assert [r.accepted for r in engine.store.retrains()][-1] is False
+    assert [r.accepted for r in engine.store.versions.retrains()][-1] is False
 
 
 class Slowing(ConvReducer):
@@ -324,15 +324,15 @@ def test_a_second_report_is_an_error_and_the_first_stands(
     trained.report(decision.id, True)
     counts, labels, count = (
         trained.state.new_labels,
-        len(trained.store.labelled().labels),
+        len(trained.store.labels.with_traces().labels),
         len(trained.model.index),
     )
     with pytest.raises(
         ReportError, match="success from verification was reported first and stands"
     ):
         trained.report(decision.id, second)
-    assert trained.store.get_decision(decision.id).success is True
-    n_labels = len(trained.store.labelled().labels)
+    assert trained.store.decisions.get(decision.id).success is True
+    n_labels = len(trained.store.labels.with_traces().labels)
     assert (trained.state.new_labels, n_labels, len(trained.model.index)) == (
         counts,
         labels,
@@ -343,10 +343,10 @@ def test_a_second_report_is_an_error_and_the_first_stands(
 def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(
     trained: DataEngine, data: Dataset
 ) -> None:
-    labels = len(trained.store.labelled().labels)
+    labels = len(trained.store.labels.with_traces().labels)
     trained.set_policy(replace(trained.policy, audit_rate=0.999))
     trained.report("from-a-lost-process", success=False, trace=good(data))
-    stored = trained.store.get_decision("from-a-lost-process")
+    stored = trained.store.decisions.get("from-a-lost-process")
     assert (stored.decision.action, stored.success, stored.source) == (
         Action.ACCEPT,
         False,
@@ -358,20 +358,20 @@ def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(
         0.999,
     )
     np.testing.assert_array_equal(stored.trace[0], good(data))
-    assert len(trained.store.labelled().labels) == labels + 1
+    assert len(trained.store.labels.with_traces().labels) == labels + 1
 
 
 def test_a_lost_success_is_not_taken_since_only_stops_speak_for_themselves(
     trained: DataEngine, data: Dataset
 ) -> None:
-    before = trained.store.status()
+    before = trained.store.decisions.counts()
     for text in ({"success": True, "trace": good(data)}, {"success": False}):
         with pytest.raises(
             ReportError,
             match=r"'lost', which is unknown; a system stop .* can be reported with its trace",
         ):
             trained.report("lost", **text)
-    assert trained.store.status() == before
+    assert trained.store.decisions.counts() == before
 
 
 @pytest.mark.parametrize("where", ["insert", "verify", "proceed"])
@@ -392,8 +392,8 @@ def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(
         cycles.extend(engine.run(Broken(data), 200))  # keeps what came before the exception
     total = sum(c.success is not None for c in cycles)
     with SqlStore(str(tmp_path / "engine.db")) as other:  # beside the engine, which is still open
-        assert other.status()["labels"] == total > 50
-        assert other.status()["decisions"] >= len(cycles) + (where != "insert")
+        assert other.decisions.counts()["labels"] == total > 50
+        assert other.decisions.counts()["decisions"] >= len(cycles) + (where != "insert")
     engine.close()
 
 
@@ -447,19 +447,6 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: 
     assert [evidence(beside.decide(x)) for x in data.X[100:]] == [
         evidence(inline.decide(x)) for x in data.X[100:]
     ]
-
-
-def test_a_version_that_the_store_gives_no_number_has_the_one_that_it_was_trained_as(
-    data: Dataset,
-) -> None:
-    class Mute(SqlStore):
-        def put_version(self, *args):
-            super().put_version(*args)
-
-    engine = make(store=Mute())
-    play(engine, data, 0, 39)
-    assert engine.retrain() == engine.store.retrains()[0]
-    assert (engine.version, engine.retrain().version) == (1, 2)
 
 
 def test_a_second_thread_in_an_engine_is_refused(data: Dataset) -> None:

@@ -101,9 +101,9 @@ def test_the_neighbours_are_the_nearest_others_and_their_labels_are_theirs(
         distances = [item.distance for item in explanation.neighbours]
         assert distances == sorted(distances)
         assert explanation.radius == pytest.approx(engine.recipe.radius)
-        asked = engine.store.get_decision(past.decision.id)
+        asked = engine.store.decisions.get(past.decision.id)
         for item in explanation.neighbours:
-            stored = engine.store.get_decision(item.decision_id)
+            stored = engine.store.decisions.get(item.decision_id)
             assert item.inside == (item.distance <= explanation.radius)
             assert (stored.success, stored.source) == (item.success, item.source)
             # The same part, which came before, has no vote.

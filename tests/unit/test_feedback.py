@@ -68,7 +68,7 @@ def beyond(engine: DataEngine) -> list[int]:
     """Members of LB's own level that the rule counts beyond those of which the store has labels,
     and the bad ones.
     """
-    records = engine.store.outcomes_since(0)
+    records = engine.store.labels.outcomes_since(0)
     n, bad = engine.model.rule.evidence.level_counts_since_alarm[0, 0].sum(0).tolist()
     reached = [item.success for item in records if item.lower >= 0.9]
     return [n - len(reached), bad - reached.count(False)]
@@ -85,7 +85,7 @@ def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_pa
 
     def source(decision: Decision) -> Source | None:
         engine.flush()
-        return engine.store.get_decision(decision.id).source
+        return engine.store.decisions.get(decision.id).source
 
     silent = accepted(engine, stream)
     assert source(silent) is None  # nothing is known of it yet
@@ -101,8 +101,8 @@ def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_pa
 def test_silence_says_nothing_by_default(stream: Dataset) -> None:
     engine = make(LOCAL)
     play(engine, stream)
-    assert engine.store.status()["sources"]["confirmed"] == 0
-    assert engine.store.tally().outcomes.accepted > 100
+    assert engine.store.decisions.counts()["sources"]["confirmed"] == 0
+    assert engine.store.decisions.tally().outcomes.accepted > 100
     certificate = engine.certificate()
     assert (certificate.accepted.upper, "audit_rate" in certificate.sentence) == (1.0, True)
 
@@ -123,7 +123,7 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
         engine = DataEngine.open(tmp_path / "late.db", replaying=True)
         engine.decide(stream.X[0])
     engine.flush()
-    assert engine.store.get_decision(stopped.id).source is Source.CONFIRMED
+    assert engine.store.decisions.get(stopped.id).source is Source.CONFIRMED
     if away:
         monkeypatch.setattr(
             engine.store, "apply_records", lambda records: (_ for _ in ()).throw(StoreError("away"))
@@ -135,15 +135,18 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     engine.decide(stream.X[1])
     engine.flush()
     assert beyond(engine) == [0, 0]
-    stored, labels = engine.store.get_decision(stopped.id), engine.model.index.column("labels")
-    assert (stored.success, engine.store.labelled().labels[stored.label_seq - 1]) == (False, 0)
+    stored, labels = engine.store.decisions.get(stopped.id), engine.model.index.column("labels")
+    assert (stored.success, engine.store.labels.with_traces().labels[stored.label_seq - 1]) == (
+        False,
+        0,
+    )
     (past,) = [past for past in engine.history() if past.decision.id == stopped.id]
     assert {stored.source, past.source, engine.find(stopped.id).source} == {Source.STOP}
     status = engine.status()
     assert (
         status.sources["stop"]
         == status.ever.false_accepts
-        == engine.store.tally().outcomes.false_accepts
+        == engine.store.decisions.tally().outcomes.false_accepts
     )
     with pytest.raises(
         ReportError,
@@ -151,7 +154,11 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     ):
         engine.report(stopped.id, False)
     assert labels[engine.model.index.column("numbers") == stored.label_seq].tolist() == [0]
-    assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.false_accepts > 0
+    assert (
+        engine.certificate().accepted.n_bad
+        == engine.store.decisions.tally().outcomes.false_accepts
+        > 0
+    )
     engine.close()
     with DataEngine.open(tmp_path / "late.db", replaying=True) as engine:
         assert (engine.find(stopped.id).source, engine.find(stopped.id).success) == (
@@ -176,11 +183,11 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
             owed[decision.id] = bool(y)
         elif decision.action is Action.VERIFY:
             engine.report(decision.id, bool(y))
-    overdue = engine.store.tally(within=20).outcomes.overdue_audited_accepts
-    assert overdue > 3 > engine.store.tally().outcomes.overdue_audited_accepts == 0
+    overdue = engine.store.decisions.tally(within=20).outcomes.overdue_audited_accepts
+    assert overdue > 3 > engine.store.decisions.tally().outcomes.overdue_audited_accepts == 0
     assert (
         engine.certificate().accepted.n_bad
-        == overdue + engine.store.tally().outcomes.audited_accepts_bad
+        == overdue + engine.store.decisions.tally().outcomes.audited_accepts_bad
     )
     assert beyond(engine) == [overdue, overdue]
     engine.close()
@@ -192,7 +199,10 @@ def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_i
     engine.flush()
     engine.decide(stream.X[0])  # what was told before is told anew once the labels are stored
     assert beyond(engine) == [0, 0]
-    assert engine.certificate().accepted.n_bad == engine.store.tally().outcomes.audited_accepts_bad
+    assert (
+        engine.certificate().accepted.n_bad
+        == engine.store.decisions.tally().outcomes.audited_accepts_bad
+    )
     engine = DataEngine.open(tmp_path / "other" / "owed.db", replaying=True)
     engine.set_policy(replace(engine.policy, alpha=0.2))
     engine.report(
@@ -302,7 +312,7 @@ class RandomHistory:
             with DataEngine.open(copied / "e.db", replaying=True) as again:
                 assert learned(again, self.probes) == learned(self.engine, self.probes)
             self.compared += (
-                self.engine.store.overdue_to(self.engine.recipe.policy.label_within) > 0
+                self.engine.store.decisions.overdue_to(self.engine.recipe.policy.label_within) > 0
             )
 
     def reopen(self) -> None:
@@ -324,7 +334,9 @@ def test_in_random_histories_with_overdue_checks_a_reopened_engine_is_the_one_th
 def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_not_know_of_overdue_checks(
     stream: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(feedback, "NewLabel", lambda *given, overdue_to: NewLabel(*given))
+    monkeypatch.setattr(
+        feedback, "NewLabel", lambda *given, overdue_to, seq: NewLabel(*given, seq=seq)
+    )
     engine, checks = make(replace(POOLED, label_within=50), store=tmp_path / "e.db"), 0
     for x, success in zip(stream.X, stream.y.tolist(), strict=True):
         decision = engine.decide(x)
@@ -338,8 +350,8 @@ def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_n
     assert verify_history(str(tmp_path / "e.db")).ok
     with DataEngine.open(tmp_path / "e.db", replaying=True) as engine:
         assert engine.safe_mode == ""
-        assert engine.store.overdue_to(50) > 0
-        answers = [item.seq for item in engine.store.outcomes_since(0, 0, 450)]
+        assert engine.store.decisions.overdue_to(50) > 0
+        answers = [item.seq for item in engine.store.labels.outcomes_since(0, 0, 450)]
         assert answers[-5:] == sorted(answers[-5:])  # not last, in one burst
         engine.report(engine.decide(stream.X[0]).id, True)
     assert verify_history(str(tmp_path / "e.db")).ok
@@ -354,7 +366,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
         engine.decide(x + np.float32(0.02))
     engine.retrain(wait=False)
     assert beyond(engine) == [0, 0]
-    assert engine.store.last_version().last_seq == engine.store.outcomes_since(0)[-1].seq
+    assert engine.store.versions.newest().last_seq == engine.store.labels.outcomes_since(0)[-1].seq
 
 
 def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
@@ -365,8 +377,8 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
     play(engine, stream)
     play(engine, spoiled(stream))
     assert engine.safe_mode
-    status = engine.store.status()
-    outcomes = engine.store.tally().outcomes
+    status = engine.store.decisions.counts()
+    outcomes = engine.store.decisions.tally().outcomes
     assert (
         status["labels"]
         == status["actions"]["verify"] + outcomes.false_accepts + outcomes.confirmed
@@ -396,7 +408,7 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
     play(engine, stream)
     cycles = play(engine, spoiled(stream))
     reason = "accepted parts failed more often than the tolerance"
-    assert heard == [reason] == [e.text for e in engine.store.events()]
+    assert heard == [reason] == [e.text for e in engine.store.events.newest()]
     assert engine.safe_mode == reason == cycles[-1].safe_mode
     first = next(i for i, c in enumerate(cycles) if c.safe_mode)
     assert sum(c.decision.action is Action.ACCEPT for c in cycles) <= 7
@@ -409,7 +421,7 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
         recovery,
     )
     play(engine, make_data(1500, samples=60, seed=9))  # more than the bad ones, which are learned
-    assert (engine.safe_mode, heard[-1], engine.store.events()[-1].kind) == (
+    assert (engine.safe_mode, heard[-1], engine.store.events.newest()[-1].kind) == (
         "",
         "",
         "safe mode ended",
@@ -422,7 +434,7 @@ def test_traces_of_one_part_share_a_fold_whatever_they_look_like(stream: Dataset
     engine = make(LOCAL, store=store)
     for x in stream.X[:10]:
         engine.report(engine.decide(x, part="A-17").id, True)
-    hashes = store.labelled().hashes
+    hashes = store.labels.with_traces().hashes
     for text, records in (
         ("", 0xCBF29CE484222325),
         ("a", 0xAF63DC4C8601EC8C),
@@ -467,10 +479,10 @@ def test_parts_that_were_each_reported_three_times_teach_as_much_as_once(
 def test_an_event_and_the_status_tell_where_nearly_every_trace_is_novel(stream: Dataset) -> None:
     engine = make(LOCAL)
     play(engine, stream, 0, 200)
-    assert engine.store.events() == []
+    assert engine.store.events.newest() == []
     for x in stream.X[:200]:
         engine.decide(3 * x)
-    assert [event.kind for event in engine.store.events()] == ["novelty"]
+    assert [event.kind for event in engine.store.events.newest()] == ["novelty"]
     assert "novel" in status(engine.store, last=200).alarm
 
 
@@ -518,7 +530,7 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
         engine.poll()
         engine.flush()
         before = told(engine)
-        n, labels = engine.store.status()["labels"], engine.state.new_labels
+        n, labels = engine.store.decisions.counts()["labels"], engine.state.new_labels
         engine.report(result[0].id, True)
         engine.report(result[1].id, False)
         assert told(engine) == before

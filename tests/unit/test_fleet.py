@@ -18,6 +18,7 @@ from dengine import Action, DataEngine, Dataset, Recipe, SqlStore
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.records import RetrainReport
 from dengine.store import verify_history
+from dengine.store.labels import LabelTable
 from dengine.store.peers import list_cells
 from dengine.store.records import address
 from tests.conftest import DATABASES, insertion_like, url_of
@@ -48,10 +49,8 @@ class Fleet:
     tag: str = field(default_factory=lambda: uuid.uuid4().hex)
     opened: list[DataEngine] = field(default_factory=list)
 
-    def store(
-        self, cell: str, product: str | None = "gear", kind: Callable[..., SqlStore] = SqlStore
-    ) -> SqlStore:
-        return kind(self.url, f"{cell}-{self.tag}", product=product and f"{product}-{self.tag}")
+    def store(self, cell: str, product: str | None = "gear") -> SqlStore:
+        return SqlStore(self.url, f"{cell}-{self.tag}", product=product and f"{product}-{self.tag}")
 
     def engine(
         self, cell: str, product: str | None = "gear", recipe: Any = RECIPE, **options: Any
@@ -114,7 +113,7 @@ def test_a_new_cell_decides_at_once_and_as_its_peers_do(
     first = fleet.engine("a")
     learn(first, parts, range(100))
     second = fleet.engine("b")
-    assert second.store.status()["labels"] == 0
+    assert second.store.decisions.counts()["labels"] == 0
     assert second.version == first.version > 0
     assert predictions(second, probe) == predictions(first, probe)
     assert any(second.decide(x).action is Action.ACCEPT for x in parts.X[100:140])
@@ -129,8 +128,8 @@ def test_one_retrain_serves_all(
         learn(cells[i % 3], parts, [i])
     for engine in cells:
         engine.poll()
-    labels = sum(engine.store.status()["labels"] for engine in cells)
-    retrains = cells[0].store.retrains()
+    labels = sum(engine.store.decisions.counts()["labels"] for engine in cells)
+    retrains = cells[0].store.versions.retrains()
     assert [report.version for report in retrains] == list(range(1, labels // EVERY + 1))
     assert {engine.version for engine in cells} == {len(retrains)}
     assert (
@@ -152,10 +151,10 @@ def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_no
         learn(
             second, parts, [start + 1]
         )  # the label that makes it due is always of the one that waits for 1000
-    assert first.store.retrains() == []
+    assert first.store.versions.retrains() == []
     learn(second, parts, [38])
     learn(first, parts, [39, 40])
-    assert len(first.store.retrains()) == 1
+    assert len(first.store.versions.retrains()) == 1
 
 
 def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
@@ -175,7 +174,7 @@ def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
         assert (
             len(first.model.index)
             == len(second.model.index)
-            == sum(e.store.status()["labels"] for e in (first, second))
+            == sum(e.store.decisions.counts()["labels"] for e in (first, second))
         )
 
 
@@ -214,26 +213,26 @@ def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_g
         first.report(first.decide(np.full(100, np.nan)).id, False)
         learn((first, second)[i % 2], parts, [i])
     first.poll(), second.poll()
-    newest = first.store.labelled(30)
-    np.testing.assert_array_equal(newest.seq, second.store.labelled(30).seq)
+    newest = first.store.labels.with_traces(30)
+    np.testing.assert_array_equal(newest.seq, second.store.labels.with_traces(30).seq)
     assert len(newest.seq) == len(first.model.index) == len(second.model.index) == 30
     assert counts(first, probe) == counts(second, probe)
 
 
 def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
-    fleet: Fleet, parts, probe
+    fleet: Fleet, parts, probe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reports = []
+    first, second = fleet.engine("a"), fleet.engine("b")
+    put = second.store.versions.put
 
-    class Slow(SqlStore):
-        """Its version comes to the database after a peer's."""
+    def put_late(*version: Any) -> int:
+        """Store a version after a peer's."""
+        if not reports:
+            reports.append(first.retrain())
+        return put(*version)
 
-        def put_version(self, *version: Any) -> int:
-            if not reports:
-                reports.append(first.retrain())
-            return super().put_version(*version)
-
-    first, second = fleet.engine("a"), fleet.engine("b", store=fleet.store("b", kind=Slow))
+    monkeypatch.setattr(second.store.versions, "put", put_late)
     learn(first, parts, range(15))
     reports.append(second.retrain())
     assert [report.version for report in reports] == [1, 2]
@@ -249,12 +248,16 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
 ) -> None:
     first, second = taught(fleet, parts, 90)
     wrong, *gone = [past.decision.id for past in first.history() if past.success is not None][20:24]
-    first.correct(wrong, not first.store.get_decision(wrong).success)
+    first.correct(wrong, not first.store.decisions.get(wrong).success)
     first.forget(*gone)
     second.poll()
     assert first.version == second.version > 0
     assert counts(first, probe) == counts(second, probe)
-    assert len(first.model.index) == len(second.model.index) == len(first.store.labelled().seq)
+    assert (
+        len(first.model.index)
+        == len(second.model.index)
+        == len(first.store.labels.with_traces().seq)
+    )
     assert second.state.new_labels == first.state.new_labels
     results = [verify_history(fleet.url, engine.store.cell_id) for engine in (first, second)]
     assert [report.faults for report in results] == [(), ()]
@@ -299,15 +302,15 @@ def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Data
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
     learn(first, parts, range(120))
     learn(second, parts, range(120, 160))
-    evidence = [len(engine.store.outcomes_since(0)) for engine in (first, second)]
-    assert evidence == [engine.store.status()["labels"] for engine in (first, second)]
+    evidence = [len(engine.store.labels.outcomes_since(0)) for engine in (first, second)]
+    assert evidence == [engine.store.decisions.counts()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
-    assert first.store.tally().outcomes != second.store.tally().outcomes
+    assert first.store.decisions.tally().outcomes != second.store.decisions.tally().outcomes
     assert (
         rule(second)["evidence.level_totals"]
         != rule(fleet.engine("c", recipe=POOLED))["evidence.level_totals"]
     )
-    assert second.store.get_decision("nobody") is None
+    assert second.store.decisions.get("nobody") is None
 
 
 def test_a_peers_version_leaves_the_rule_as_it_was(fleet: Fleet, parts: Dataset) -> None:
@@ -345,11 +348,13 @@ def test_nothing_is_mixed_between_products_and_cells_without(
     assert predictions(cells["d"], probe) == predictions(alone, probe)
     rows = {name: np.arange(i, 120, 4) for i, name in enumerate("abcd")}
     for name, kin in {"a": "ab", "b": "ab", "c": "c", "d": "d"}.items():
-        labelled = cells[name].store.labelled()
+        labelled = cells[name].store.labels.with_traces()
         theirs = {parts.X[i].tobytes() for other in kin for i in rows[other]}
         assert {trace.tobytes() for trace in labelled.traces} <= theirs
         assert labelled.seq.tolist() == list(range(1, len(labelled.seq) + 1))
-        assert len(labelled.seq) == sum(cells[other].store.status()["labels"] for other in kin)
+        assert len(labelled.seq) == sum(
+            cells[other].store.decisions.counts()["labels"] for other in kin
+        )
 
 
 def test_label_numbers_are_unique_and_increase_over_the_product(
@@ -365,29 +370,31 @@ def test_label_numbers_are_unique_and_increase_over_the_product(
                 range(4),
             )
         )
-    assert [engine.store.status()["labels"] for engine in fleet.opened] == [25] * 4
-    seen = fleet.opened[0].store.labelled()
+    assert [engine.store.decisions.counts()["labels"] for engine in fleet.opened] == [25] * 4
+    seen = fleet.opened[0].store.labels.with_traces()
     assert seen.seq.tolist() == list(range(1, 101))
     assert {trace.tobytes() for trace in seen.traces} == {x.tobytes() for x in parts.X[:100]}
 
 
-class ShakyStore(SqlStore):
-    """A store that cannot be asked for news while `lost`, and counts how often it was."""
+class ShakyNews:
+    """News of a product that cannot be asked for while `lost`; counts how often it was."""
 
-    lost, asked = False, 0
+    def __init__(self, labels: LabelTable) -> None:
+        self.lost, self.asked, self._news_since = False, 0, labels.news_since
+        labels.news_since = self
 
-    def news_since(self, seq: int, limit: int) -> Any:
+    def __call__(self, seq: int, limit: int) -> Any:
         self.asked += 1
         if self.lost:
             raise StoreError("The connection is gone.")
-        return super().news_since(seq, limit)
+        return self._news_since(seq, limit)
 
 
 def test_a_cell_without_news_goes_on_and_says_so_once(
     fleet: Fleet, parts: Dataset, probe: np.ndarray, caplog
 ) -> None:
-    shaky = fleet.store("b", kind=ShakyStore)
-    first, second = fleet.engine("a"), fleet.engine("b", store=shaky)
+    first, second = fleet.engine("a"), fleet.engine("b")
+    shaky = ShakyNews(second.store.labels)
     learn(first, parts, range(30))
     second.poll()
     asked = shaky.asked
@@ -462,11 +469,11 @@ def test_a_cell_keeps_its_product_and_one_that_worked_alone_joins_none(
 
 def test_questions_about_a_product_go_down_an_index(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db"), "a", product="gear") as store:
-        store.put_version(RetrainReport(1, 0.1, 10, 1, True, ""), 0, {"w": np.ones(3)})
+        store.versions.put(RetrainReport(1, 0.1, 10, 1, True, ""), 0, {"w": np.ones(3)})
         with plans(tmp_path / "a.db") as result:
-            store.news_since(5, 10)
-            store.load_version(1)
-            store.corrections(1)
+            store.labels.news_since(5, 10)
+            store.versions.load(1)
+            store.corrections.after(1)
     assert len(result) >= 7
     tables = ("label", "trace", "model_version", "decision", "correction")
     for statement, plan in result:
@@ -490,7 +497,7 @@ def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> Non
         "ab", f"gear-{fleet.tag}"
     ) | {"d": None}
     assert (result["a"].decisions, result["b"].decisions) == (30, 0)
-    assert result["a"].labels == fleet.opened[0].store.status()["labels"]
+    assert result["a"].labels == fleet.opened[0].store.decisions.counts()["labels"]
     assert (result["a"].version, result["b"].version, result["d"].version) == (1, 1, None)
     assert result["a"].last_seen is not None
     assert result["b"].last_seen is None
@@ -529,7 +536,11 @@ def test_every_verb_that_names_a_store_names_a_cell(
     ]
     assert cell[:10] in succeed("status", fleet.url)
     with SqlStore(fleet.url, peer) as store:
-        assert len(store.labelled().seq) > len(store.labelled(cell_only=True).seq) > 0
+        assert (
+            len(store.labels.with_traces().seq)
+            > len(store.labels.with_traces(cell_only=True).seq)
+            > 0
+        )
 
 
 @pytest.mark.parametrize("verb", ["status", "export"])

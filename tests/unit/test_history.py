@@ -37,7 +37,8 @@ def store(store: SqlStore) -> SqlStore:
     tenth; two events.
     """
     seconds = count(1000)
-    store.clock = lambda: float(next(seconds) // 3)
+    # Each record asks twice: for itself, and for the ledger.
+    store.clock = store.database.clock = lambda: float(next(seconds) // 6)
     rng = np.random.default_rng(0)
     for i in range(N):
         action, predicted, reason, audit = KINDS[int(rng.integers(len(KINDS)))]
@@ -74,13 +75,13 @@ def store(store: SqlStore) -> SqlStore:
                 np.ones(2, np.float32),
             )
         if i % 10 == 9:
-            store.put_version(
+            store.versions.put(
                 RetrainReport(i // 10 + 1, 0.1, i, 3, True, "accepted"),
                 i // 2,
                 {"w": np.full(3, i)},
             )
-    store.put_event("safe mode", "too many traces were novel")
-    store.put_event("safe mode ended", "fresh evidence keeps the tolerance")
+    store.events.put("safe mode", "too many traces were novel")
+    store.events.put("safe mode ended", "fresh evidence keeps the tolerance")
     return store
 
 
@@ -114,7 +115,11 @@ def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch: pytest.Mo
             zip(ids, times, strict=True)
         )
     assert [past.decision.id for past in history(store, last=2, since=2.0)] == ["d0", "d2"]
-    assert (store.unreported_accepts(), store.tally(2).count(), store.tally(2).last) == (
+    assert (
+        store.decisions.unreported_accepts(),
+        store.decisions.tally(2).count(),
+        store.decisions.tally(2).last,
+    ) == (
         ids,
         2,
         7.0,
@@ -153,7 +158,7 @@ def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
     whole = everything(store)
     for last in (None, 1, 10, 59, 500):
         some = whole if last is None else whole[-last:]
-        result = store.tally(last)
+        result = store.decisions.tally(last)
         kinds = Counter(
             (
                 *(getattr(p.decision, name) for name in KIND),
@@ -190,15 +195,15 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore, n: int) 
     whole = everything(store)
     length = max(1, -(-N // n))
     expected = [counted(whole[start : start + length]) for start in range(0, N, length)]
-    assert store.stretches(n) == expected
+    assert store.decisions.stretches(n) == expected
     shifts = [[item for item in whole if item.time // (10.0 * n) == k] for k in range(N)]
-    assert store.stretches(seconds=10.0 * n) == [counted(item) for item in shifts if item]
+    assert store.decisions.stretches(seconds=10.0 * n) == [counted(item) for item in shifts if item]
     for batch, name in (
         ("5", lambda part: part[:5]),
         ("-/", lambda part: part[: part.rindex("-") + 1]),
     ):
         sizes = Counter(name(item.decision.part) for item in whole)
-        assert {item.batch: item.n for item in store.stretches(batch=batch)} == sizes
+        assert {item.batch: item.n for item in store.decisions.stretches(batch=batch)} == sizes
 
 
 def test_an_empty_store_has_no_past() -> None:
@@ -206,19 +211,19 @@ def test_an_empty_store_has_no_past() -> None:
     assert (
         everything(empty)
         == list(history(empty, last=5))
-        == empty.stretches(10)
-        == empty.past_labels(0)
+        == empty.decisions.stretches(10)
+        == empty.labels.past(0)
         == []
     )
-    assert (empty.tally().count(), empty.tally().first) == (0, None)
+    assert (empty.decisions.tally().count(), empty.decisions.tally().first) == (0, None)
 
 
 def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlStore) -> None:
-    every = store.past_labels(0)
+    every = store.labels.past(0)
     assert [label.seq for label in every] == list(range(1, len(every) + 1))
-    assert [label.seq for label in store.past_labels(3, 7)] == [4, 5, 6, 7]
+    assert [label.seq for label in store.labels.past(3, 7)] == [4, 5, 6, 7]
     assert all(label.point == pytest.approx(np.ones(2)) for label in every)
-    expected = store.outcomes_since(0)
+    expected = store.labels.outcomes_since(0)
     answers = [label for label in every if not label.quarantined]
     assert [(label.seq, label.novel) for label in answers] == [
         (item.seq, item.novel) for item in expected
@@ -242,7 +247,7 @@ def test_retrains_and_events_are_those_of_the_time_that_is_asked_for(store: SqlS
 def test_a_page_is_read_along_the_index_and_no_trace_is(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "engine.db")) as opened, plans(tmp_path / "engine.db") as result:
         for newest in (True, False):
-            opened.decisions(HistoryFilter(action=Action.ACCEPT), 50, "d1", newest)
+            opened.decisions.select(HistoryFilter(action=Action.ACCEPT), 50, "d1", newest)
     assert len(result) == 2
     for statement, plan in result:
         assert "trace" not in statement

@@ -81,7 +81,7 @@ def test_a_store_that_was_passed_open_stays_open_and_gives_the_cell_up(
             import_journal(opened, tmp_path / "none.csv")
         assert import_journal(opened, journal).imported == 20
         assert import_journal(opened, journal).repeated == 20
-        assert len(opened.labelled().labels) == 220
+        assert len(opened.labels.with_traces().labels) == 220
         with DataEngine.open(opened) as engine:
             assert engine.retrain().n_traces == 220
 
@@ -120,8 +120,14 @@ def test_a_journal_brings_bounds_parts_and_sources(
             (0, 0, n) if again else (n, 0, 0)
         )
         with DataEngine.open(path) as engine:
-            records, last = engine.store.outcomes_since(200), engine.store.labelled(n)
-            outcomes, sources = engine.store.tally().outcomes, engine.store.status()["sources"]
+            records, last = (
+                engine.store.labels.outcomes_since(200),
+                engine.store.labels.with_traces(n),
+            )
+            outcomes, sources = (
+                engine.store.decisions.tally().outcomes,
+                engine.store.decisions.counts()["sources"],
+            )
             members = engine.model.rule.state_dict()["evidence.level_totals"].clone()
         lower, success = (
             [0.25, 0.925, 0.9375, 0.9375, 0.9375, 0.0],
@@ -164,10 +170,10 @@ def test_a_journal_that_grew_adds_what_is_new(
         for n in cuts:
             import_journal(path, write_lines(tmp_path / "cell.csv", X, CELL[:n]))
         with DataEngine.open(path) as engine:
-            records = engine.store.outcomes_since(200)
+            records = engine.store.labels.outcomes_since(200)
             result[len(cuts)] = (
                 [(item.lower, item.silent) for item in records],
-                engine.store.tally().outcomes,
+                engine.store.decisions.tally().outcomes,
             )
             engine.decide(X[0])
             engine.report(
@@ -219,7 +225,7 @@ def test_late_labels_are_imported_once_by_their_own_ids(
             (0, 4, 0) if again else (4, 0, 0)
         )
     with DataEngine.open(path) as engine:
-        stored = [engine.store.get_decision(f"a-{i}") for i in range(1, 7)]
+        stored = [engine.store.decisions.get(f"a-{i}") for i in range(1, 7)]
         assert [records and records.success for records in stored] == [
             True,
             False,
@@ -228,7 +234,7 @@ def test_late_labels_are_imported_once_by_their_own_ids(
             True,
             None,
         ]
-        outcomes = engine.store.tally().outcomes
+        outcomes = engine.store.decisions.tally().outcomes
         assert (outcomes.accepted, outcomes.false_accepts, outcomes.confirmed) == (3, 1, 2)
     contrary = write_lines(
         tmp_path / "contrary.csv", X, [line.replace("label,a-5,1", "label,a-5,0") for line in LATE]

@@ -20,11 +20,11 @@ from tests.support.stores import decision, execute, report
 
 def put(store: SqlStore, versions: int) -> None:
     for version in range(1, versions + 1):
-        store.put_version(report(version), version, {"w": np.full(20, version, np.float32)})
+        store.versions.put(report(version), version, {"w": np.full(20, version, np.float32)})
 
 
 def kept(store: SqlStore) -> list[int]:
-    return [row.report.version for row in store.versions() if row.kept]
+    return [row.report.version for row in store.versions.all() if row.kept]
 
 
 def test_the_newest_the_first_and_ever_fewer_of_the_older_ones_keep_their_states(
@@ -49,7 +49,7 @@ def test_a_new_state_takes_the_room_of_those_that_are_not_kept_any_more(tmp_path
     state = np.random.default_rng(0).random(2**17)  # 1 MiB
     with SqlStore(str(file), keep_versions=2) as store:
         for version in range(1, 10):
-            store.put_version(report(version), version, {"w": state})
+            store.versions.put(report(version), version, {"w": state})
         assert kept(store) == [1, 8, 9]
     assert 3 * 2**20 < file.stat().st_size < 3.6 * 2**20
 
@@ -75,28 +75,28 @@ def test_traces_fill_the_pages_of_a_file(samples: int, tmp_path: Path) -> None:
 def test_a_version_is_loaded_by_its_number(store: SqlStore) -> None:
     put(store, 12)
     for version in (1, 10, 12):
-        result = store.load_version(version)
+        result = store.versions.load(version)
         assert (result.version, result.last_seq, result.state["w"].tolist()) == (
             version,
             version,
             [float(version)] * 20,
         )
     result.state["w"][:] = 0  # an array of its own
-    assert store.load_version(12).state["w"][0] == 12
+    assert store.versions.load(12).state["w"][0] == 12
     for version in (2, 13, 0):
         with pytest.raises(
             StoreError,
             match=rf"got {version}, which is not kept; load one of these: 1, 8, 9, 10, 11, 12",
         ):
-            store.load_version(version)
+            store.versions.load(version)
 
 
 def test_every_retrain_is_listed_for_ever(store: SqlStore) -> None:
     with pytest.raises(StoreError, match="load one of these: none"):
-        store.load_version(1)
+        store.versions.load(1)
     put(store, 7)
-    store.put_version(report(7, accepted=False), 9, None)
-    rows = store.versions()
+    store.versions.put(report(7, accepted=False), 9, None)
+    rows = store.versions.all()
     listed = [(row.report.version, row.report.accepted, row.kept) for row in rows]
     kept_ones = [(version, True, version != 2) for version in range(1, 8)]
     assert listed == [*kept_ones, (7, False, False)]
@@ -145,7 +145,7 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
         assert (
             engine.report(decision.id, True).version == 4
         )  # with the labels that came after version 2
-        assert [event.kind for event in engine.store.events()] == ["damaged"]
+        assert [event.kind for event in engine.store.events.newest()] == ["damaged"]
     with DataEngine.open(str(file)) as engine:
         assert engine.version == 4
 
@@ -164,6 +164,6 @@ def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damage
     execute(file, "UPDATE trace SET data = zeroblob(400) WHERE rowid = 7")
     with DataEngine.open(str(file), model=AgreeingNeighbours(Policy(0.1, 0.9))) as engine:
         assert (engine.version, engine.model) == (0, None)
-        assert [event.kind for event in engine.store.events()] == ["damaged"]
+        assert [event.kind for event in engine.store.events.newest()] == ["damaged"]
         engine.report(engine.decide(data.X[60]).id, bool(data.y[60]))
         assert engine.version == 2

@@ -112,14 +112,14 @@ def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
             with pytest.raises(TraceError, match="part's number"):
                 call(part=part)
     engine.flush()
-    assert engine.store.status()["decisions"] == 0
+    assert engine.store.decisions.counts()["decisions"] == 0
     engine.report("lost-1", False, trace=x[0])
     decision = engine.decide(x[1])
     for value in NONE:
         with pytest.raises(ReportError):
             engine.report(decision.id, value)
     engine.report(decision.id, 1)
-    assert engine.store.status()["sources"] == {
+    assert engine.store.decisions.counts()["sources"] == {
         "verification": 1,
         "audit": 0,
         "stop": 1,
@@ -149,9 +149,9 @@ def test_a_check_that_answers_no_label_ends_the_run_and_its_decision_is_kept(
     with pytest.raises(ReportError, match=r"of decision \S+, by verify\(\)") as caught:
         list(engine.run(cell, 5))
     id_ = re.search(r"of decision (\S+),", str(caught.value))[1]
-    assert engine.store.status()["decisions"] == 1
+    assert engine.store.decisions.counts()["decisions"] == 1
     engine.report(id_, True)  # what it really was, once somebody has looked
-    assert engine.store.status()["labels"] == 1
+    assert engine.store.decisions.counts()["labels"] == 1
 
 
 @pytest.mark.parametrize("answer", ["STOP", None, True, 0])
@@ -188,5 +188,5 @@ def test_a_baseline_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(
             decision = engine.decide(x)
             engine.report(decision.id, y)
         assert (decision.action, decision.reason) == (Action.VERIFY, Reason.MODEL_ERROR)
-        assert engine.store.status()["labels"] == 6
+        assert engine.store.decisions.counts()["labels"] == 6
         assert engine.state.store_fault == ""

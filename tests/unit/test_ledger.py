@@ -40,7 +40,7 @@ def write(store: SqlStore, n: int = 12) -> SqlStore:
     """Something in every table, in entries of one row and of many."""
     rng = np.random.default_rng(0)
     traces = rng.normal(size=(n, 1, T)).astype(np.float32)
-    store.save_settings({"recipe": "a = 1", "trace": "{}"})
+    store.settings.save({"recipe": "a = 1", "trace": "{}"})
     for i in range(n):
         put_decision(store, replace(decision(f"d{i}"), part=f"SN-{i}"), traces[i], i - 3, i == 5)
     store.flush()
@@ -59,14 +59,16 @@ def write(store: SqlStore, n: int = 12) -> SqlStore:
     )
     store.apply_records([record for pair in imported for record in pair])
     for version in (1, 2):
-        store.put_version(report(version), 5, {"w": rng.normal(size=40)})
-    store.put_version(report(2, accepted=False), 6, None)
-    store.save_settings({"recipe": "a = 2", "trace": "{}"})
-    store.put_event("note", "Prüfung wörtlich")
-    store.apply_change(
+        store.versions.put(report(version), 5, {"w": rng.normal(size=40)})
+    store.versions.put(report(2, accepted=False), 6, None)
+    store.settings.save({"recipe": "a = 2", "trace": "{}"})
+    store.events.put("note", "Prüfung wörtlich")
+    store.corrections.apply(
         Change("correct", "no success", {"decisions": ["d6"]}, "kim", ("d6",), False)
     )
-    store.apply_change(Change("forget", "forgotten", {"decisions": ["d7"]}, "kim", ("d7",), None))
+    store.corrections.apply(
+        Change("forget", "forgotten", {"decisions": ["d7"]}, "kim", ("d7",), None)
+    )
     return store
 
 
@@ -102,9 +104,9 @@ def test_every_transaction_is_an_entry_and_an_empty_one_or_one_that_fails_is_non
     with SqlStore(*place) as store:
         store.flush()
         with pytest.raises(StoreError):
-            store.save_settings({"recipe": None})
+            store.settings.save({"recipe": None})
         puts = [
-            lambda: store.put_event("note", "one"),
+            lambda: store.events.put("note", "one"),
             lambda: put_decision(store, decision("a"), np.zeros(T, np.float32), 1, False),
             lambda: put_label(store, "a", True, Source.VERIFICATION, 0, None),
         ]
@@ -151,7 +153,7 @@ def test_a_running_engine_does_not_keep_a_check_from_its_work(place: tuple[str, 
 
         def go_on() -> None:
             while not stop.is_set():
-                store.put_event("note", "meanwhile")
+                store.events.put("note", "meanwhile")
 
         thread = threading.Thread(target=go_on)
         thread.start()
@@ -292,7 +294,7 @@ def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere
 ) -> None:
     kept = verify_history(str(file)).cells[0].digest
     with SqlStore(str(file)) as store:
-        store.put_event("note", "later")
+        store.events.put("note", "later")
     assert verify_history(str(file), expect=kept[:12]).ok
     for _ in range(2):
         cut_off(file)
@@ -376,21 +378,21 @@ def test_what_is_no_store_is_refused_and_nothing_is_made(
 
 def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file: Path) -> None:
     with SqlStore(str(file)) as store:
-        whole = store.labelled()
+        whole = store.labels.with_traces()
     changed = "UPDATE trace SET data = zeroblob(800) WHERE decision_id = 'd3'"
     execute(file, changed, "DELETE FROM trace WHERE decision_id = 'd4'")
     with SqlStore(str(file)) as store:
         for _ in range(2):
-            result, kept = store.labelled(), ~np.isin(whole.seq, [4, 5])
+            result, kept = store.labels.with_traces(), ~np.isin(whole.seq, [4, 5])
             for name in ("seq", "traces", "labels", "hashes"):
                 np.testing.assert_array_equal(getattr(result, name), getattr(whole, name)[kept])
-        (answer,) = (event.text for event in store.events() if event.kind == "damaged")
+        (answer,) = (event.text for event in store.events.newest() if event.kind == "damaged")
         assert "decision d3, d4" in answer
         with pytest.raises(StoreError, match=r"'d3'.*bytes have changed"):
-            store.get_decision("d3")
+            store.decisions.get("d3")
     execute(file, "UPDATE trace SET data = zeroblob(800)")
     with SqlStore(str(file)) as store:
-        assert len(store.labelled().seq) == len(store.labelled().traces) == 0
+        assert len(store.labels.with_traces().seq) == len(store.labels.with_traces().traces) == 0
 
 
 def verb(*words: object) -> tuple[int, str]:

@@ -246,7 +246,7 @@ def test_a_version_that_could_not_be_opened_or_answers_otherwise_is_dropped_and_
 ) -> None:
     with taught(reducer_of(network), tmp_path / "cell.db") as engine:
         assert engine.version == 0
-        assert all(reason in report.reason for report in engine.store.retrains())
+        assert all(reason in report.reason for report in engine.store.versions.retrains())
         assert reason in engine.status().alarm
     with DataEngine.open(tmp_path / "cell.db", reducer=reducer_of(network)) as engine:
         assert engine.decide(toy_traces(1)[0][0]).action == "verify"

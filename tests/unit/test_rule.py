@@ -167,7 +167,7 @@ def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(
         cycles = list(engine.run(ReplayCell(data), 100))
         assert {c.decision.action for c in cycles} == {Action.VERIFY}
         assert {c.decision.reason for c in cycles[41:]} == {"model_error"}
-        assert len(engine.store.labelled().labels) == 100
+        assert len(engine.store.labels.with_traces().labels) == 100
         assert engine.version == 2
     with DataEngine.open(url, allow_import=True) as engine:
         assert engine.decide(good(data)).action is Action.VERIFY

@@ -44,7 +44,7 @@ def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
     )
     assert engine.recipe == expected
     assert engine.policy is engine.recipe.policy
-    assert engine.store.settings()["recipe"] == expected.to_toml()
+    assert engine.store.settings.read()["recipe"] == expected.to_toml()
 
 
 class Halves:
@@ -79,7 +79,7 @@ def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store
     for begin in (DataEngine, DataEngine.open_or_create):
         with pytest.raises(SettingError, match=words):
             begin(store=tmp_path / "engine.db", **given)
-    assert DataEngine("pca", store=tmp_path / "engine.db").store.settings()
+    assert DataEngine("pca", store=tmp_path / "engine.db").store.settings.read()
 
 
 def test_the_loops_settings_and_those_of_a_policy_that_are_no_rule_count_for_a_baseline_too(
@@ -90,7 +90,7 @@ def test_the_loops_settings_and_those_of_a_policy_that_are_no_rule_count_for_a_b
     with DataEngine(policy=policy, **given) as engine:
         assert engine.policy == policy
         assert (engine.recipe.retrain_every, engine.recipe.budget) == (7, 0.2)
-        assert engine.store.settings()["model"] == "Counting"
+        assert engine.store.settings.read()["model"] == "Counting"
     with pytest.raises(SettingError, match=r"\(label_within 200\), got label_within 300"):
         DataEngine.open_or_create(policy=replace(policy, label_within=300), **given)
     with DataEngine.open_or_create(policy=replace(policy, shadow=True), **given) as engine:
@@ -102,7 +102,7 @@ def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None
     for start in (0, 50, 100):
         with DataEngine.open_or_create(url, reducer="pca", policy=POLICY, radius=0.5) as engine:
             assert engine.resumed is (start > 0)
-            assert engine.store.status()["decisions"] == start
+            assert engine.store.decisions.counts()["decisions"] == start
             drive(engine, data, start, start + 50)
     assert DataEngine.open(url).version > 0
 
@@ -165,7 +165,9 @@ def test_a_store_keeps_the_rate_that_it_holds(make_data, tmp_path: Path) -> None
     DataEngine("pca", store=url).close()
     old = '{"samples": 100, "rate_hz": 500.0, "channels": 1, "unit": "N", "limit": null, "columns": []}'
     with DataEngine.open(url) as engine:
-        engine.store.save_settings(engine.store.settings() | {"trace": old, "inferred": "true"})
+        engine.store.settings.save(
+            engine.store.settings.read() | {"trace": old, "inferred": "true"}
+        )
     with DataEngine.open_or_create(url, trace=TraceSpec(100)) as engine:
         engine.decide(data.X[0])
         assert engine.trace == TraceSpec(100, 500.0, unit="N")
@@ -180,7 +182,7 @@ def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stat
     limited = Recipe("pca", policy=Policy(windows=("0.02:0.1::1e9",)))
     DataEngine("pca", store=url).close()
     with DataEngine.open(url) as engine:
-        engine.store.save_settings(engine.store.settings() | {"recipe": limited.to_toml()})
+        engine.store.settings.save(engine.store.settings.read() | {"recipe": limited.to_toml()})
     for begin in (DataEngine.open, DataEngine.open_or_create):
         with pytest.raises(SettingError, match="Expected the rate of the traces"):
             begin(url)
@@ -305,7 +307,7 @@ def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was
     for steps in (1, 3):
         engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
         drive(engine, data, 0, 60)
-        assert {r.n_steps for r in engine.store.retrains()} == {steps}
+        assert {r.n_steps for r in engine.store.versions.retrains()} == {steps}
     ticks = count()
     engine = DataEngine(
         "conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks))

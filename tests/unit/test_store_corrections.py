@@ -30,19 +30,19 @@ def fill(store: SqlStore, n: int = 5) -> None:
 
 def correct(store: SqlStore, success: bool | None, *names: str, author: str = "kim") -> int:
     kind = "forget" if success is None else "correct"
-    return store.apply_change(
+    return store.corrections.apply(
         Change(kind, f"{kind} {', '.join(names)}", {"names": list(names)}, author, names, success)
     )
 
 
 def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: SqlStore) -> None:
     fill(store, 3)
-    store.put_event("note", "before")
+    store.events.put("note", "before")
     assert correct(store, False, "2", "0", author="kim") == 2
     put(store, "late")
     put_labels(store, label("late"))
     assert correct(store, None, "late", author="") == 3
-    result = store.corrections()
+    result = store.corrections.after()
     assert [
         (c.number, c.decision_id, c.success, c.author, c.event, c.newest_seq, c.seq) for c in result
     ] == [
@@ -50,12 +50,12 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store: 
         (2, "0", False, "kim", 2, 3, 1),
         (3, "late", None, "", 3, 4, 4),
     ]
-    assert [c.number for c in store.corrections(2)] == [3]
+    assert [c.number for c in store.corrections.after(2)] == [3]
     correct(store, False, "late")
-    assert [c.was for c in store.corrections()] == [True, True, True, None]
-    event = store.events()[1]
+    assert [c.was for c in store.corrections.after()] == [True, True, True, None]
+    event = store.events.newest()[1]
     assert (event.kind, event.data, event.author) == ("correct", {"names": ["2", "0"]}, "kim")
-    assert (store.events()[0].data, store.events()[0].author) == (None, "")
+    assert (store.events.newest()[0].data, store.events.newest()[0].author) == (None, "")
 
 
 @pytest.mark.parametrize(
@@ -66,21 +66,25 @@ def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is
 ) -> None:
     fill(store, 2)
     put(store, "open")
-    store.save_settings({"a": "1"})
+    store.settings.save({"a": "1"})
     with pytest.raises(ReportError, match=text):
-        store.apply_change(
+        store.corrections.apply(
             Change("correct", "", decisions=("0", name), success=False, settings={"a": "2"})
         )
-    assert (store.events(), store.corrections(), store.settings()) == ([], [], {"a": "1"})
-    assert store.labelled().labels.tolist() == [1, 0]
+    assert (store.events.newest(), store.corrections.after(), store.settings.read()) == (
+        [],
+        [],
+        {"a": "1"},
+    )
+    assert store.labels.with_traces().labels.tolist() == [1, 0]
 
 
 def test_an_event_a_version_and_settings_are_kept_together(store: SqlStore) -> None:
     report = RetrainReport(1, 0.0, 2, 0, True, "rolled back")
-    store.apply_change(
+    store.corrections.apply(
         Change("rollback", "to 1", version=(report, 7, {"w": np.ones(2)}), settings={"b": "2"})
     )
-    assert (store.retrains(), store.settings(), store.last_version().last_seq) == (
+    assert (store.versions.retrains(), store.settings.read(), store.versions.newest().last_seq) == (
         [report],
         {"b": "2"},
         7,
@@ -89,8 +93,8 @@ def test_an_event_a_version_and_settings_are_kept_together(store: SqlStore) -> N
 
 def test_an_events_data_that_json_has_not_is_refused(store: SqlStore) -> None:
     with pytest.raises(StoreError, match="as JSON has it"):
-        store.put_event("note", "", {"x": float("nan")})
-    assert store.events() == []
+        store.events.put("note", "", {"x": float("nan")})
+    assert store.events.newest() == []
 
 
 def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(
@@ -109,11 +113,11 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
         put_labels(store, NewLabel(str(i), True, Source.AUDIT, 0, None))
     correct(store, False, "0", "1", "2")
     correct(store, None, "3", "4", "5")
-    o = store.tally().outcomes
+    o = store.decisions.tally().outcomes
     assert (o.accepted, o.false_accepts, o.confirmed, o.forgotten_accepts) == (2, 1, 0, 1)
     assert (o.audited_accepts, o.audited_accepts_bad, o.forgotten_audited_accepts) == (1, 1, 1)
     assert (o.audited_rejects, o.audited_rejects_good, o.forgotten_audited_rejects) == (1, 0, 1)
-    later = store.tally(since_version=1).outcomes
+    later = store.decisions.tally(since_version=1).outcomes
     assert (
         later.accepted,
         later.false_accepts,
@@ -134,8 +138,8 @@ def test_any_corrections_leave_what_plain_python_would(
     store: SqlStore, changes: list[tuple[int, bool | None]]
 ) -> None:
     run = uuid.uuid4().hex[:8]
-    begin = store.status()["labels"] + store.status()["forgotten"]
-    before = len(store.corrections())
+    begin = store.decisions.counts()["labels"] + store.decisions.counts()["forgotten"]
+    before = len(store.corrections.after())
     for i in range(6):
         put(store, f"{run}-{i}")
         put_labels(store, label(f"{run}-{i}", i % 2 == 0))
@@ -144,11 +148,11 @@ def test_any_corrections_leave_what_plain_python_would(
         correct(store, success, f"{run}-{i}")
         now[i] = success
     kept = {begin + 1 + i: success for i, success in now.items() if success is not None}
-    labelled = store.labelled(first=begin + 1)
+    labelled = store.labels.with_traces(first=begin + 1)
     assert dict(zip(labelled.seq.tolist(), labelled.labels.tolist(), strict=True)) == kept
-    assert {item.seq: item.success for item in store.outcomes_since(begin)} == kept
-    assert [store.get_decision(f"{run}-{i}").success for i in range(6)] == list(now.values())
-    as_reported = store.labelled(first=begin + 1, corrected_to=before)
+    assert {item.seq: item.success for item in store.labels.outcomes_since(begin)} == kept
+    assert [store.decisions.get(f"{run}-{i}").success for i in range(6)] == list(now.values())
+    as_reported = store.labels.with_traces(first=begin + 1, corrected_to=before)
     assert as_reported.labels.tolist() == [1, 0, 1, 0, 1, 0]
 
 
@@ -157,8 +161,8 @@ def test_corrections_survive_closing_and_belong_to_their_cell(place: tuple[str, 
         fill(store)
         correct(store, None, "0")
     with SqlStore(*place) as store, SqlStore(place[0], uuid.uuid4().hex) as other:
-        assert store.labelled().seq.tolist() == [2, 3, 4, 5]
-        assert (other.corrections(), other.labelled().seq.tolist()) == ([], [])
+        assert store.labels.with_traces().seq.tolist() == [2, 3, 4, 5]
+        assert (other.corrections.after(), other.labels.with_traces().seq.tolist()) == ([], [])
 
 
 def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(
@@ -168,7 +172,7 @@ def test_the_newest_labels_are_found_along_indexes_where_there_are_corrections(
         fill(store)
         correct(store, None, "0")
         with plans(tmp_path / "a.db") as result:
-            store.labelled(3)
+            store.labels.with_traces(3)
     plan = " | ".join(result[0][1])
     assert "USING INDEX label_training" in plan
     assert "USING INDEX correction_of" in plan or "USING COVERING INDEX correction_of" in plan

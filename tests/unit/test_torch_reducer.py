@@ -175,7 +175,7 @@ def test_an_engine_waits_for_enough_labels_and_drops_no_retrain(tmp_path: Any) -
         reports.append(engine.report(engine.decide(x).id, bool(good)))
     trained_on = [report.n_traces for report in reports if report is not None]
     assert trained_on == [20, 30, 40]
-    assert all(report.accepted for report in engine.store.retrains())
+    assert all(report.accepted for report in engine.store.versions.retrains())
 
 
 def test_grouped_members_compute_what_separate_networks_of_the_same_weights_compute() -> None:

@@ -125,7 +125,10 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
     results = []
     for name in ("imported", "own"):
         with DataEngine.open(tmp_path / f"{name}.db") as engine:
-            records, outcomes = engine.store.outcomes_since(400), engine.store.tally().outcomes
+            records, outcomes = (
+                engine.store.labels.outcomes_since(400),
+                engine.store.decisions.tally().outcomes,
+            )
             rule = {key: value.tolist() for key, value in engine.model.rule.state_dict().items()}
             evidence = [
                 (item.lower, item.upper, item.success, item.novel, item.silent) for item in records
@@ -136,14 +139,16 @@ def test_late_labels_and_stops_count_as_in_the_engine_and_come_into_the_store_as
                 outcomes.audited_accepts,
                 outcomes.audited_accepts_bad,
             )
-            hashes = engine.store.labelled().hashes.tolist()
-            results.append([evidence, rule, engine.store.status()["sources"], hashes, certain])
+            hashes = engine.store.labels.with_traces().hashes.tolist()
+            results.append(
+                [evidence, rule, engine.store.decisions.counts()["sources"], hashes, certain]
+            )
     assert results[0] == results[1]
     with DataEngine.open(tmp_path / "imported.db") as engine:
         labelled = next(
             k for k, d in enumerate(decisions) if k in due[k] and d.action is Action.VERIFY
         )
-        assert engine.store.get_decision(ids[labelled]).success is bool(
+        assert engine.store.decisions.get(ids[labelled]).success is bool(
             y[labelled]
         )  # by the id that the cell answered
 

@@ -150,7 +150,7 @@ def bounds(engine: DataEngine) -> list[tuple[Any, ...]]:
 
 def missing(store: SqlStore, acknowledged: dict[str, bool]) -> int:
     """How many labels a store does not hold as they were acknowledged."""
-    result = {name: store.get_decision(name) for name in acknowledged}
+    result = {name: store.decisions.get(name) for name in acknowledged}
     return sum(
         item is None or item.success is not acknowledged[name] for name, item in result.items()
     )

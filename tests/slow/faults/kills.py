@@ -89,7 +89,7 @@ def cell(
         if locked_after is None
         else sqlite3.connect(place.url, isolation_level=None, timeout=30)
     )
-    _acknowledge(told, "began", engine.store.status()["labels"], engine.version)
+    _acknowledge(told, "began", engine.store.decisions.counts()["labels"], engine.version)
     for n, _ in enumerate(_for_a_while()):
         if other is not None and n == locked_after:
             other.execute("BEGIN IMMEDIATE")
@@ -127,7 +127,11 @@ def serving(place: Place, told: str, seed: int) -> None:
         )
         with closing(service), served(create_app(service, page=False)) as port:
             _acknowledge(
-                told, "began", service.engine.store.status()["labels"], service.engine.version, port
+                told,
+                "began",
+                service.engine.store.decisions.counts()["labels"],
+                service.engine.version,
+                port,
             )
             time.sleep(60)
 
@@ -245,10 +249,10 @@ def check_cell(outcome: Outcome, place: Place, told: list[list[str]], excuse: st
     with DataEngine.open(place.store()) as engine:
         outcome.labels += len(labels)
         outcome.versions += sum(engine.version - int(version) for _, version in began)
-        text = bool(excuse) and any(excuse in event.text for event in engine.store.events())
+        text = bool(excuse) and any(excuse in event.text for event in engine.store.events.newest())
         loss = engine.status().loss
         outcome.must(bool(excuse) or not loss, f"an alarm though nothing was damaged: {loss}")
-        lost, n_stored = missing(engine.store, labels), engine.store.status()["labels"]
+        lost, n_stored = missing(engine.store, labels), engine.store.decisions.counts()["labels"]
         probe = engine.decide(stream().X[-1])
         outcome.lost += 0 if text and lost == 1 else lost
         now = [
@@ -314,10 +318,10 @@ def kill_imports(outcome: Outcome, place: Place, times: int) -> None:
         outcome.labels += done
         try:
             with custom.store() as store:
-                outcome.lost += max(0, done - store.status()["labels"])
+                outcome.lost += max(0, done - store.decisions.counts()["labels"])
             import_labelled(custom.store(), stream(), recipe=RECIPE)
             with custom.store() as store:
-                labels = store.status()["labels"]
+                labels = store.decisions.counts()["labels"]
             outcome.must(labels == n, f"{labels} of {n} labels after the repetition")
         except DengineError as error:
             outcome.tell(error)

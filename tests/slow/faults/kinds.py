@@ -123,7 +123,7 @@ def lost_journal(outcome: Outcome, place: Place) -> None:
             outcome.must(journal.exists(), "the journal was not made anew")
     cell.until_back()
     outcome.must(
-        any("created again" in event.text for event in cell.engine.store.events()),
+        any("created again" in event.text for event in cell.engine.store.events.newest()),
         "nobody was told",
     )
     cell.finish()
@@ -147,7 +147,9 @@ def unstorable(outcome: Outcome, place: Place) -> None:
         cell.until_back()  # a busy machine's store may have been late, too
     finally:
         sa.event.remove(sa.Engine, "before_cursor_execute", refuse)
-    texts = [event.text for event in cell.engine.store.events() if event.kind == "dead letter"]
+    texts = [
+        event.text for event in cell.engine.store.events.newest() if event.kind == "dead letter"
+    ]
     outcome.must(len(texts) == 1 and ODD in texts[0], "the row did not become a dead letter")
     cell.finish()
 
@@ -544,7 +546,7 @@ def flipped_store(outcome: Outcome, place: Place) -> None:
         ):  # else it is refused, and said
             same = bounds(again) == before and not missing(again.store, cell.acknowledged)
             answer = again.state.store_fault or any(
-                event.kind == "damaged" for event in again.store.events()
+                event.kind == "damaged" for event in again.store.events.newest()
             )
             outcome.must(same or bool(answer), f"flip {i}: nobody is told of it")
 
@@ -575,7 +577,7 @@ def put_back(outcome: Outcome, place: Place) -> None:
     cell.play(AFTER)
     cell.finish()
     with DataEngine.open(place.store(), reading=True) as again:
-        kinds = [event.kind for event in again.store.events()]
+        kinds = [event.kind for event in again.store.events.newest()]
         outcome.must(
             kinds.count("lost") == 1,
             f"it was told {kinds.count('lost')} times that the store was cut off",

@@ -101,7 +101,9 @@ def test_a_version_that_took_too_long_to_store_is_not_stored_later(
     cell.until_back()
     cell.engine.flush()
     assert (
-        cell.engine.version == max(kept.version for kept in cell.engine.store.retrains()) == before
+        cell.engine.version
+        == max(kept.version for kept in cell.engine.store.versions.retrains())
+        == before
     )
     cell.finish()
     assert cell.outcome.wrong == 0, cell.outcome.told
@@ -243,9 +245,12 @@ def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its
         for _ in range(2):  # the same again is taken, and counts once
             assert store.apply_records([first]) == []
         assert store.apply_records([other, replace(label, time=5.0, decided=other.time)]) == []
-        assert (store.get_decision("part 7").success, store.status()["labels"]) == (None, 0)
-        texts = [event.text for event in store.events()]
-        assert [event.kind for event in store.events()] == ["dead letter", "dead letter"]
+        assert (store.decisions.get("part 7").success, store.decisions.counts()["labels"]) == (
+            None,
+            0,
+        )
+        texts = [event.text for event in store.events.newest()]
+        assert [event.kind for event in store.events.newest()] == ["dead letter", "dead letter"]
         assert "data" in texts[0]
         assert "another decision" in texts[1]
         for _ in range(2):
@@ -255,4 +260,4 @@ def test_what_a_journal_holds_of_another_decision_of_an_id_is_set_aside_with_its
         assert (
             store.apply_records([replace(label, time=7.0, decided=first.time, success=True)]) == []
         )
-        assert "a second label" in store.events()[-1].text
+        assert "a second label" in store.events.newest()[-1].text

@@ -213,8 +213,8 @@ class Cell:
     def decisions(self) -> dict[str, str]:
         store = self.service.submit(lambda engine: (engine.flush(), engine.store)[1]).result(60)
         results = [
-            store.get_decision(decision.decision.id)
-            for decision in store.decisions(HistoryFilter(), 10**6)
+            store.decisions.get(decision.decision.id)
+            for decision in store.decisions.select(HistoryFilter(), 10**6)
         ]
         return {
             decision.decision.id: repr(decision) + decision.trace.tobytes().hex()

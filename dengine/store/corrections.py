@@ -1,0 +1,167 @@
+"""`CorrectionTable`: corrections of labels, and the other changes that people make, each with its
+event. `SqlStore` has one.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import sqlalchemy as sa
+
+from ..errors import StoreError
+from .connections import Database
+from .queries import CORRECTION_OF_LABEL, WITH_LABELS, corrected_label
+from .records import (
+    FORGOTTEN,
+    Change,
+    Correction,
+    Event,
+    from_row,
+    new_event,
+    nothing_to_correct,
+    to_row,
+    unknown_decision,
+)
+from .schema import CORRECTION, DECISION, EVENT, LABEL
+from .settings import SettingTable
+from .versions import VersionTable
+
+
+class CorrectionTable:
+    """Commits changes of people, and reads the corrections of labels.
+
+    Parameters
+    ----------
+    database : Database
+    settings : SettingTable
+    versions : VersionTable
+    """
+
+    def __init__(self, database: Database, settings: SettingTable, versions: VersionTable) -> None:
+        self._database = database
+        self._scope = database.scope
+        self._settings = settings
+        self._versions = versions
+
+    def apply(self, change: Change) -> int:
+        """Commit a person's change and its event in one transaction; return the event's number.
+
+        The change may correct or forget labels, store a version, and replace the settings. If one
+        part fails, nothing is written.
+
+        Raises
+        ------
+        ReportError
+            For a decision that is unknown or has no label.
+        SettingError
+            If a peer's settings contradict the new ones.
+        StoreError
+            For data that JSON does not have, for a setting that is the store's own, for a version
+            without arrays, if a peer of the product stored a version meanwhile, and if the database
+            fails.
+        """
+        now = float(self._database.clock())
+        event = new_event(change.kind, change.text, now, change.data, change.author)
+        version = None if change.version is None else self._versions.row(*change.version, now)
+
+        def add_rows(connection: sa.Connection) -> int:
+            """Insert the event and everything that it changes; return the event's number."""
+            labels = self._labels_to_correct(connection, change.decisions)
+            number = self.insert(connection, event, change.success, labels)
+            if version is not None:
+                stored = self._versions.insert(connection, version)
+                if stored != version["version"]:
+                    expected = f"version {version['version']} to be the next"
+                    raise StoreError(
+                        f"Expected {expected}, a peer of the product stored {stored - 1} "
+                        "meanwhile; try it again."
+                    )
+            if change.settings is not None:
+                self._settings.replace(connection, change.settings)
+            return number
+
+        return self._database.write(add_rows)
+
+    def _labels_to_correct(
+        self, connection: sa.Connection, ids: Sequence[str]
+    ) -> dict[str, bool | None]:
+        """Return the present label of each of these decisions; None if it was forgotten.
+
+        Raise ReportError for a decision that is unknown or has no label.
+        """
+        stored = self.stored_labels(connection, ids)
+        for id_ in ids:
+            if id_ not in stored:
+                raise unknown_decision(id_)
+            if stored[id_].corrected is None:
+                raise nothing_to_correct(id_)
+        labels = {0: False, 1: True, FORGOTTEN: None}
+        return {id_: labels[stored[id_].corrected] for id_ in ids}
+
+    def after(self, after: int = 0) -> list[Correction]:
+        """Return corrections of labels, oldest first, also those that a later one replaced.
+
+        Parameters
+        ----------
+        after : int, default 0
+            Only those after this number.
+
+        Returns
+        -------
+        list of Correction
+            Of all cells of the product.
+        """
+        query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(
+            CORRECTION.join(LABEL, CORRECTION_OF_LABEL)
+        )
+        query = query.where(
+            self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after)
+        )
+        return [
+            from_row(Correction, row._mapping)
+            for row in self._database.read(query.order_by(CORRECTION.c.number))
+        ]
+
+    def insert(
+        self,
+        connection: sa.Connection,
+        event: Event,
+        success: bool | None,
+        labels: Mapping[str, bool | None],
+    ) -> int:
+        """Insert an event and the corrections that it records, in a write transaction.
+
+        Parameters
+        ----------
+        connection : sqlalchemy.Connection
+        event : Event
+        success : bool or None
+            The new label of all decisions; None: forgotten.
+        labels : mapping of str to bool or None
+            Label until now of each decision, by id; None if it was forgotten.
+
+        Returns
+        -------
+        int
+            Number of the event.
+        """
+        (number,) = self._database.insert(connection, EVENT.c.number, [to_row(event)])
+        if labels:
+            newest = self._scope.next_number(connection, LABEL.c.seq) - 1
+            common = {"event": number, "author": event.author, "time": event.time}
+            common |= {"success": success, "newest_seq": newest}
+            rows = [common | {"decision_id": id_, "was": was} for id_, was in labels.items()]
+            self._database.insert(connection, CORRECTION.c.number, rows)
+        return number
+
+    def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
+        """Return, by id, a row for each of the given decisions that the cell has stored.
+
+        A row has content_hash, quarantined and time of the decision, and of its label success,
+        source, seq and `corrected`: the label after corrections, 0, 1 or FORGOTTEN. These four are
+        None without a label. Ids that are not stored are left out.
+        """
+        label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
+        query = sa.select(
+            *DECISION.c["id", "content_hash", "quarantined", "time"], *label
+        ).select_from(WITH_LABELS)
+        return self._database.rows_by_id(connection, query, ids)

@@ -1,0 +1,322 @@
+"""`DecisionTable`: the decisions of a store's cell, one by one, in selections and counted.
+`SqlStore` has one; the engine reads it when it resumes, the status and the history are computed
+from it.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import sqlalchemy as sa
+
+from ..errors import StoreError
+from ..records import Action, Reason, Source
+from .connections import Database
+from .ledger import is_intact
+from .queries import (
+    SOURCE,
+    SUCCESS,
+    TRACE_OF_DECISION,
+    WITH_LABELS,
+    n_decisions,
+    past_query,
+    stretches_query,
+)
+from .records import CHUNK, StoredDecision, from_row, read_decision
+from .schema import CORRECTION, DECISION, LABEL, TRACE
+from .views import LABELS, DecisionGroup, HistoryFilter, Stretch, Tally
+
+
+class DecisionTable:
+    """Reads the decisions of a cell, with their labels after corrections.
+
+    Parameters
+    ----------
+    database : Database
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._read = database.read
+        self._own = database.own
+
+    def get(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
+        """Return a decision with its label after corrections.
+
+        Parameters
+        ----------
+        decision_id : str
+        trace : bool, default True
+            Read its trace, too. False: its trace has shape (0, 0).
+
+        Returns
+        -------
+        StoredDecision or None
+            None for an unknown id.
+
+        Raises
+        ------
+        StoreError
+            If the trace is not as it was stored.
+        """
+        query = past_query(self._database.cell_id).where(DECISION.c.id == decision_id)
+        rows = self._read(
+            query.add_columns(*TRACE.c).outerjoin(TRACE, TRACE_OF_DECISION) if trace else query
+        )
+        if not rows:
+            return None
+        if trace and not is_intact(TRACE, rows[0][-len(TRACE.c) :]):
+            where = f"as it was stored in {self._database.name}, its bytes have changed"
+            do = "see `dengine verify`, and restore the store from a copy"
+            raise StoreError(f"Expected the trace of decision {decision_id!r} {where}; {do}.")
+        return read_decision(rows[0])
+
+    def ids(self) -> Iterator[Sequence[str]]:
+        """Yield the ids of all decisions of the cell, in any order, in lists of at most CHUNK.
+
+        A read transaction stays open meanwhile.
+        """
+        query = sa.select(DECISION.c.id).where(self._own(DECISION))
+        with self._database.reading() as connection:
+            yield from (
+                connection.execute(query.execution_options(yield_per=CHUNK)).scalars().partitions()
+            )
+
+    def newest_number(self) -> int:
+        """Return the number of the cell's newest decision; 0 before the first."""
+        return self._read(sa.select(n_decisions(self._database.cell_id)))[0][0] or 0
+
+    def select(
+        self, where: HistoryFilter, limit: int, start_after: str | None = None, newest: bool = True
+    ) -> list[StoredDecision]:
+        """Return the newest `limit` decisions of a selection, or the oldest; always oldest first.
+
+        They are in the order in which they were made, whatever the clock said.
+
+        Parameters
+        ----------
+        where : HistoryFilter
+        limit : int
+        start_after : str or None
+            Id of a decision, for the next page: only decisions before it are returned; with
+            `newest=False` only those after it.
+        newest : bool, default True
+            False: the oldest.
+
+        Returns
+        -------
+        list of StoredDecision
+            With corrected labels, without their traces. Empty for an unknown `start_after`.
+        """
+        conditions = [
+            column == str(value)
+            for column in DECISION.c["action", "predicted", "reason", "part"]
+            if (value := getattr(where, column.name)) is not None
+        ]
+        if where.label is not None:
+            label = LABELS[where.label]
+            conditions.append(SUCCESS.is_(None) if label is None else SUCCESS.in_([int(label)]))
+        if where.since is not None:
+            conditions.append(DECISION.c.time >= where.since)
+        if where.until is not None:
+            conditions.append(DECISION.c.time < where.until)
+        number = DECISION.c.number
+        if start_after is not None:
+            other = DECISION.alias("other")
+            is_other = self._own(other) & (other.c.id == start_after)
+            limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
+            conditions.append(number < limit_number if newest else number > limit_number)
+        query = (
+            past_query(self._database.cell_id)
+            .where(*conditions)
+            .order_by(number.desc() if newest else number)
+        )
+        rows = self._read(query.limit(limit))
+        return [read_decision(row) for row in (rows[::-1] if newest else rows)]
+
+    def unreported_accepts(self, since_version: int = 0) -> list[str]:
+        """Return the ids of accepted decisions without a label, oldest first.
+
+        Parameters
+        ----------
+        since_version : int, default 0
+            Only decisions by this version or a later one.
+
+        Returns
+        -------
+        list of str
+            Those of quarantined traces are left out.
+        """
+        return [
+            row.id
+            for row in self._read(
+                self._unlabelled_query(Action.ACCEPT, since_version, DECISION.c.id)
+            )
+        ]
+
+    def pending(self, since_version: int = 0) -> list[StoredDecision]:
+        """Return the decisions that asked for a check and have no label, oldest first.
+
+        Parameters
+        ----------
+        since_version : int, default 0
+            Only decisions by this version or a later one.
+
+        Returns
+        -------
+        list of StoredDecision
+            Without their traces; those of quarantined traces are left out.
+        """
+        return [
+            read_decision(row)
+            for row in self._read(self._unlabelled_query(Action.VERIFY, since_version, *DECISION.c))
+        ]
+
+    def _unlabelled_query(
+        self, action: Action, since_version: int, *columns: Any
+    ) -> sa.Select[Any]:
+        """Return the query for the cell's decisions of an action that have no label, oldest first.
+
+        Those of quarantined traces, and those by a version before `since_version`, are left out.
+        """
+        query = (
+            sa.select(*columns)
+            .select_from(WITH_LABELS)
+            .where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
+        )
+        query = query.where(self._own(DECISION), DECISION.c.quarantined == sa.false())
+        return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
+
+    def overdue_to(self, within: int, since_version: int = 0) -> int:
+        """Return the number of the newest decision that is old enough for its check to be overdue.
+
+        A decision with this or a lower number that asked for a check and has no label is overdue.
+        The number is that of the newest decision minus `within`, or the one that a label recorded,
+        if that is larger; 0 if nothing can be overdue yet.
+
+        Parameters
+        ----------
+        within : int
+            Number of later decisions after which a check is overdue.
+        since_version : int, default 0
+            The first version since `within` is in force; if the newest decision is by an earlier
+            one, only what the labels recorded counts.
+
+        Returns
+        -------
+        int
+        """
+        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(self._own(DECISION))
+        last = self._read(newest.order_by(DECISION.c.number.desc()).limit(1))
+        of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL))
+        by_labels = self._read(of_labels)[0][0] or 0
+        is_in_force = bool(last) and last[0].model_version >= since_version
+        return max(by_labels, last[0].number - within) if is_in_force else by_labels
+
+    def tally(
+        self, last: int | None = None, since_version: int = 0, within: int | None = None
+    ) -> Tally:
+        """Count the cell's decisions in groups of equal action, reason, corrected label and so on.
+
+        Parameters
+        ----------
+        last : int or None
+            Number of newest decisions that are counted; None: all.
+        since_version : int, default 0
+            Only decisions by this version or a later one.
+        within : int or None
+            Number of later decisions after which a check without a label is overdue; None: none is.
+
+        Returns
+        -------
+        Tally
+            With the groups in no order.
+        """
+        newest = n_decisions(self._database.cell_id)
+        aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
+            "aged"
+        )
+        columns = DECISION.c["action", "predicted", "reason", "audit", "quarantined"]
+        group = (
+            *columns,
+            aged,
+            SUCCESS.label("success"),
+            SOURCE.label("source"),
+            sa.func.count().label("n"),
+        )
+        times = (
+            sa.func.min(DECISION.c.time),
+            sa.func.max(DECISION.c.time),
+            sa.func.max(LABEL.c.time),
+        )
+        query = (
+            sa.select(*group, *times)
+            .select_from(WITH_LABELS)
+            .group_by(*columns, "aged", SUCCESS, SOURCE)
+        )
+        query = query.where(self._own(DECISION), DECISION.c.model_version >= since_version)
+        rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
+        first, latest, label = (
+            [row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1)
+        )
+        groups = tuple(from_row(DecisionGroup, row._mapping) for row in rows)
+        return Tally(
+            groups, min(first, default=None), max(latest, default=None), max(label, default=None)
+        )
+
+    def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
+        """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
+
+        The newest may be shorter.
+
+        Parameters
+        ----------
+        n : int
+            Without effect on stretches of time and on batches.
+        **by
+            For periods of time `seconds`, their length, and `start`, when one begins; for batches
+            `batch`, the length or the separators of a batch's name in the parts' numbers. As in
+            `stretches_query`.
+
+        Returns
+        -------
+        list of Stretch
+        """
+        length = max(1, -(-self.newest_number() // n))
+        rows = self._read(stretches_query(self._database.cell_id, length, **by))
+        return [Stretch(*row) for row in rows]
+
+    def counts(self, tally: Tally | None = None) -> dict[str, Any]:
+        """Return counts of all decisions and labels of the cell.
+
+        Parameters
+        ----------
+        tally : Tally or None
+            Of all decisions of the cell, if it has been read already; None: it is read.
+
+        Returns
+        -------
+        dict
+            decisions, quarantined, labels: numbers; corrected, forgotten: numbers of decisions
+            whose label was corrected or forgotten; actions, reasons, sources: dicts of numbers by
+            value, 0 included. Forgotten labels are not among labels and sources.
+        """
+        tally = tally or self.tally()
+        actions = tally.by("action")
+        reasons = tally.by("reason")
+        sources: Counter[Any] = Counter()
+        for group in tally.groups:
+            sources[group.source] += group.n if group.success is not None else 0
+        forgotten = tally.by("label")["forgotten"]
+        query = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
+        corrected = self._read(query.where(self._own(CORRECTION)))[0][0]
+        return {
+            "decisions": tally.count(),
+            "actions": {action.value: actions[action] for action in Action},
+            "reasons": {reason.value: reasons[reason] for reason in Reason},
+            "quarantined": tally.by("quarantined")[True],
+            "labels": sources.total(),
+            "sources": {source.value: sources[source] for source in Source},
+            "corrected": corrected - forgotten,
+            "forgotten": forgotten,
+        }

@@ -1,0 +1,353 @@
+"""`Drainer`: copies ("drains") the synced records of a cell's journal into its database, and makes
+the engine's calls to the database, in a thread of its own. So no call of the engine waits longer
+than a time limit, even where the database does not answer. `JournalledStore` has one.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from contextlib import suppress
+from itertools import islice
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ..errors import StoreError, listed
+from .journal import Journal, Record, decode_record
+from .lookup import DecisionIndex
+from .recording import RETRY_SECONDS, Entry, Recorder
+from .records import DATA_LOST, LOSS_REMEDY
+
+if TYPE_CHECKING:
+    from .sql import SqlStore
+
+log = logging.getLogger("dengine")
+T = TypeVar("T")
+DRAIN_SECONDS = 0.25  # synced records wait so long for others before they are drained together
+LAG_SECONDS = 1.0  # a larger lag is a fault of the store
+COMMIT_SECONDS = 2.0  # beyond the time limit, for a commit under way: it may still succeed
+DRAIN_CHUNK = 500  # records that the database takes in one transaction
+
+
+class Drainer:
+    """Takes synced records from a recorder, and commits them to a database.
+
+    `start` starts its thread, and `stop` ends it.
+
+    Parameters
+    ----------
+    store : SqlStore
+    journal : Journal
+    recorder : Recorder
+    index : DecisionIndex
+        Forgets the records that the database has.
+    limit : float
+        Seconds that a call waits at most.
+
+    Attributes
+    ----------
+    n_drained : int
+        Number of records that the database has, or that are lost.
+    """
+
+    def __init__(
+        self,
+        store: SqlStore,
+        journal: Journal,
+        recorder: Recorder,
+        index: DecisionIndex,
+        limit: float,
+    ) -> None:
+        self.n_drained = 0
+        self._store = store
+        self._journal = journal
+        self._recorder = recorder
+        self._index = index
+        self._limit = limit
+        self._changed = recorder.changed
+        self._wanted = 0  # up to this record somebody waits for the database
+        self._error = ""
+        self._label_numbers: list[tuple[str, int]] = []  # of a product, not yet collected
+        self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="dengine-store", daemon=True)
+
+    @property
+    def is_drained(self) -> bool:
+        """Whether the database has taken every record."""
+        return self.n_drained == self._recorder.n_recorded
+
+    @property
+    def lag(self) -> float:
+        """Age in seconds of the oldest record that is not drained; 0.0 if all are."""
+        with self._changed:
+            oldest = self._recorder.oldest
+        return 0.0 if oldest is None else time.monotonic() - oldest
+
+    @property
+    def fault(self) -> str:
+        """Why the store cannot be written or read at present; "" if it can.
+
+        This is a fault of the journal, the last error of the database, or a lag above both the
+        limit and LAG_SECONDS.
+        """
+        fault = self._recorder.fault or self._error
+        lag = self.lag
+        if fault or lag <= max(LAG_SECONDS, self._limit):
+            return fault
+        return f"no answer from the store for {lag:.1f} s."
+
+    def request(self) -> None:
+        """Ask that everything recorded so far be synced and drained at once; do not wait."""
+        with self._changed:
+            self._wanted = self._recorder.n_recorded
+            self._recorder.request_sync()
+
+    def drain(self) -> None:
+        """Wait until everything recorded so far is drained, as `Outbox.drain` says."""
+        with self._changed:
+            if self.is_drained:
+                return
+            self.request()
+            place = self._wanted
+            if not self._changed.wait_for(
+                lambda: self.n_drained >= place or bool(self.fault), self._limit
+            ):
+                self._error = f"no answer from the store within {self._limit:g} s."
+            if self.n_drained < place:
+                raise self._unavailable()
+
+    def _unavailable(self) -> StoreError:
+        """Return the StoreError for a store that cannot be reached now, with the reason."""
+        return StoreError(
+            f"The store is unavailable: {self.fault} Labels wait in its journal; "
+            "try this again when it is back."
+        )
+
+    def pop_label_numbers(self) -> list[tuple[str, int]]:
+        """Return the numbers of labels, as `Outbox.pop_label_numbers` says."""
+        with self._changed:
+            numbers = self._label_numbers
+            self._label_numbers = []
+        return numbers
+
+    def submit(self, call: Callable[[], T]) -> Future[T]:
+        """Have the thread make a call, and return without waiting for it.
+
+        Records that are on disk by then are drained before, if the database takes them.
+
+        Returns
+        -------
+        Future
+            Of the call's result, for `wait_for_result`.
+
+        Raises
+        ------
+        StoreError
+            If the store is unavailable.
+        """
+        future: Future[T] = Future()
+        with self._changed:
+            if self.fault:
+                raise self._unavailable()
+            self._calls.append((future, call))
+            self._changed.notify_all()
+        return future
+
+    def wait_for_result(self, future: Future[T]) -> T:
+        """Wait for a submitted call; return its result, or raise what it raised.
+
+        Raises
+        ------
+        StoreError
+            If it takes longer than the limit. The call is then cancelled, so that it commits
+            nothing. A call that is already committing is waited for COMMIT_SECONDS more; if
+            StoreError is raised after these, it may still have committed, or do so later.
+        """
+        if not wait([future], self._limit).done and not future.cancel():
+            wait([future], COMMIT_SECONDS)
+        if future.cancelled() or not future.done():
+            raise StoreError(f"no answer from the store within {self._limit:g} s.")
+        return future.result()
+
+    def start(self) -> None:
+        """Start the thread, and have it drain before anybody else uses the store."""
+        self._thread.start()
+        self._store.database.before_use = self._drain_before_use
+
+    def wait_for_store(self, seconds: float) -> None:
+        """Wait until everything is drained, or a fault shows that it will not be."""
+        with self._changed:
+            self._changed.wait_for(lambda: self.is_drained or bool(self.fault), seconds)
+
+    def stop(self, seconds: float) -> bool:
+        """End the thread, wait for it, and return whether it ended within these seconds.
+
+        It drains what is synced before, if the database takes it.
+        """
+        with self._changed:
+            self._stopped = True
+            self._changed.notify_all()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _drain_before_use(self) -> None:
+        """Drain before the store is used directly, so that its user sees every record.
+
+        It waits at most `limit` seconds. If the store is unavailable, nothing is raised here. In
+        the thread that drains, and once that was stopped, it does nothing.
+        """
+        if not self._stopped and threading.current_thread() is not self._thread:
+            with suppress(StoreError):
+                self.drain()
+
+    def _run(self) -> None:
+        """Drain synced records and make submitted calls until stopped.
+
+        Before a call everything synced is drained, if the database takes it; the call is made in
+        either case. An error of the database is logged once and kept for `fault`; a second later
+        the database is tried again.
+        """
+        while True:
+            call = self._wait_for_work()
+            try:
+                self._drain_synced()
+            except Exception as error:  # whatever it is, the cell goes on, and this thread too
+                self._note_error(error)
+            if call is not None:
+                self._make_call(*call)
+            with self._changed:
+                has_ended = self._error or not self._recorder.synced
+                if self._stopped and has_ended and not self._calls:
+                    return
+                if self._error:
+                    self._changed.wait_for(lambda: self._calls or self._stopped, RETRY_SECONDS)
+
+    def _wait_for_work(self) -> tuple[Future[Any], Callable[[], Any]] | None:
+        """Wait until there is a call, or until there are records and it is time to drain them.
+
+        Return the oldest call, None if there is none.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._calls or self._recorder.synced or self._stopped)
+            self._changed.wait_for(
+                lambda: (
+                    self._calls
+                    or self._stopped
+                    or self._wanted > self.n_drained
+                    or self._recorder.needs_clearing
+                ),
+                DRAIN_SECONDS,
+            )
+            return self._calls.popleft() if self._calls else None
+
+    def _note_error(self, error: Exception) -> None:
+        """Keep an error of the database for `fault`, and wake those who wait; log the first."""
+        with self._changed:
+            if not self._error:
+                log.warning("labels wait in the journal beside the store: %s", error)
+            self._error = str(error)
+            self._changed.notify_all()
+
+    def _drain_synced(self) -> None:
+        """Drain everything that is synced. Raise StoreError if the database refuses it."""
+        if self._recorder.synced:
+            self._journal.sync_head()
+        while self._recorder.synced:
+            self.drain_chunk()
+        self._error = ""
+
+    def drain_chunk(self) -> None:
+        """Commit the oldest synced records, at most DRAIN_CHUNK, in one transaction.
+
+        Decisions that were replaced are left out. Of records that are damaged on disk an event is
+        committed. Journal, counters and index are updated. Raise StoreError if the database refuses
+        records or event; nothing is updated then, and the next call commits the same records again.
+        """
+        with self._changed:
+            chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))
+        records: list[Record] = []
+        damaged: list[Entry] = []
+        for entry in chunk:
+            if self._index.is_replaced(entry):
+                continue
+            try:
+                records.append(decode_record(self._journal.read(entry.offset)))
+            except StoreError:
+                damaged.append(entry)
+                copy = entry.record or self._index.recent.get(entry.decision_id)
+                if copy is not None:
+                    records.append(copy)
+        numbers = self._store.apply_records(records)
+        self._report_damage(damaged)
+        with self._changed:
+            self._journal.drained_to = chunk[-1].end
+            self._journal.head.n_drained += len(chunk)
+            self.save_newest_entry()
+            if self._store.product is not None:
+                self._label_numbers += numbers
+            for entry in chunk:
+                self._recorder.synced.popleft()
+                self._index.remove_drained(entry)
+            self.n_drained += len(chunk)
+            self._changed.notify_all()
+
+    def _report_damage(self, damaged: list[Entry]) -> None:
+        """Commit an event about records that were damaged in the journal; without any, none.
+
+        It names the decisions that are not in memory any more and so are lost. Raise StoreError if
+        the database refuses the event.
+        """
+        if not damaged:
+            return
+        lost = [
+            entry.decision_id
+            for entry in damaged
+            if not (entry.record or self._index.recent.get(entry.decision_id))
+        ]
+        self.report(
+            DATA_LOST if lost else "journal",
+            f"{len(damaged)} records of the journal were damaged on disk and are stored from "
+            f"memory; decisions that are lost: {listed(lost) or 'none'}.",
+        )
+
+    def report(self, kind: str, text: str) -> None:
+        """Log an error, and commit it to the store as an event, directly and not by the journal."""
+        log.error("%s: %s%s", kind, text, f" {LOSS_REMEDY}" if kind == DATA_LOST else "")
+        self._store.events.put(kind, text)
+
+    def save_newest_entry(self) -> None:
+        """Write the ledger's newest entry to the journal's header and its head; errors are ignored.
+
+        By it a store that was cut off is recognized at the next start.
+        """
+        with self._changed, suppress(StoreError):  # a broken journal is reported by its next record
+            self._journal.save_newest_entry(self._store.database.newest_entry)
+
+    def _make_call(self, future: Future[Any], call: Callable[[], Any]) -> None:
+        """Make a submitted call; set the future's result or exception. Nothing is raised here.
+
+        A call that was cancelled before is not made. One that is cancelled while it runs is rolled
+        back; once it has begun to commit it cannot be cancelled.
+        """
+
+        def is_wanted() -> bool:
+            """Return whether the future was not cancelled; from then on it cannot be."""
+            return future.running() or (
+                not future.cancelled() and future.set_running_or_notify_cancel()
+            )
+
+        if future.cancelled():
+            return
+        try:
+            with self._store.database.commit_if(is_wanted):
+                result = call()
+        except BaseException as error:
+            if is_wanted():
+                future.set_exception(error)
+        else:
+            if is_wanted():
+                future.set_result(result)

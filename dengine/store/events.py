@@ -1,0 +1,125 @@
+"""`EventTable`: what happened to the engines of a store's cell, for people to read. `SqlStore` has
+one.
+"""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import sqlalchemy as sa
+
+from ..errors import StoreError
+from .connections import Database
+from .records import (
+    ACKNOWLEDGED,
+    POLICY_CHANGED,
+    SHADOW_CHANGED,
+    Event,
+    as_text,
+    from_row,
+    new_event,
+    open_losses,
+    to_row,
+)
+from .schema import DECISION, EVENT
+
+log = logging.getLogger("dengine")
+
+
+class EventTable:
+    """Reads and writes the events of a cell.
+
+    Parameters
+    ----------
+    database : Database
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._read = database.read
+        self._own = database.own
+
+    def put(
+        self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""
+    ) -> None:
+        """Commit an event with the present time.
+
+        Parameters
+        ----------
+        kind, text, data, author
+            As in `Event`.
+
+        Raises
+        ------
+        StoreError
+            For data that JSON does not have, and if the database fails.
+        """
+        event = new_event(kind, text, self._database.clock(), data, author)
+        self._database.write(
+            lambda connection: self._database.insert(connection, EVENT.c.number, [to_row(event)])
+        )
+
+    def record_damage(self, text: str) -> None:
+        """Commit an event of kind "damaged", unless the cell has one with this text.
+
+        If the store cannot be written, the text is logged instead, and nothing raised.
+        """
+        query = sa.select(EVENT.c.number).where(self._own(EVENT))
+        query = query.where(EVENT.c.kind == "damaged", EVENT.c.text == as_text(text))
+        if not self._read(query.limit(1)):
+            try:
+                self.put("damaged", text)
+            except StoreError as error:  # a store that can only be read is read all the same
+                log.warning("%s (%s)", text, error)
+
+    def newest(self, limit: int | None = None) -> list[Event]:
+        """Return the newest events of the cell, oldest first.
+
+        Parameters
+        ----------
+        limit : int or None
+            Number of events; None: all.
+
+        Returns
+        -------
+        list of Event
+        """
+        query = (
+            sa.select(EVENT).where(self._own(EVENT)).order_by(EVENT.c.number.desc()).limit(limit)
+        )
+        return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
+
+    def acknowledge_losses(self, author: str = "") -> None:
+        """End the alarm about lost data by an event; without an alarm nothing is written.
+
+        Parameters
+        ----------
+        author : str
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        if losses := open_losses(self.newest()):
+            self.put(ACKNOWLEDGED, f"{len(losses)} losses of data", author=author)
+
+    def policy_change_after(self, decision_id: str) -> Event | None:
+        """Return the event of the first change of the policy or the shadow mode after a decision.
+
+        Parameters
+        ----------
+        decision_id : str
+
+        Returns
+        -------
+        Event or None
+            None if there was no change, or there is no such decision. The order is the ledger's,
+            whatever the clock said.
+        """
+        is_decision = self._own(DECISION) & (DECISION.c.id == decision_id)
+        decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
+        kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
+        query = sa.select(EVENT).where(self._own(EVENT), kinds, EVENT.c.entry > decided)
+        rows = self._read(query.order_by(EVENT.c.number).limit(1))
+        return from_row(Event, rows[0]._mapping) if rows else None

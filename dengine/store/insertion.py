@@ -1,0 +1,234 @@
+"""`RecordInsertion`: commits the records of a cell's journal to its store: decisions, labels,
+events. Records may come twice, and may contradict what is stored; nothing is guessed, and none is
+lost: one that cannot be stored becomes an event, "dead letter". `SqlStore` has one.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import sqlalchemy as sa
+
+from ..errors import StoreError
+from .connections import ROW_ERRORS, Database
+from .corrections import CorrectionTable
+from .journal import Record
+from .queries import WITH_TRACES
+from .records import (
+    FORGOTTEN,
+    LATE_STOP,
+    Event,
+    NewLabel,
+    StoredDecision,
+    as_text,
+    decision_row,
+    new_event,
+    to_row,
+    trace_row,
+)
+from .schema import DECISION, EVENT, LABEL, TRACE
+
+log = logging.getLogger("dengine")
+
+
+@dataclass
+class SortedLabels:
+    """Labels of a journal, by what the store does with them.
+
+    Attributes
+    ----------
+    new : dict of str to NewLabel
+        To be inserted, by decision.
+    taken : dict of str to None
+        Decisions that have the label, from now on or since before, in the order of the labels.
+    late_stops : dict of str to None
+        Decisions whose label, "confirmed" by silence, is to be corrected to a failure.
+    problems : list of str
+        Labels that contradict what is stored, in words.
+    """
+
+    new: dict[str, NewLabel] = field(default_factory=dict)
+    taken: dict[str, None] = field(default_factory=dict)
+    late_stops: dict[str, None] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+
+class RecordInsertion:
+    """Inserts records into the tables of a cell.
+
+    Parameters
+    ----------
+    database : Database
+    corrections : CorrectionTable
+    """
+
+    def __init__(self, database: Database, corrections: CorrectionTable) -> None:
+        self._database = database
+        self._corrections = corrections
+
+    def commit(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+        """Commit records, as `SqlStore.apply_records` says.
+
+        If the database refuses a value, the records are halved, each half in a transaction of its
+        own, until the refused record is alone; that becomes a dead letter.
+        """
+        try:
+            return self._database.write(lambda connection: self._insert(connection, records))
+        except StoreError as error:
+            if not isinstance(error.__cause__, ROW_ERRORS):
+                raise
+            if len(records) > 1:  # the database refuses one of them
+                half = len(records) // 2
+                return self.commit(records[:half]) + self.commit(records[half:])
+            text = f"{_describe(records[0])}, which the database refused: {error.__cause__}"
+        self._database.write(lambda connection: self._insert_events(connection, [], [text]))
+        return []
+
+    def _insert(
+        self, connection: sa.Connection, records: Sequence[Record]
+    ) -> list[tuple[str, int]]:
+        """Insert what is not stored yet, without a commit.
+
+        Return (decision id, number) of the labels that are stored now.
+        """
+        events = [record for record in records if isinstance(record, Event)]
+        decisions = [record for record in records if isinstance(record, StoredDecision)]
+        labels = [record for record in records if isinstance(record, NewLabel)]
+        problems = self._insert_decisions(connection, decisions)
+        ids = [label.decision_id for label in labels]
+        stored = self._corrections.stored_labels(connection, ids)
+        sorted_labels = _sort_labels(labels, stored)
+        numbers = self._insert_labels(connection, sorted_labels.new, stored)
+        self._insert_events(connection, events, problems + sorted_labels.problems)
+        for id_ in sorted_labels.late_stops:
+            self._correct_confirmation(connection, id_)
+        return [(id_, numbers[id_]) for id_ in sorted_labels.taken]
+
+    def _insert_decisions(
+        self, connection: sa.Connection, decisions: Sequence[StoredDecision]
+    ) -> list[str]:
+        """Insert the decisions that are not stored yet, with their traces.
+
+        Return, in words, each whose id is stored with other values.
+        """
+        trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
+        query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
+        ids = [item.decision.id for item in decisions]
+        stored = self._database.rows_by_id(connection, query, ids)
+        new = [item for item in decisions if item.decision.id not in stored]
+        rows = [decision_row(item) for item in new]
+        self._database.insert(connection, DECISION.c.number, rows)
+        if new:
+            cell = {"cell_id": self._database.cell_id}
+            connection.execute(sa.insert(TRACE), [cell | trace_row(item) for item in new])
+        problems = []
+        for item in decisions:
+            row = stored.get(item.decision.id)
+            different = [] if row is None else _differences(item, row)
+            if different:
+                names = ", ".join(different)
+                problems.append(
+                    f"{_describe(item)}, of which the store holds another: {names} differ"
+                )
+        return problems
+
+    def _insert_labels(
+        self, connection: sa.Connection, labels: dict[str, NewLabel], stored: dict[str, Any]
+    ) -> dict[str, int]:
+        """Insert new labels; return the numbers of these and of stored ones, by decision."""
+        rows = [
+            to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
+            for label in labels.values()
+        ]
+        numbers = {id_: row.seq for id_, row in stored.items()}
+        new_numbers = self._database.insert(connection, LABEL.c.seq, rows)
+        return numbers | dict(zip(labels, new_numbers, strict=True))
+
+    def _insert_events(
+        self, connection: sa.Connection, events: Sequence[Event], problems: Sequence[str]
+    ) -> None:
+        """Insert events that are not stored yet, by time, kind and text; and a dead letter for each
+        problem, which is also logged as an error.
+        """
+        new = []
+        if events:
+            query = sa.select(EVENT.c.time, EVENT.c.kind, EVENT.c.text)
+            times = [event.time for event in events]
+            query = query.where(self._database.own(EVENT), EVENT.c.time.in_(times))
+            stored = {tuple(row) for row in connection.execute(query)}
+            new = [event for event in events if (event.time, event.kind, event.text) not in stored]
+        for problem in problems:
+            log.error("dead letter: %s", problem)
+            new.append(new_event("dead letter", problem, self._database.clock()))
+        self._database.insert(connection, EVENT.c.number, [to_row(event) for event in new])
+
+    def _correct_confirmation(self, connection: sa.Connection, decision_id: str) -> None:
+        """Correct to failure the label of a part that silence confirmed and that then stopped."""
+        text = (
+            f"decision {as_text(decision_id)} counts as a failure, was a success: its stop came "
+            "after its confirmation"
+        )
+        event = new_event("late stop", text, self._database.clock())
+        self._corrections.insert(connection, event, False, {decision_id: True})
+
+
+def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLabels:
+    """Sort labels by what the store does with them.
+
+    `stored` has, by decision, the rows of `CorrectionTable.stored_labels`.
+    """
+    result = SortedLabels()
+    for label in labels:
+        id_ = label.decision_id
+        row: Any = stored.get(id_)
+        # The label that the decision has: of these records, or of the store.
+        first = result.new.get(id_) if row is None or row.seq is None else row
+        problem = _find_problem(label, row, first)
+        if problem:
+            result.problems.append(problem)
+            continue
+        result.taken[id_] = None
+        if first is None:
+            result.new[id_] = label
+        elif _is_late_stop(label, first) and row.corrected != 0:  # else it is corrected already
+            result.late_stops[id_] = None
+    return result
+
+
+def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
+    """Return in words why the store cannot take a label; "" if it can.
+
+    `row` is that of its decision, None if it is not stored; `first` is the label that the decision
+    has, None if it has none.
+    """
+    if row is None:
+        return f"{_describe(label)}, which the store does not hold"
+    if (row.content_hash, row.time) != (label.content_hash, label.decided):
+        return f"{_describe(label)}, of which the store holds another decision"
+    if first is None or (first.success, first.source) == (label.success, label.source):
+        return ""
+    if _is_late_stop(label, first) and row.corrected != FORGOTTEN:
+        return ""
+    return f"a second label: {_describe(label)}, which has one"
+
+
+def _is_late_stop(label: NewLabel, first: Any) -> bool:
+    """Return whether a label is the line stop of a part that silence had confirmed first."""
+    return ((first.success, first.source), (label.success, label.source)) == LATE_STOP
+
+
+def _differences(item: StoredDecision, row: Any) -> list[str]:
+    """Return the names of the columns in which a decision and its stored row differ."""
+    given = decision_row(item) | trace_row(item)
+    return [name for name, value in given.items() if row._mapping[name] != value]
+
+
+def _describe(record: Record) -> str:
+    """Return a record (event, decision or label) in a few words, for the text of a dead letter."""
+    if isinstance(record, Event):
+        return f"an event, {record.text!r}"
+    if isinstance(record, StoredDecision):
+        return f"a decision, {record.decision.id!r}"
+    result = "success" if record.success else "failure"
+    return f"a label, {result} from {record.source.value}, on {record.decision_id!r}"

@@ -1,0 +1,346 @@
+"""`JournalledStore`: the way of a running cell's engine to its store. It composes a `Recorder`,
+which appends decisions, labels and events to the local journal, a `Drainer`, which copies them from
+there into the database, and a `DecisionIndex`, by which decisions are found in memory. Recorder and
+drainer have a thread each; a third thread reads the ids of all decisions once.
+
+So no call of the engine waits longer than the store's time limit (`SqlStore.wait`), even where the
+disk or the database does not answer. `lag` is how far the database is behind.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from numpy.typing import NDArray
+
+from ..errors import NotTakenError, StoreError
+from ..records import RetrainReport
+from .draining import Drainer
+from .journal import HEADER, decode_record
+from .lookup import DecisionIndex
+from .outbox import Outbox
+from .recording import RETRY_SECONDS, Recorder
+from .records import DATA_LOST, NewLabel, StoredDecision
+from .views import HistoryFilter
+
+if TYPE_CHECKING:
+    from .sql import SqlStore
+
+log = logging.getLogger("dengine")
+T = TypeVar("T")
+NO_LIMIT = 1e9  # seconds: never reached
+LOCK_SECONDS = 0.001  # a wait for the lock that counts as none
+# Opening waits so long for SQLite's check; that of a large store goes on beside.
+CHECK_SECONDS = 0.1
+CLOSE_SECONDS = 5.0  # the longest that closing waits
+MAX_UNWRITTEN = 10_000  # records in memory while the disk hangs; later decisions are not recorded
+
+
+class JournalledStore(Outbox):
+    """An outbox with a journal between the engine and the database; it owns the cell.
+
+    Opening copies what an earlier process left in the journal into the database, checks the store's
+    integrity, and starts three threads, which `close` ends. Any thread may record and look up.
+
+    Parameters
+    ----------
+    store : SqlStore
+        `close` closes it.
+    window : int
+        Number of newest labels whose integrity is checked.
+    patient : bool, default False
+        Wait without a time limit, as a replay does that must repeat exactly.
+
+    Raises
+    ------
+    StoreError
+        Where another engine owns the cell, or the database cannot take what the journal holds.
+    """
+
+    def __init__(self, store: SqlStore, window: int, patient: bool = False) -> None:
+        super().__init__(store, window, NO_LIMIT if patient else store.wait)
+        self._unrecorded: set[str] = set()  # ids that were answered without recording a decision
+        journal = self._journal = store.claim_cell()
+        self._index = DecisionIndex(journal)
+        self._recorder = Recorder(journal, store.clock, self.limit)
+        self._changed = self._recorder.changed  # guards all of it
+        self._drainer = Drainer(store, journal, self._recorder, self._index, self.limit)
+        try:
+            self._compare_with_ledger()  # before anything is drained
+            self._drain_leftovers()
+            self._continue_numbers()
+            store.database.on_entry = self._drainer.save_newest_entry
+            self._drainer.save_newest_entry()
+            self._begin_check()
+        except BaseException:
+            journal.close()
+            raise
+        self._drainer.pop_label_numbers()  # an engine that resumes reads these labels
+        self._recorder.start()
+        # Only now: a check of the pages that takes long uses the store as well, and needs them.
+        self._drainer.start()
+        threading.Thread(target=self._load_ids, name="dengine-ids", daemon=True).start()
+
+    def _compare_with_ledger(self) -> None:
+        """Check that the store's ledger has the entries that the journal and its head name.
+
+        If one is missing, the store was cut off or restored from an older copy: an event is stored,
+        and the journal is set to be drained from its beginning. An event is also stored if the
+        journal or its head is new though the store is not.
+        """
+        journal = self._journal
+        database = self.store.database
+        missing = [entry for entry in journal.entries if not database.has_entry(*entry)]
+        if missing:
+            self._drainer.report(
+                DATA_LOST,
+                f"the ledger lacks entry {missing[0][0]}, which this cell's journal knows: the "
+                "store was cut off, or restored from a copy; labels may be missing.",
+            )
+            journal.drained_to = HEADER  # the journal may still hold some of them
+        elif len(journal.entries) < 2 and database.newest_entry is not None:
+            self._drainer.report(
+                "journal",
+                f"the journal {journal.path}, or its head beside it, is new here, and the store is "
+                "not: whether the store was cut off, or labels are elsewhere, is unknown; bring "
+                "the old files here, or copy a store by `dengine backup` and `dengine restore`.",
+            )
+
+    def _drain_leftovers(self) -> None:
+        """Drain what an earlier process left in the journal, and clear the journal.
+
+        Damage in the journal, or records that it lacks, become an event, which is an alarm.
+        """
+        newest = self.store.decisions.select(HistoryFilter(), limit=1)
+        since = "".join(
+            f" They came after decision {item.decision.id} of {item.when:%F %T} UTC."
+            for item in newest
+        )
+        for offset, end, blob in self._journal.undrained_records():
+            record = decode_record(blob)
+            self._index.add(record, self._recorder.adopt(record, offset, end))
+        while not self.is_drained:
+            self._drainer.drain_chunk()
+        if self._journal.loss:
+            self._drainer.report(DATA_LOST, self._journal.loss + since)
+        elif self._journal.dropped:
+            self._drainer.report(
+                "journal",
+                f"{self._journal.dropped} bytes at its end were dropped: a process was killed as "
+                "it wrote them",
+            )
+        self._journal.clear()
+
+    def _begin_check(self) -> None:
+        """Check the store's integrity; the result becomes `integrity_error`.
+
+        The check of the pages by SQLite is waited for only CHECK_SECONDS and goes on in a thread.
+        """
+        check = threading.Thread(
+            target=lambda: self._note_integrity(self.store.database.check_pages()), daemon=True
+        )
+        check.start()
+        self.check_integrity()
+        check.join(CHECK_SECONDS)
+
+    # State
+
+    @property
+    def verify_all_reason(self) -> str:
+        return self.integrity_error or self._recorder.fault
+
+    @property
+    def fault(self) -> str:
+        return self.integrity_error or self._drainer.fault
+
+    @property
+    def lag(self) -> float:
+        return self._drainer.lag
+
+    @property
+    def is_drained(self) -> bool:
+        return self._drainer.is_drained
+
+    @contextmanager
+    def try_lock(self) -> Iterator[bool]:
+        """Context manager that tries to take the lock, and gives whether that succeeded.
+
+        It waits at most a millisecond, and the block runs in either case. While the block holds the
+        lock, the threads wait, and so do calls from other threads. The lock is released after the
+        block.
+        """
+        # A thread that only looks has it for an instant.
+        locked = self._changed.acquire(timeout=LOCK_SECONDS)
+        try:
+            yield locked
+        finally:
+            if locked:
+                self._changed.release()
+
+    # What the engine records
+
+    def record_decision(self, item: StoredDecision) -> StoredDecision:
+        id_ = item.decision.id
+        with self._changed:
+            first = self._index.recent.get(id_)
+            if first is not None:
+                return first
+            self._unrecorded.discard(id_)
+            if len(self._recorder.unwritten) >= MAX_UNWRITTEN:
+                self._unrecorded.add(id_)
+                return item
+            self.n_decisions += 1
+            item = replace(item, number=self.n_decisions)
+            self._index.add(item, self._recorder.record(item))
+        return item
+
+    def replace_decision(self, item: StoredDecision) -> StoredDecision:
+        id_ = item.decision.id
+        with self._changed:
+            first, _ = self._index.find(id_)
+            if first is None:
+                raise KeyError(id_)
+            if not self._index.is_unsynced(id_):
+                return first
+            item = replace(item, time=first.time, trace=first.trace, number=first.number)
+            self._index.add(item, self._recorder.record(item))
+        return item
+
+    def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
+        with self._changed:
+            for item, label in labels:
+                now = self.store.clock()
+                hash_ = item.content_hash
+                label = replace(label, time=now, content_hash=hash_, decided=item.time)
+                self._index.add(label, self._recorder.record(label))
+
+    def record_event(self, kind: str, text: str) -> None:
+        self._recorder.record_event(kind, text)
+
+    def sync(self, seconds: float | None = None) -> None:
+        self._recorder.sync(seconds)
+
+    def drain(self) -> None:
+        self._drainer.drain()
+
+    def request_label_drain(self) -> bool:
+        with self._changed:
+            if self._index.has_labels:
+                self._drainer.request()
+            return self._index.has_labels
+
+    def pop_label_numbers(self) -> list[tuple[str, int]]:
+        return self._drainer.pop_label_numbers()
+
+    # What the engine asks
+
+    def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
+        with self._changed:
+            if decision_id in self._unrecorded:
+                raise StoreError(
+                    f"Expected a decision that is recorded, got {decision_id!r}, which could "
+                    "not be looked up, and was "
+                    "verified unrecorded; decide on the part again."
+                )
+            item, label = self._index.find(decision_id, unsynced)
+        if item is None and not self._index.is_new(decision_id):
+            item = self.call_store(lambda: self.store.decisions.get(decision_id))
+        if item is not None and label is not None:
+            item = replace(item, success=label.success, source=label.source)
+        return item
+
+    def find_earlier(self, decision_id: str) -> StoredDecision | None:
+        with self._changed:
+            self._unrecorded.discard(decision_id)
+        try:
+            return None if self._index.is_new(decision_id) else self.find_decision(decision_id)
+        except StoreError:
+            self._unrecorded.add(decision_id)
+            raise
+
+    def load_ids(self) -> None:
+        """Read the ids of all decisions from the database into a Bloom filter in memory.
+
+        It takes about a second for a million ids; the lock is held for a page of them at a time.
+        """
+        if self._index.has_all_ids:
+            return
+        for ids in self.store.decisions.ids():
+            with self._changed:
+                self._index.add_ids(ids)
+        self._index.complete_ids()
+
+    def _load_ids(self) -> None:
+        """Load the ids, again after each failure, until that succeeds or the outbox is closed.
+
+        Until then every new id is looked up in the database.
+        """
+        while not self._closed and not self._index.has_all_ids:
+            try:
+                self.load_ids()
+            except StoreError:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._closed, RETRY_SECONDS)
+
+    def evict_decision(self, decision_id: str) -> None:
+        with self._changed:
+            self._index.recent.pop(decision_id, None)
+
+    def call_store(self, call: Callable[[], T]) -> T:
+        return self.wait_for_result(self._drainer.submit(call))
+
+    def store_version(
+        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
+    ) -> Future[int]:
+        return self._drainer.submit(lambda: self.store.versions.put(report, last_seq, state))
+
+    def wait_for_result(self, future: Future[T]) -> T:
+        return self._drainer.wait_for_result(future)
+
+    def close(self) -> None:
+        """Drain, end the threads, close store and journal, within seconds unless `patient`.
+
+        What the database does not take stays in the journal, and the next engine drains it. What
+        the disk does not take is given up, and an error is logged: whoever waited for that was told
+        so. A second call does nothing, nor does one in a forked process.
+        """
+        if not self.is_usable:
+            return
+        try:
+            self.flush()
+        except NotTakenError as error:
+            log.error("closed without the newest records, which no report acknowledged: %s", error)
+        # A sync that is under way hangs: nothing that waits for the disk would end.
+        seconds = 0.0 if self._recorder.is_syncing else CLOSE_SECONDS
+        self._drainer.wait_for_store(seconds)
+        if self._end_threads(seconds) and self.is_drained:
+            self.store.close()
+        else:
+            self._leave_store(can_close=seconds > 0.0)
+
+    def _end_threads(self, seconds: float) -> bool:
+        """Have the threads end, and return whether both have, each within these seconds."""
+        with self._changed:
+            self._closed = True
+        has_recorder_ended = self._recorder.stop(seconds)
+        return self._drainer.stop(seconds) and has_recorder_ended
+
+    def _leave_store(self, can_close: bool) -> None:
+        """Log that the journal holds what the database lacks; disconnect where the disk answers.
+
+        Else the lease on the cell would outlive the engine.
+        """
+        log.warning(
+            "the store was left, its journal %s holds what it lacks: %s",
+            self._journal.path,
+            self.fault,
+        )
+        if can_close:
+            self.store.database.close(waiting=False)
+            self._journal.close(waiting=False)

@@ -1,0 +1,323 @@
+"""`LabelTable`: the labels of a store's cell and of its product, with their traces for training,
+and as outcomes for a decision rule. `SqlStore` has one.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+from numpy.typing import NDArray
+
+from ..errors import StoreError, listed
+from ..records import Reason, Source
+from .connections import Database
+from .decisions import DecisionTable
+from .events import EventTable
+from .ledger import is_intact
+from .queries import (
+    LABEL_OF_DECISION,
+    TRAINS,
+    Scope,
+    audit_columns,
+    corrected_label,
+    training_query,
+)
+from .records import (
+    CHUNK,
+    FORGOTTEN,
+    LabelledTraces,
+    OutcomeRecord,
+    ProductNews,
+    StoredDecision,
+    from_row,
+    overdue_outcomes,
+    unpack,
+)
+from .schema import CORRECTION, DECISION, LABEL, TRACE
+from .views import PastLabel
+
+
+class LabelTable:
+    """Reads labels. What is not as it was stored is left out, and an event says so.
+
+    Parameters
+    ----------
+    database : Database
+    decisions : DecisionTable
+    events : EventTable
+        Takes an event about what was left out.
+    """
+
+    def __init__(self, database: Database, decisions: DecisionTable, events: EventTable) -> None:
+        self._database = database
+        self._read = database.read
+        self._own = database.own
+        self._scope = database.scope
+        self._decisions = decisions
+        self._events = events
+
+    def newest(self) -> int:
+        """Return the number of the newest label of the cell or its product; 0 before the first."""
+        with self._database.reading() as connection:
+            return self._scope.newest(connection, LABEL.c.seq)
+
+    def with_traces(
+        self,
+        limit: int | None = None,
+        *,
+        first: int = 1,
+        last: int | None = None,
+        corrected_to: int | None = None,
+        cell_only: bool = False,
+    ) -> LabelledTraces:
+        """Return labelled traces for training, with corrected labels, oldest first.
+
+        Forgotten labels and quarantined traces are left out. So is a trace that is not as it was
+        stored, and an event with its decision's id is written to the store.
+
+        Parameters
+        ----------
+        limit : int or None
+            Number of newest labels, damaged ones included; None: all.
+        first, last : int, optional
+            Numbers of the first and the last label, both included.
+        corrected_to : int or None
+            Number of the last correction that is applied, for labels as they stood then; None: all.
+        cell_only : bool, default False
+            Leave out those of the product's other cells.
+
+        Returns
+        -------
+        LabelledTraces
+
+        Raises
+        ------
+        StoreError
+            If the traces have different shapes, or a label is not 0 or 1; other damage of a label
+            is not noticed here.
+        """
+        scope = Scope(self._database.cell_id) if cell_only else self._scope
+        query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
+        query = query if first <= 1 else query.where(LABEL.c.seq >= int(first))
+        query = query if last is None else query.where(LABEL.c.seq <= last)
+        with self._database.reading() as connection:
+            rows = self._read_newest(connection, query, limit, last)[::-1]
+            labelled, damaged = self._with_traces(connection, rows, scope)
+        self._record_left_out(damaged, "trace")
+        return labelled
+
+    def _read_newest(
+        self, connection: sa.Connection, query: sa.Select[Any], limit: int | None, last: int | None
+    ) -> Sequence[Any]:
+        """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
+
+        The query itself has this limit, order and condition. Of a product only labels with high
+        numbers are read at first, or all would be sorted; if these are too few, the query runs over
+        all.
+        """
+        if self._scope.product is not None and limit is not None:
+            newest = self._scope.newest(connection, LABEL.c.seq)
+            newest = newest if last is None else min(newest, last)
+            rows = connection.execute(query.where(LABEL.c.seq > newest - 2 * limit)).all()
+            if len(rows) == limit or newest <= 2 * limit:
+                return rows
+        return connection.execute(query).all()  # here more than half are quarantined or forgotten
+
+    def news_since(self, seq: int, limit: int) -> ProductNews:
+        """Return what the cells of the product, this one included, stored after label number `seq`.
+
+        Only labels that train are returned, none that was forgotten or of a quarantined trace, with
+        the numbers of the newest version and correction. A trace that is not as it was stored is
+        left out, and an event is written to the store.
+
+        Parameters
+        ----------
+        seq : int
+        limit : int
+            Number of labels at most; the oldest are returned.
+
+        Returns
+        -------
+        ProductNews
+
+        Raises
+        ------
+        StoreError
+            If the traces have different shapes, or a label is not 0 or 1; other damage of a label
+            is not noticed here.
+        """
+        query = (
+            training_query(self._scope)
+            .where(LABEL.c.seq > int(seq))
+            .order_by(LABEL.c.seq)
+            .limit(limit)
+        )
+        with self._database.reading() as connection:
+            labelled, damaged = self._with_traces(
+                connection, connection.execute(query).all(), self._scope
+            )
+            version = self._scope.newest_version(connection)
+            correction = self._scope.newest(connection, CORRECTION.c.number)
+        self._record_left_out(damaged, "trace")
+        return ProductNews(labelled, version, correction)
+
+    def _with_traces(
+        self, connection: sa.Connection, rows: Sequence[Any], scope: Scope
+    ) -> tuple[LabelledTraces, list[str]]:
+        """Read the traces of label rows, which are sorted by number, oldest first.
+
+        Return the labelled traces in this order, and the ids of decisions whose traces are missing
+        or not as they were stored; these are left out. Raise StoreError if traces have different
+        shapes, or a label is not 0 or 1.
+        """
+        labels = {row.seq: row for row in rows}  # the forgotten are not among them
+        traces: dict[int, NDArray[np.float32]] = {}
+        is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
+            TRACE.c.decision_id == LABEL.c.decision_id
+        )
+        query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, is_of_label))
+        query = query.where(scope.shared(LABEL.c.cell_id), TRAINS)
+        first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
+        query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
+        for row in connection.execute(query.execution_options(yield_per=CHUNK)):
+            if row.seq in labels and is_intact(TRACE, row):
+                traces[row.seq] = unpack(row.data).reshape(row.channels, row.samples)
+        shapes = sorted({trace.shape for trace in traces.values()})
+        if len(shapes) > 1:
+            raise StoreError(
+                f"Expected one shape in a cell's store, found {shapes}; give each kind its own "
+                "cell_id."
+            )
+        if not all(row.success in (0, 1) for row in rows):
+            raise StoreError(
+                "Expected labels that are True or False, found another: the store is damaged; "
+                "restore a copy."
+            )
+        kept = [labels[seq] for seq in traces]
+        labelled = LabelledTraces(
+            seq=np.array([row.seq for row in kept], dtype=np.int64),
+            traces=np.stack([*traces.values()]) if traces else np.zeros((0, 0, 0), np.float32),
+            labels=np.array([row.success for row in kept], dtype=np.int8),
+            hashes=np.array([row.content_hash for row in kept], dtype=np.int64),
+        )
+        return labelled, [row.decision_id for row in rows if row.seq not in traces]
+
+    def past(self, after: int, upto: int | None = None) -> list[PastLabel]:
+        """Return this cell's labels as they were recorded, oldest first.
+
+        Labels of quarantined traces are included. A label that is not as it was stored is left out,
+        and an event with its decision's id is written to the store.
+
+        Parameters
+        ----------
+        after : int
+            Only labels after this number.
+        upto : int or None
+            Number of the last label; None: all.
+
+        Returns
+        -------
+        list of PastLabel
+            Corrections are not applied.
+        """
+        query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
+        query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
+        query = query.where(self._own(LABEL), LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
+        rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
+        damaged = {row.decision_id for row in rows if not is_intact(LABEL, row)}
+        self._record_left_out(sorted(damaged), "label")
+        rows = [row for row in rows if row.decision_id not in damaged]
+        return [from_row(PastLabel, row._mapping, novel=row.reason == Reason.NOVEL) for row in rows]
+
+    def outcomes_since(
+        self, seq: int, since_version: int = 0, overdue_to: int = 0
+    ) -> list[OutcomeRecord]:
+        """Return the outcomes with which a rule is updated, as corrected, in the labels' order.
+
+        Left out are labels of rejected parts, since which of them come back is somebody's choice
+        (`Source.INSPECTION`), forgotten labels, and those of quarantined traces. Only this cell's
+        labels count, since those of other cells are no evidence for this one, and a detector of
+        drift that counts them would notice too late that this cell has changed.
+
+        Parameters
+        ----------
+        seq : int
+            Outcomes of labels after this number.
+        since_version : int, default 0
+            Only of decisions by this version or a later one.
+        overdue_to : int, default 0
+            Up to this decision number a check without a label is overdue; 0: none is. An overdue
+            check adds none, one or two outcomes (`overdue_outcomes`), whatever `seq` is. They are
+            inserted where the running engine updated the rule with them; every later label stores
+            that position.
+
+        Returns
+        -------
+        list of OutcomeRecord
+        """
+        label = corrected_label()
+        novel = DECISION.c.reason == Reason.NOVEL.value
+        fields = (
+            LABEL.c.seq,
+            *DECISION.c["lower", "upper"],
+            label == 1,
+            novel,
+            LABEL.c.silent,
+            *audit_columns(),
+        )
+        # A label that does not know came right after its decision, as most do.
+        known_overdue = sa.func.coalesce(LABEL.c.overdue_to, DECISION.c.number)
+        query = sa.select(*fields, known_overdue).select_from(
+            LABEL.join(DECISION, LABEL_OF_DECISION)
+        )
+        query = query.where(
+            self._own(LABEL),
+            TRAINS,
+            LABEL.c.seq > int(seq),
+            LABEL.c.source != Source.INSPECTION.value,
+        )
+        query = query.where(label != FORGOTTEN, DECISION.c.model_version >= since_version)
+        rows = self._read(query.order_by(LABEL.c.seq))
+        overdue: deque[StoredDecision] = deque()
+        if overdue_to:
+            pending = self._decisions.pending(since_version)
+            overdue.extend(item for item in pending if item.number <= overdue_to)
+        outcomes: list[OutcomeRecord] = []
+        for *values, last_overdue in rows:
+            while overdue and overdue[0].number <= last_overdue:
+                outcomes += overdue_outcomes(overdue.popleft().decision)
+            outcomes.append(OutcomeRecord(*values))
+        for item in overdue:
+            outcomes += overdue_outcomes(item.decision)
+        return outcomes
+
+    def silent_total(self, since_version: int = 0) -> int:
+        """Return how many accepted parts went on without a report, as the cell's labels count them.
+
+        Parameters
+        ----------
+        since_version : int, default 0
+            Only labels that came under this version or a later one.
+
+        Returns
+        -------
+        int
+            The sum of `silent`; labels of quarantined traces are left out.
+        """
+        query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
+        query = query.where(self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version)
+        return int(self._read(query)[0][0])
+
+    def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
+        """Record as damage that the trace or label of some decisions was left out.
+
+        `damaged` has the decisions' ids, and `part` is "trace" or "label". Nothing happens without
+        decisions.
+        """
+        if damaged:
+            names = f"decision {listed(damaged)}; see dengine verify"
+            self._events.record_damage(
+                f"left out, since the {part} is not as it was stored: {names}"
+            )

@@ -1,0 +1,164 @@
+"""`DecisionIndex`: the decisions that an engine can look up without its database. It holds the
+newest ones in memory, knows where in the journal the others are that the database lacks, and
+recognizes a new id by a `BloomFilter` over all ids. `JournalledStore` has one.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .journal import Journal, Record, decode_record
+from .recording import Entry
+from .records import NewLabel, StoredDecision
+
+N_RECENT = 1_000  # newest decisions kept in memory
+
+
+class BloomFilter:
+    """A set of decision ids in 2 MB, however many: it may report an id that was never added.
+
+    It never misses an id that was added. At a million ids, one new id in 500 is reported.
+
+    Parameters
+    ----------
+    ids : iterable of str
+        The first ids.
+
+    References
+    ----------
+    Bloom (1970), CACM 13(7).
+    """
+
+    def __init__(self, ids: Iterable[str] = ()) -> None:
+        self._bytes = np.zeros(2**21, dtype=np.uint8)
+        self.add(*ids)
+
+    def add(self, *ids: str) -> None:
+        """Add ids."""
+        byte, bit = self._bit_positions(ids)
+        np.bitwise_or.at(self._bytes, byte, bit)
+
+    def may_contain(self, decision_id: str) -> bool:
+        """Return False if the id was never added, True if it was or (rarely) if it was not."""
+        byte, bit = self._bit_positions([decision_id])
+        return bool((self._bytes[byte] & bit).all())
+
+    def _bit_positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return the four bits of each id, each as an index of a byte and a byte with one bit set.
+
+        Both arrays have four entries per id; the second has dtype uint8.
+        """
+        digests = bytearray()
+        for id_ in ids:
+            digests += blake2b(id_.encode("utf-8", "surrogatepass"), digest_size=16).digest()
+        positions = np.frombuffer(digests, dtype="<u4") % (8 * len(self._bytes))
+        return positions >> 3, np.left_shift(1, positions & 7, dtype=np.uint8, casting="unsafe")
+
+
+class DecisionIndex:
+    """Decisions and labels by id, as far as no database is needed for them.
+
+    It has no lock: whoever shares it between threads holds one.
+
+    Parameters
+    ----------
+    journal : Journal
+        From which decisions are read that are not in memory any more.
+
+    Attributes
+    ----------
+    recent : dict of str to StoredDecision
+        The newest N_RECENT decisions by id, without labels that are not drained.
+    has_all_ids : bool
+        Whether all ids of the database were added.
+    """
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+        self.recent: OrderedDict[str, StoredDecision] = OrderedDict()
+        # Not drained, by decision: the newest record of the decision, and of its label.
+        self._decisions: dict[str, Entry] = {}
+        self._labels: dict[str, tuple[NewLabel, Entry]] = {}
+        self._ids = BloomFilter()
+        self.has_all_ids = False
+
+    def add(self, record: Record, entry: Entry) -> None:
+        """Add a record that was just recorded; an event, which has no id, changes nothing."""
+        if isinstance(record, StoredDecision):
+            id_ = record.decision.id
+            self.recent[id_] = record
+            self._decisions[id_] = entry
+            self._ids.add(id_)
+            if len(self.recent) > N_RECENT:
+                self.recent.popitem(last=False)
+        elif isinstance(record, NewLabel):
+            self._labels[record.decision_id] = record, entry
+
+    def is_replaced(self, entry: Entry) -> bool:
+        """Return whether a later record of the same decision replaces this undrained one."""
+        return bool(entry.decision_id) and self._decisions.get(entry.decision_id) is not entry
+
+    def remove_drained(self, entry: Entry) -> None:
+        """Forget a record that the database has now, or that is lost.
+
+        A decision among the newest N_RECENT stays in memory, and has its label from now on.
+        """
+        if not self.is_replaced(entry):
+            self._decisions.pop(entry.decision_id, None)
+        label = entry.record
+        if isinstance(label, NewLabel):
+            id_ = label.decision_id
+            if self._labels[id_][1] is entry:  # else a later label of the decision waits
+                del self._labels[id_]
+            item = self.recent.get(id_)
+            if item is not None:
+                self.recent[id_] = replace(item, success=label.success, source=label.source)
+
+    def find(
+        self, decision_id: str, unsynced: bool = False
+    ) -> tuple[StoredDecision | None, NewLabel | None]:
+        """Return a decision from memory or from the journal, and its undrained label.
+
+        None for each that is in neither, and for a label that is not on disk yet unless `unsynced`.
+        Raise StoreError if the journal is damaged where the decision stands.
+        """
+        item = self.recent.get(decision_id)
+        entry = self._decisions.get(decision_id)
+        if item is None and entry is not None:
+            record: Any = entry.record or decode_record(self._journal.read(entry.offset))
+            item = record
+        label, place = self._labels.get(decision_id, (None, None))
+        is_counted = unsynced or (place is not None and place.is_synced)
+        return item, label if is_counted else None
+
+    def is_unsynced(self, decision_id: str) -> bool:
+        """Return whether a decision was recorded, and is not in the journal yet."""
+        entry = self._decisions.get(decision_id)
+        return entry is not None and not entry.is_synced
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether any label is not drained."""
+        return bool(self._labels)
+
+    def is_new(self, decision_id: str) -> bool:
+        """Return whether an id certainly has no decision; False if it may have one.
+
+        Until all ids are loaded, False for every id.
+        """
+        return self.has_all_ids and not self._ids.may_contain(decision_id)
+
+    def add_ids(self, ids: Sequence[str]) -> None:
+        """Add ids of decisions that the database has."""
+        self._ids.add(*ids)
+
+    def complete_ids(self) -> None:
+        """Note that all ids of the database were added: every new id is recognized from now on."""
+        self.has_all_ids = True

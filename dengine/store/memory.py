@@ -1,0 +1,112 @@
+"""`MemoryStore`: an engine's way to a store in memory, as replays and tests have it. Records are
+kept in lists, and written to SQLite when somebody reads the store: a replay, which reads nothing,
+never pays for that. An engine that only reads its store, a file or a server, also uses it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from numpy.typing import NDArray
+
+from ..records import RetrainReport
+from .journal import Record
+from .outbox import Outbox
+from .records import NewLabel, StoredDecision, check_state, chunks, new_event
+
+if TYPE_CHECKING:
+    from .sql import SqlStore
+
+T = TypeVar("T")
+MAX_UNWRITTEN_VERSIONS = 40  # about 1.5 MB each
+
+
+class MemoryStore(Outbox):
+    """An outbox without journal, disk and threads; nothing in it waits or is ever unavailable.
+
+    One thread uses it at a time.
+
+    Parameters
+    ----------
+    store : SqlStore
+    window : int
+        Number of newest labels whose integrity is checked.
+    reading : bool, default False
+        The engine only reads.
+    """
+
+    is_thread_safe = False
+
+    def __init__(self, store: SqlStore, window: int, reading: bool = False) -> None:
+        super().__init__(store, window, math.inf, reading)
+        self._unwritten: list[Record] = []
+        self._versions: list[tuple[Any, ...]] = []  # not written: arguments of `versions.put`
+        self._decisions: dict[str, StoredDecision] = {}  # not written, with their labels
+        self._note_integrity(store.database.check_pages())
+        self.check_integrity()
+        self._continue_numbers()
+        store.database.before_use = self._write
+
+    def _write(self) -> None:
+        """Write what was recorded to the database: called before the store is used."""
+        versions = self._versions
+        records = self._unwritten
+        self._versions = []
+        self._unwritten = []
+        self._decisions = {}
+        for version in versions:
+            self.store.versions.put(*version)
+        for part in chunks(records):
+            self.store.apply_records(part)
+
+    def record_decision(self, item: StoredDecision) -> StoredDecision:
+        self.n_decisions += 1
+        item = replace(item, number=self.n_decisions)
+        self._unwritten.append(item)
+        self._decisions[item.decision.id] = item
+        return item
+
+    def replace_decision(self, item: StoredDecision) -> StoredDecision:
+        """Raise KeyError: a decision of a store in memory is never late, so none is replaced."""
+        raise KeyError(item.decision.id)
+
+    def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
+        for item, label in labels:
+            now = self.store.clock()
+            label = replace(label, time=now, content_hash=item.content_hash, decided=item.time)
+            self._unwritten.append(label)
+            if label.decision_id in self._decisions:
+                labelled = replace(item, success=label.success, source=label.source)
+                self._decisions[label.decision_id] = labelled
+
+    def record_event(self, kind: str, text: str) -> None:
+        self._unwritten.append(new_event(kind, text, self.store.clock()))
+        if self._reading:  # nobody may read the store again before it is closed
+            self._write()
+
+    def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
+        return self._decisions.get(decision_id) or self.store.decisions.get(decision_id)
+
+    def store_version(
+        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
+    ) -> Future[int]:
+        """Keep a retrain with copies of its arrays; it is done when this returns.
+
+        It is written with the other records, or when 40 retrains wait: packing one takes as long as
+        many decisions.
+        """
+        self._versions.append((report, last_seq, check_state(report, state), self.store.clock()))
+        if len(self._versions) == MAX_UNWRITTEN_VERSIONS:
+            self._write()
+        future: Future[int] = Future()
+        future.set_result(report.version)
+        return future
+
+    def close(self) -> None:
+        """End the use by this engine; a store in memory stays open, also for another engine."""
+        self._closed = True
+        self.store.close()

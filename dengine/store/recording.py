@@ -1,0 +1,259 @@
+"""`Recorder`: appends what an engine records to its cell's journal, and syncs that to the disk, in
+a thread of its own. `draining.Drainer` takes the synced records from it; `JournalledStore` has
+both.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from ..errors import NotTakenError
+from .journal import Journal, LostJournalError, Record, encode_record
+from .records import StoredDecision, new_event
+
+log = logging.getLogger("dengine")
+BATCH_SECONDS = 0.05  # a record waits so long for others before they are written together
+RETRY_SECONDS = 1.0  # between two attempts after a failure
+LONG = 8 << 20  # bytes of a journal that is to be cleared
+
+
+@dataclass(slots=True, eq=False)
+class Entry:
+    """A record on its way into the database.
+
+    Attributes
+    ----------
+    record : StoredDecision, NewLabel, Event or None
+        None for a decision that is in the journal: its trace takes too much memory.
+    decision_id : str
+        Of a decision; "" for other records.
+    offset, end : int
+        Where it stands in the journal, in bytes; 0 until it is synced.
+    time : float
+        When it was recorded, by `time.monotonic`.
+    """
+
+    record: Record | None
+    decision_id: str
+    offset: int = 0
+    end: int = 0
+    time: float = field(default_factory=time.monotonic)
+
+    @property
+    def is_synced(self) -> bool:
+        """Whether it is in the journal, and synced."""
+        return self.end > 0
+
+    def place(self, offset: int, end: int) -> None:
+        """Note where the record stands in the journal; a decision is not kept in memory."""
+        self.offset = offset
+        self.end = end
+        if self.decision_id:
+            self.record = None
+
+
+class Recorder:
+    """Takes records, and writes them to a journal in batches.
+
+    `start` starts its thread, and `stop` ends it.
+
+    Parameters
+    ----------
+    journal : Journal
+    clock : callable
+        Returns the time, in seconds since 1970.
+    limit : float
+        Seconds after which a sync counts as a fault.
+
+    Attributes
+    ----------
+    changed : threading.Condition
+        With a reentrant lock. It guards the recorder, and is notified of every change.
+    unwritten, synced : deque of Entry
+        Records that are not on disk, and those that are, oldest first; who drains the latter takes
+        them out.
+    n_recorded, n_synced : int
+        Numbers of records so far.
+    """
+
+    def __init__(self, journal: Journal, clock: Callable[[], float], limit: float) -> None:
+        self.synced: deque[Entry] = deque()
+        self.n_recorded = 0
+        self.n_synced = 0
+        self._journal = journal
+        self._clock = clock
+        self._limit = limit
+        self.changed = threading.Condition(threading.RLock())
+        self.unwritten: deque[Entry] = deque()
+        self._wanted = 0  # up to this record somebody waits for a sync
+        self._n_failed = 0  # writes
+        self._began = math.inf  # the sync under way, by `time.monotonic`
+        self._error = ""
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="dengine-journal", daemon=True)
+
+    @property
+    def fault(self) -> str:
+        """Why the journal cannot be written: its last error, or a sync that exceeds the limit.
+
+        "" if it can.
+        """
+        seconds = time.monotonic() - self._began
+        if self._error or seconds <= self._limit:
+            return self._error
+        return f"the disk has not answered for {seconds:.1f} s."
+
+    @property
+    def is_syncing(self) -> bool:
+        """Whether a sync is under way."""
+        return not math.isinf(self._began)
+
+    @property
+    def needs_clearing(self) -> bool:
+        """Whether the journal is so long that its records are to be drained at once."""
+        return self._journal.end > LONG
+
+    @property
+    def oldest(self) -> float | None:
+        """When the oldest record was recorded that is not drained, by `time.monotonic`.
+
+        None if there is none.
+        """
+        for entries in (self.synced, self.unwritten):
+            if entries:
+                return entries[0].time
+        return None
+
+    def record(self, record: Record) -> Entry:
+        """Add a record in memory, and wake the thread that writes it."""
+        id_ = record.decision.id if isinstance(record, StoredDecision) else ""
+        entry = Entry(record, id_)
+        with self.changed:
+            self.n_recorded += 1
+            if not self.unwritten:  # else the thread is awake already
+                self.changed.notify_all()
+            self.unwritten.append(entry)
+        return entry
+
+    def record_event(self, kind: str, text: str) -> None:
+        """Add an event with the present time."""
+        self.record(new_event(kind, text, self._clock()))
+
+    def adopt(self, record: Record, offset: int, end: int) -> Entry:
+        """Add a record that an earlier process left in the journal, where it stands there.
+
+        The thread must not have been started.
+        """
+        entry = self.record(record)
+        entry.place(offset, end)
+        self.n_synced += 1
+        self.synced.append(self.unwritten.popleft())
+        return entry
+
+    def request_sync(self) -> None:
+        """Ask that everything recorded so far be synced at once; do not wait."""
+        with self.changed:
+            self._wanted = self.n_recorded
+            self.changed.notify_all()
+
+    def sync(self, seconds: float | None = None) -> None:
+        """Wait until everything recorded so far is synced, as `Outbox.sync` says."""
+        limit = self._limit if seconds is None else seconds
+        with self.changed:
+            place = self.n_recorded
+            n_failed = self._n_failed
+            self._wanted = place
+            self.changed.notify_all()
+            self.changed.wait_for(
+                lambda: self.n_synced >= place or self._n_failed > n_failed, limit
+            )
+            if self.n_synced < place:
+                reason = self._error or f"the disk gave no answer within {limit:g} s."
+                raise NotTakenError(
+                    f"The record may not be on disk: {reason} "
+                    "Report the same again; once the disk answers it is taken, and counts once."
+                )
+
+    def start(self) -> None:
+        """Start the thread that writes."""
+        self._thread.start()
+
+    def stop(self, seconds: float) -> bool:
+        """End the thread, wait for it, and return whether it ended within these seconds.
+
+        It writes what waits before, once.
+        """
+        with self.changed:
+            self._stopped = True
+            self.changed.notify_all()
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        """Write and sync new records in batches until stopped.
+
+        After an error, which is kept for `fault`, it wakes those who wait in `sync`, and tries the
+        same records again a second later.
+        """
+        while True:
+            with self.changed:
+                self.changed.wait_for(lambda: self.unwritten or self._stopped)
+                self.changed.wait_for(
+                    lambda: self._wanted > self.n_synced or self._stopped, BATCH_SECONDS
+                )
+                batch = list(self.unwritten)
+                if not batch:
+                    return
+                self._began = time.monotonic()
+            try:
+                self._write(batch)
+            except Exception as error:  # whatever it is, the cell goes on, and this thread too
+                with self.changed:
+                    self._error = str(error)
+                    self._n_failed += 1
+                    self._began = math.inf
+                    self.changed.notify_all()
+                    if self._stopped:
+                        return
+                    self.changed.wait(RETRY_SECONDS)
+
+    def _write(self, batch: Sequence[Entry]) -> None:
+        """Append records to the journal, sync it, and hand them on as synced.
+
+        A long journal is cleared first if it is drained within BATCH_SECONDS. Raise StoreError if
+        the disk fails; the records then stay unwritten.
+        """
+        if self.needs_clearing:
+            with self.changed:  # a cell that never pauses would fill the disk
+                self.changed.notify_all()
+                is_drained = self.changed.wait_for(lambda: self._journal.is_drained, BATCH_SECONDS)
+            if is_drained:  # without the lock: a disk that hangs would hang the cell
+                self._journal.clear()
+        blobs = [encode_record(entry.record) for entry in batch if entry.record is not None]
+        try:
+            offsets = self._journal.append(blobs, self._clock())
+        except LostJournalError as error:
+            self._recreate(error)
+            offsets = self._journal.append(blobs, self._clock())
+        with self.changed:
+            ends = [*offsets[1:], self._journal.end]
+            for entry, offset, end in zip(batch, offsets, ends, strict=True):
+                entry.place(offset, end)
+                self.synced.append(self.unwritten.popleft())
+            self.n_synced += len(batch)
+            self._error = ""
+            self._began = math.inf
+            self.changed.notify_all()
+
+    def _recreate(self, error: LostJournalError) -> None:
+        """Create a journal again whose file was lost, and record an event about it."""
+        log.error("%s It is created again with what the store lacks.", error)
+        with self.changed:  # nobody reads it or writes its header meanwhile
+            self._journal.recreate()
+        self.record_event("journal", f"{error} It was created again with what the store lacked.")

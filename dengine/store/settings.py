@@ -1,0 +1,76 @@
+"""`SettingTable`: the settings of a store's cell, as its engine saved them, and those of the other
+cells of its product. `SqlStore` has one.
+"""
+
+from collections.abc import Mapping
+
+import sqlalchemy as sa
+
+from ..errors import StoreError
+from .connections import Database
+from .ledger import read_settings
+from .peers import check_peer_settings
+from .schema import PRODUCT, RESERVED, SETTING, lock
+
+
+class SettingTable:
+    """Reads and replaces the settings of a cell.
+
+    Parameters
+    ----------
+    database : Database
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._scope = database.scope
+
+    def read(self) -> dict[str, str]:
+        """Return the settings that were saved last, by key; {} for a new store."""
+        with self._database.reading() as connection:
+            return read_settings(connection, self._database.cell_id)
+
+    def save(self, settings: Mapping[str, str]) -> None:
+        """Commit new settings in the place of all present ones.
+
+        Raise SettingError if a peer's contradict them, and StoreError for a key that the store
+        itself keeps (`RESERVED`); then nothing is changed.
+        """
+        self._database.write(lambda connection: self.replace(connection, settings))
+
+    def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
+        """Replace the engine's settings of the cell in a write transaction; the store's own stay.
+
+        Raise StoreError for a setting that is the store's own (`RESERVED`), and SettingError if a
+        peer of the product would embed traces differently. The product stays locked until the
+        commit.
+        """
+        for key in sorted(settings.keys() & set(RESERVED)):
+            raise StoreError(
+                f"Expected settings of the engine, got {key!r}, which is the store's; rename it."
+            )
+        if self._scope.product is not None:
+            lock(connection, PRODUCT, self._scope.product)
+            for name, peer_settings in self._read_peers(connection).items():
+                check_peer_settings(settings, peer_settings, name, self._scope.product)
+        is_replaced = self._database.own(SETTING) & SETTING.c.key.not_in(RESERVED)
+        connection.execute(sa.delete(SETTING).where(is_replaced))
+        rows = [
+            {"cell_id": self._database.cell_id, "key": key, "value": value}
+            for key, value in settings.items()
+        ]
+        if rows:
+            connection.execute(sa.insert(SETTING), rows)
+
+    def of_peers(self) -> dict[str, dict[str, str]]:
+        """Return the settings of the product's other cells, by cell; {} without a product.
+
+        A cell without settings is left out.
+        """
+        with self._database.reading() as connection:
+            return self._read_peers(connection)
+
+    def _read_peers(self, connection: sa.Connection) -> dict[str, dict[str, str]]:
+        """Return the settings of the product's other cells, by cell, of those that have some."""
+        peers = self._scope.cells(connection)[1:]
+        return {name: settings for name in peers if (settings := read_settings(connection, name))}

@@ -1,0 +1,247 @@
+"""`VersionTable`: the retrains of a store's cell or product, and the arrays of their model
+versions. `SqlStore` has one.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+from numpy.typing import NDArray
+
+from ..errors import StoreError, instead
+from ..records import RetrainReport
+from .connections import Database
+from .events import EventTable
+from .ledger import state_sum
+from .queries import Scope
+from .records import (
+    ModelVersion,
+    StoredVersion,
+    VersionError,
+    check_state,
+    from_npz,
+    from_row,
+    keeps_state,
+    to_npz,
+    to_row,
+    without_rule,
+)
+from .schema import PRODUCT, VERSION, lock
+
+
+class VersionTable:
+    """Stores and loads model versions.
+
+    Parameters
+    ----------
+    database : Database
+    events : EventTable
+        Takes an event about a version that is damaged.
+    keep : int or None
+        Number of newest versions that keep their states; None: all.
+    """
+
+    def __init__(self, database: Database, events: EventTable, keep: int | None) -> None:
+        self._database = database
+        self._read = database.read
+        self._scope = database.scope
+        self._events = events
+        self._keep = keep
+
+    def put(
+        self,
+        report: RetrainReport,
+        last_seq: int,
+        state: Mapping[str, NDArray[Any]] | None,
+        time: float | None = None,
+    ) -> int:
+        """Commit a retrain, and delete the states of older versions that are no longer kept.
+
+        Parameters
+        ----------
+        report : RetrainReport
+        last_seq : int
+            Number of the newest label that the retrain knew of.
+        state : mapping of str to array, or None
+            The version's arrays; None for a dropped candidate.
+        time : float or None
+            When the retrain ended, in seconds since 1970; None: now.
+
+        Returns
+        -------
+        int
+            The version's number. It is the report's, unless this one is accepted and a peer of the
+            product stored a version meanwhile: then the next.
+
+        Raises
+        ------
+        StoreError
+            For an accepted version without arrays, for an array of Python objects, and if the
+            database fails.
+        """
+        row = self.row(report, last_seq, state, self._database.clock() if time is None else time)
+        return self._database.write(lambda connection: self.insert(connection, row))
+
+    def row(
+        self,
+        report: RetrainReport,
+        last_seq: int,
+        state: Mapping[str, NDArray[Any]] | None,
+        now: float,
+    ) -> dict[str, Any]:
+        """Return the row of a retrain for the table `model_version`, its arrays packed as npz.
+
+        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
+        an accepted version without arrays, and for an array of Python objects.
+        """
+        arrays = check_state(report, state)
+        blob = None if arrays is None else to_npz(arrays)
+        return {
+            "time": now,
+            "last_seq": int(last_seq),
+            "state": blob,
+            "state_sum": state_sum(blob),
+        } | to_row(report)
+
+    def insert(self, connection: sa.Connection, row: dict[str, Any]) -> int:
+        """Insert the row of a retrain; return its version's number.
+
+        For an accepted version this is the next number if a peer of the product has taken the given
+        one; and states that `keeps_state` does not keep are deleted.
+        """
+        number: int = row["version"]
+        if (
+            self._scope.product is not None and row["accepted"]
+        ):  # a peer's may have been stored before
+            lock(connection, PRODUCT, self._scope.product)
+            number = max(number, self._scope.newest_version(connection) + 1)
+        if row["accepted"]:
+            with_state = connection.execute(
+                self._accepted_query().where(VERSION.c.state.is_not(None))
+            ).all()
+            dropped = [
+                stored.retrain
+                for stored in with_state
+                if not keeps_state(stored.version, number, self._keep)
+            ]
+            if dropped:
+                is_dropped = self._scope.shared(VERSION.c.cell_id) & VERSION.c.retrain.in_(dropped)
+                connection.execute(sa.update(VERSION).where(is_dropped).values(state=None))
+        # Afterwards, so that the new state takes the room of those.
+        self._database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
+        return number
+
+    def newest(self) -> ModelVersion | None:
+        """Return the newest accepted version of the cell or its product, with its arrays.
+
+        For a damaged one an event is written to the store, and the one before it is returned.
+
+        Returns
+        -------
+        ModelVersion or None
+            None before the first, and if all that are kept are damaged. A peer's version is
+            returned without the state of its rule.
+        """
+        for i, row in enumerate(self._read(self._accepted_query())):
+            if not row.kept and i > 0:
+                continue  # its state was deleted, which the newest's never is
+            try:
+                return self._load_retrain(row.retrain)
+            except VersionError as error:
+                self._events.record_damage(f"{error} The accepted version before it answers.")
+        return None
+
+    def load(self, version: int) -> ModelVersion:
+        """Return an accepted version of the cell or its product, with its arrays.
+
+        Parameters
+        ----------
+        version : int
+
+        Returns
+        -------
+        ModelVersion
+            A peer's version is returned without the state of its rule.
+
+        Raises
+        ------
+        VersionError
+            If there is no such accepted version, if its state is not kept (the error names the
+            versions whose states are), or if it is damaged.
+        """
+        retrains = {
+            row.version: row.retrain
+            for row in reversed(self._read(self._accepted_query()))
+            if row.kept
+        }
+        if version not in retrains:
+            others = ", ".join(map(str, retrains)) or "none"
+            raise VersionError(
+                f"Expected a held version, got {version}, which is not kept; load one of "
+                f"these: {others}."
+            )
+        return self._load_retrain(retrains[version])
+
+    def _load_retrain(self, retrain: int) -> ModelVersion:
+        """Return the version of a retrain with its arrays.
+
+        A peer's version is returned without the state of its rule, and with a `rule_last_seq` of 0.
+        Raise VersionError if the state is missing or damaged.
+        """
+        query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
+        is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
+        row = self._read(query.where(is_retrain))[0]
+        if row.state is None or (
+            row.state_sum is not None and state_sum(row.state) != row.state_sum
+        ):
+            where = f"as it was stored in {self._database.name}, its bytes have changed"
+            raise VersionError(
+                f"Expected the state of version {row.version} {where}; restore the store from "
+                "a copy."
+            )
+        with instead(VersionError, f"Version {row.version} cannot be read", StoreError):
+            state = from_npz(row.state, self._database.name)
+        if row.cell_id != self._database.cell_id:  # a peer's outcomes are no evidence for this cell
+            state = without_rule(state) | {"rule_last_seq": np.array(0)}
+        return ModelVersion(row.version, row.last_seq, state)
+
+    def all(self, cell_only: bool = False) -> list[StoredVersion]:
+        """Return every retrain of the cell or its product, dropped ones included, oldest first.
+
+        Their arrays are not read.
+
+        Parameters
+        ----------
+        cell_only : bool, default False
+            Leave out those of the product's other cells.
+
+        Returns
+        -------
+        list of StoredVersion
+        """
+        kept = VERSION.c.state.is_not(None).label("kept")
+        n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
+        columns = (column for column in VERSION.c if column.name != "state")
+        query = sa.select(*columns, VERSION.c.retrain.label("number"), n_bytes, kept)
+        scope = Scope(self._database.cell_id) if cell_only else self._scope
+        rows = self._read(query.where(scope.shared(VERSION.c.cell_id)).order_by(VERSION.c.retrain))
+        return [
+            from_row(StoredVersion, row._mapping, report=from_row(RetrainReport, row._mapping))
+            for row in rows
+        ]
+
+    def retrains(self) -> list[RetrainReport]:
+        """Return the report of every retrain of the cell or its product, oldest first."""
+        return [version.report for version in self.all()]
+
+    def _accepted_query(self) -> sa.Select[Any]:
+        """Return the query for the accepted versions of the cell or its product, newest first.
+
+        Its columns are retrain, version, and `kept`, whether the state is kept.
+        """
+        query = sa.select(
+            *VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept")
+        )
+        query = query.where(self._scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
+        return query.order_by(VERSION.c.retrain.desc())
