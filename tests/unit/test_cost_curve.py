@@ -347,7 +347,7 @@ def test_a_search_that_is_interrupted_shows_what_was_finished(
     ids=["local", "pooled", "cost"],
 )
 def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejected(
-    changes: dict[str, Any], reducer: str, make_data: Callable[..., Dataset]
+    changes: dict[str, Any], make_data: Callable[..., Dataset]
 ) -> None:
     data = make_data(160)
     policy = Policy(stops="all").changed(**changes)
