@@ -104,7 +104,6 @@ def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fi
 @pytest.mark.parametrize(
     ("guarantee", "stops", "n"),
     [
-        ("local", "some", 900),
         ("local", "all", 900),
         ("pooled", "some", 1500),
         ("pooled", "all", 900),

@@ -28,7 +28,7 @@ from tests.support.exports import fitted, trained
 NEEDED = ("onnx", "onnxruntime", "onnxscript")
 pytestmark = pytest.mark.skipif(not all(map(find_spec, NEEDED)), reason=f"needs {NEEDED}")
 SPEC = TraceSpec(100, limit=500.0)
-BALLS: list[dict[str, Any]] = [{}, {"interval": "binomial", "radius": 0.5}]
+BALLS = [{}, pytest.param({"interval": "binomial", "radius": 0.5}, marks=pytest.mark.merge)]
 
 
 @pytest.fixture(scope="module")

@@ -328,9 +328,10 @@ def test_a_version_that_was_rolled_back_to_stays_until_somebody_ends_that(
 
 
 @pytest.mark.parametrize(
-    ("part", "start"), [(5, "from initial weights"), (45, "from version 1")], ids=["first", "later"]
+    ("part", "start", "reopens"),
+    [(5, "from initial weights", True), (45, "from version 1", False)],
+    ids=["first", "later"],
 )
-@pytest.mark.parametrize("reopens", [False, True])
 def test_after_forgetting_a_label_the_weights_are_as_if_it_had_been_another(
     part: int, start: str, reopens: bool, make_data, tmp_path: Path
 ) -> None:

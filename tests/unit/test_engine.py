@@ -470,6 +470,7 @@ def test_a_second_thread_in_an_engine_is_refused(data: Dataset) -> None:
         assert deciding.result().action is Action.VERIFY
 
 
+@pytest.mark.merge  # it starts a process
 def test_an_engine_that_retrains_itself_has_loaded_what_a_retrain_imports() -> None:
     program = "import dengine, sys; dengine.DataEngine(); assert 'torch._dynamo' in sys.modules"
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -517,7 +517,7 @@ def told(engine: DataEngine) -> dict[str, list]:
 
 
 @pytest.mark.parametrize(
-    "policy", [LOCAL, replace(LOCAL, stops="all"), replace(LOCAL, audit_rate=0.2), POOLED]
+    "policy", [replace(LOCAL, stops="all"), replace(LOCAL, audit_rate=0.2), POOLED]
 )
 def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told(
     policy: Policy, stream: Dataset, tmp_path: Path

@@ -119,7 +119,9 @@ def test_a_new_cell_decides_at_once_and_as_its_peers_do(
     assert any(second.decide(x).action is Action.ACCEPT for x in parts.X[100:140])
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, CONV], ids=["pca", "conv"])
+@pytest.mark.parametrize(
+    "recipe", [RECIPE, pytest.param(CONV, marks=pytest.mark.merge)], ids=["pca", "conv"]
+)
 def test_one_retrain_serves_all(
     recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:

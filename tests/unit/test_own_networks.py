@@ -202,17 +202,14 @@ def taught(reducer: Any, store: Path | None = None, traces: Any = None) -> DataE
     return engine
 
 
-ANSWERING = (
-    TiedWeights,
-    TwoNames,
-    Recurrent,
-    UnsavedBuffer,
-    PlainTensor,
-    ChangedInTraining,
-    NestedTensors,
-    OwnNumber,
-    WeightNorm,
-)
+ANSWERING = [
+    *(TiedWeights, Recurrent, UnsavedBuffer, PlainTensor, WeightNorm),
+    # Each takes seconds.
+    *(
+        pytest.param(network, marks=pytest.mark.merge)
+        for network in (TwoNames, ChangedInTraining, NestedTensors, OwnNumber)
+    ),
+]
 
 
 @pytest.mark.parametrize("network", ANSWERING)

@@ -326,15 +326,10 @@ def assert_only_fault(
         assert {fault.column for fault in data.faults} == {column}, data.faults
 
 
-@pytest.mark.parametrize("style", [PLAIN, GERMAN], ids=["plain", "german"])
 @pytest.mark.parametrize("layout", [*TEXT_LAYOUTS, "files json", "files jsonl", "long jsonl"])
 @pytest.mark.parametrize("cell", [*CELLS, "", "1,,2"])
-def test_a_cell_that_is_no_number_is_a_fault(
-    tmp_path: Path, layout: str, cell: str, style: Style
-) -> None:
-    if style is PLAIN and "text" in layout and "," in cell:
-        cell = cell.replace(",", "'")
-    written = write(tmp_path, layout, *some(), style, put(cell))
+def test_a_cell_that_is_no_number_is_a_fault(tmp_path: Path, layout: str, cell: str) -> None:
+    written = write(tmp_path, layout, *some(), GERMAN, put(cell))
     is_text, is_wide = "text" in layout, layout == "wide text"
     lines = [written.row + 1 + (0 if is_wide else 7)] if is_text else []
     assert_only_fault(written, lines, "FZ_7" if is_wide else "FZ")
@@ -655,7 +650,7 @@ SECTIONS_ = {name: of_section(name, cls) for name, cls in SECTIONS.items()}
 NOTES = st.dictionaries(st.sampled_from(["text.names", "channels.?", "files"]), st.text())
 
 
-@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.builds(Description, **KEYS_, **SECTIONS_, notes=NOTES))
 def test_a_description_comes_back_from_its_toml(description: Description) -> None:
     columns = {channel.column for channel in description.channels}

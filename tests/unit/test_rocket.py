@@ -8,7 +8,6 @@ import torch
 from scipy.special import expit
 from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
-from sklearn.metrics import roc_auc_score
 
 from dengine import DataEngine, Dataset, Recipe, RocketReducer
 from dengine.datasets.importing import import_labelled
@@ -215,36 +214,6 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
                 for share in np.linspace(0.0, 1.0, N_SHARES)
             ]
         assert min(np.abs(expit(first) - text).max() for first in mixed) < 1e-5
-
-
-def test_where_good_of_one_product_is_bad_of_the_other_the_products_of_components_tell_it() -> None:
-    rng = np.random.default_rng(0)
-    levels = rng.choice([-1.0, 1.0], (400, 2, 1)) + 0.3 * rng.standard_normal((400, 2, 1))
-    time, y = np.linspace(0.0, 1.0, 200), (levels[:, 0, 0] * levels[:, 1, 0] > 0).astype(np.int64)
-    X = (
-        levels[:, 0] * (time < 0.1)
-        + levels[:, 1] * (time > 0.9)
-        + 0.3 * rng.standard_normal((400, 200))
-    )
-    reducer = RocketReducer().fit(X[:150], y[:150])
-    assert roc_auc_score(y[150:], reducer.embed(X[150:, None])[..., 0].mean(1)) > 0.9
-
-
-def test_where_a_resonance_tells_it_kernels_that_compete_sort_better_than_ramps_alone() -> None:
-    rng = np.random.default_rng(0)
-    y = rng.integers(2, size=500)
-    noise = rng.standard_normal((500, 1, 410))
-    echo = np.cos((0.9 + 0.06 * y) * np.arange(10)[:, None]) * 0.8 ** np.arange(10)[:, None]
-    X = sum(
-        noise[..., i : 400 + i] * custom[:, None, None] for i, custom in enumerate(echo)
-    ).astype(np.float32)
-    auc = [
-        roc_auc_score(y[300:], reducer.embed(X[300:])[..., 0].mean(1))
-        for reducer in (
-            item.fit(X[:300], y[:300]) for item in (RocketReducer(groups=0), RocketReducer())
-        )
-    ]
-    assert auc[1] > auc[0] + 0.02
 
 
 def test_where_a_trace_is_flat_every_kernel_of_a_group_counts_alike() -> None:

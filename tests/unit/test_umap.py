@@ -266,6 +266,7 @@ def test_empty_slots_of_the_module_attract_nothing(insertion: Traces, n: int) ->
         assert (places <= high + 1e-3).all()
 
 
+@pytest.mark.merge  # ONNX needs seconds
 def test_both_exports_decide_as_the_model_does(
     make_data: Callable[..., Dataset],
     tmp_path: Path,
