@@ -238,7 +238,7 @@ class Drainer:
                     self._calls
                     or self._stopped
                     or self._wanted > self.n_drained
-                    or self._recorder.needs_clearing
+                    or self._recorder.needs_drain
                 ),
                 DRAIN_SECONDS,
             )

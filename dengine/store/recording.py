@@ -80,12 +80,15 @@ class Recorder:
         them out.
     n_recorded, n_synced : int
         Numbers of records so far.
+    needs_drain : bool
+        The journal is long, and is cleared if its records are drained at once.
     """
 
     def __init__(self, journal: Journal, clock: Callable[[], float], limit: float) -> None:
         self.synced: deque[Entry] = deque()
         self.n_recorded = 0
         self.n_synced = 0
+        self.needs_drain = False
         self._journal = journal
         self._clock = clock
         self._limit = limit
@@ -113,11 +116,6 @@ class Recorder:
     def is_syncing(self) -> bool:
         """Whether a sync is under way."""
         return not math.isinf(self._began)
-
-    @property
-    def needs_clearing(self) -> bool:
-        """Whether the journal is so long that its records are to be drained at once."""
-        return self._journal.end > LONG
 
     @property
     def oldest(self) -> float | None:
@@ -229,10 +227,12 @@ class Recorder:
         A long journal is cleared first if it is drained within BATCH_SECONDS. Raise StoreError if
         the disk fails; the records then stay unwritten.
         """
-        if self.needs_clearing:
-            with self.changed:  # a cell that never pauses would fill the disk
+        if self._journal.end > LONG:  # a cell that never pauses would fill the disk
+            with self.changed:
+                self.needs_drain = True
                 self.changed.notify_all()
                 is_drained = self.changed.wait_for(lambda: self._journal.is_drained, BATCH_SECONDS)
+                self.needs_drain = False
             if is_drained:  # without the lock: a disk that hangs would hang the cell
                 self._journal.clear()
         blobs = [encode_record(entry.record) for entry in batch if entry.record is not None]
