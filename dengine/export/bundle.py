@@ -202,7 +202,7 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
         model_version=engine.version,
         recipe=engine.recipe.to_toml(),
         examples=engine.store.labels.with_traces(N_EXAMPLES).traces,
-        note=engine.store.events.put,
+        note=engine._outbox.record_event,  # it waits for no database
     )
 
 
