@@ -253,10 +253,14 @@ class Drainer:
             self._changed.notify_all()
 
     def _drain_synced(self) -> None:
-        """Drain everything that is synced. Raise StoreError if the database refuses it."""
-        if self._recorder.synced:
+        """Drain everything that is synced by now. Raise StoreError if the database refuses it.
+
+        What is synced meanwhile waits for the next time, or each record would be a transaction.
+        """
+        synced_to = self._recorder.n_synced
+        if self.n_drained < synced_to:
             self._journal.sync_head()
-        while self._recorder.synced:
+        while self.n_drained < synced_to:
             self.drain_chunk()
         self._error = ""
 

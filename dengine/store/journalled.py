@@ -82,7 +82,7 @@ class JournalledStore(Outbox):
             journal.close()
             raise
         self._drainer.pop_label_numbers()  # an engine that resumes reads these labels
-        self._recorder.start()
+        self._recorder.start(kept=store)
         # Only now: a check of the pages that takes long uses the store as well, and needs them.
         self._drainer.start()
         threading.Thread(target=self._load_ids, name="dengine-ids", daemon=True).start()

@@ -99,7 +99,6 @@ class Recorder:
         self._began = math.inf  # the sync under way, by `time.monotonic`
         self._error = ""
         self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="dengine-journal", daemon=True)
 
     @property
     def fault(self) -> str:
@@ -178,8 +177,15 @@ class Recorder:
                     "Report the same again; once the disk answers it is taken, and counts once."
                 )
 
-    def start(self) -> None:
-        """Start the thread that writes."""
+    def start(self, kept: object = None) -> None:
+        """Start the thread that writes, and keep an object alive as long as it runs.
+
+        If a sync hangs when the process ends, nothing else that syncs may be freed with it: SQLite
+        does so as it frees a connection, and the process would never end.
+        """
+        self._thread = threading.Thread(
+            target=self._run, args=(kept,), name="dengine-journal", daemon=True
+        )
         self._thread.start()
 
     def stop(self, seconds: float) -> bool:
@@ -193,7 +199,7 @@ class Recorder:
         self._thread.join(seconds)
         return not self._thread.is_alive()
 
-    def _run(self) -> None:
+    def _run(self, kept: object) -> None:
         """Write and sync new records in batches until stopped.
 
         After an error, which is kept for `fault`, it wakes those who wait in `sync`, and tries the
