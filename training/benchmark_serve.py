@@ -53,7 +53,7 @@ class Server:
 
     def __init__(self, folder: Path, *words: str) -> None:
         command = [sys.executable, "-m", "dengine", "serve"]
-        command += ["--store", "cell.db", "--port", "0", "--rate", "0", *words]
+        command += ["--store", "cell.db", "--port", "0", *words]
         path = os.pathsep.join(filter(None, [str(Path.cwd()), *sys.path]))
         log = folder / "server.log"
         with log.open("a", encoding="utf-8") as errors:

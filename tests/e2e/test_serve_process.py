@@ -98,7 +98,7 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
         "conv", radius=0.05, retrain_every=20, budget=3.0
     )  # seconds: so that a retrain is met
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with started(tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0") as process:
+    with started(tmp_path, "--no-page", "--recipe", "recipe.toml") as process:
         robots = Robots(process.ask, parts)
         threads = robots.start()
         until(lambda: process.ask("/status")["retraining"])
@@ -128,9 +128,7 @@ def test_a_server_that_is_killed_leaves_no_retraining_process_behind(
 ) -> None:
     recipe = Recipe("conv", retrain_every=20, budget=300.0, max_steps=10**6)
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with started(
-        tmp_path, "--no-page", "--recipe", "recipe.toml", "--rate", "0", wait=at_work
-    ) as process:
+    with started(tmp_path, "--no-page", "--recipe", "recipe.toml", wait=at_work) as process:
         if at_work:
             threads = Robots(process.ask, parts).start(1)
             until(lambda: process.ask("/status")["retraining"])
