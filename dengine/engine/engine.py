@@ -447,9 +447,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        Labels of silently confirmed parts, which wait in memory, are recorded first. Afterwards
-        labels that the store has numbered are in the training window. Raises NotTakenError after
-        `wait` seconds; None: the store's own limit.
+        Labels of silently confirmed parts, which wait in memory, are recorded first, so that they
+        are in the training window afterwards. Raises NotTakenError after `wait` seconds; None: the
+        store's own limit.
         """
         self._feedback.store_pending()
         self._outbox.flush(wait)

@@ -102,9 +102,8 @@ class Learner:
         begins in a thread to compute what the next retrain starts with. Raises StoreError where the
         store cannot be read.
         """
-        version = (
-            self._store.versions.newest()
-        )  # before the labels: a peer may store both meanwhile
+        # The version is read before the labels: a peer may store both meanwhile.
+        version = self._store.versions.newest()
         labelled = self._store.labels.with_traces(self._window.capacity)
         self._window.refill(labelled)
         reports = self._store.versions.retrains()

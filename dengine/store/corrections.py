@@ -8,6 +8,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import StoreError
+from .cell_table import CellTable
 from .connections import Database
 from .queries import CORRECTION_OF_LABEL, WITH_LABELS, corrected_label
 from .records import (
@@ -26,7 +27,7 @@ from .settings import SettingTable
 from .versions import VersionTable
 
 
-class CorrectionTable:
+class CorrectionTable(CellTable):
     """Commits changes of people, and reads the corrections of labels.
 
     Parameters
@@ -37,8 +38,7 @@ class CorrectionTable:
     """
 
     def __init__(self, database: Database, settings: SettingTable, versions: VersionTable) -> None:
-        self._database = database
-        self._scope = database.scope
+        super().__init__(database)
         self._settings = settings
         self._versions = versions
 

@@ -11,7 +11,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from ..records import Action, Reason, Source
-from .connections import Database
+from .cell_table import CellTable
 from .ledger import is_intact
 from .queries import (
     SOURCE,
@@ -27,18 +27,11 @@ from .schema import CORRECTION, DECISION, LABEL, TRACE
 from .views import LABELS, DecisionGroup, HistoryFilter, Stretch, Tally
 
 
-class DecisionTable:
+class DecisionTable(CellTable):
     """Reads the decisions of a cell, with their labels after corrections.
 
-    Parameters
-    ----------
-    database : Database
+    It takes what `CellTable` takes.
     """
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-        self._read = database.read
-        self._own = database.own
 
     def get(self, decision_id: str, trace: bool = True) -> StoredDecision | None:
         """Return a decision with its label after corrections.

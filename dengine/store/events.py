@@ -9,7 +9,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .connections import Database
+from .cell_table import CellTable
 from .records import (
     ACKNOWLEDGED,
     POLICY_CHANGED,
@@ -26,18 +26,11 @@ from .schema import DECISION, EVENT
 log = logging.getLogger("dengine")
 
 
-class EventTable:
+class EventTable(CellTable):
     """Reads and writes the events of a cell.
 
-    Parameters
-    ----------
-    database : Database
+    It takes what `CellTable` takes.
     """
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-        self._read = database.read
-        self._own = database.own
 
     def put(
         self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""

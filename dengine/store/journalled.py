@@ -215,9 +215,7 @@ class JournalledStore(Outbox):
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
         with self._changed:
             for item, label in labels:
-                now = self.store.clock()
-                hash_ = item.content_hash
-                label = replace(label, time=now, content_hash=hash_, decided=item.time)
+                label = self._completed(item, label)
                 self._index.add(label, self._recorder.record(label))
 
     def record_event(self, kind: str, text: str) -> None:
@@ -252,7 +250,7 @@ class JournalledStore(Outbox):
         if item is None and not self._index.is_new(decision_id):
             item = self.call_store(lambda: self.store.decisions.get(decision_id))
         if item is not None and label is not None:
-            item = replace(item, success=label.success, source=label.source)
+            item = item.with_label(label)
         return item
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError, listed
 from ..records import Reason, Source
+from .cell_table import CellTable
 from .connections import Database
 from .decisions import DecisionTable
 from .events import EventTable
@@ -39,7 +40,7 @@ from .schema import CORRECTION, DECISION, LABEL, TRACE
 from .views import PastLabel
 
 
-class LabelTable:
+class LabelTable(CellTable):
     """Reads labels. What is not as it was stored is left out, and an event says so.
 
     Parameters
@@ -51,10 +52,7 @@ class LabelTable:
     """
 
     def __init__(self, database: Database, decisions: DecisionTable, events: EventTable) -> None:
-        self._database = database
-        self._read = database.read
-        self._own = database.own
-        self._scope = database.scope
+        super().__init__(database)
         self._decisions = decisions
         self._events = events
 

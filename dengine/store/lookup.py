@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from hashlib import blake2b
 from typing import Any
 
@@ -119,7 +118,7 @@ class DecisionIndex:
                 del self._labels[id_]
             item = self.recent.get(id_)
             if item is not None:
-                self.recent[id_] = replace(item, success=label.success, source=label.source)
+                self.recent[id_] = item.with_label(label)
 
     def find(
         self, decision_id: str, unsynced: bool = False

@@ -76,12 +76,10 @@ class MemoryStore(Outbox):
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
         for item, label in labels:
-            now = self.store.clock()
-            label = replace(label, time=now, content_hash=item.content_hash, decided=item.time)
+            label = self._completed(item, label)
             self._unwritten.append(label)
             if label.decision_id in self._decisions:
-                labelled = replace(item, success=label.success, source=label.source)
-                self._decisions[label.decision_id] = labelled
+                self._decisions[label.decision_id] = item.with_label(label)
 
     def record_event(self, kind: str, text: str) -> None:
         self._unwritten.append(new_event(kind, text, self.store.clock()))

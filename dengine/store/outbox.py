@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from numpy.typing import NDArray
@@ -193,6 +194,11 @@ class Outbox(ABC):
         labels : iterable of (StoredDecision, NewLabel)
             Each label, with a number of `number_label`, and its decision.
         """
+
+    def _completed(self, item: StoredDecision, label: NewLabel) -> NewLabel:
+        """Return a label with the present time, and with hash and time of its decision."""
+        hash_ = item.content_hash
+        return replace(label, time=self.store.clock(), content_hash=hash_, decided=item.time)
 
     @abstractmethod
     def record_event(self, kind: str, text: str) -> None:

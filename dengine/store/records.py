@@ -11,7 +11,7 @@ import json
 import os
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
 from functools import lru_cache, partial
@@ -240,6 +240,10 @@ class StoredDecision:
         if self.success is None:
             return "none"
         return "good" if self.success else "bad"
+
+    def with_label(self, label: NewLabel) -> Self:
+        """Return a copy that has the success and the source of a label."""
+        return replace(self, success=label.success, source=label.source)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,23 +7,17 @@ from collections.abc import Mapping
 import sqlalchemy as sa
 
 from ..errors import StoreError
-from .connections import Database
+from .cell_table import CellTable
 from .ledger import read_settings
 from .peers import check_peer_settings
 from .schema import PRODUCT, RESERVED, SETTING, lock
 
 
-class SettingTable:
+class SettingTable(CellTable):
     """Reads and replaces the settings of a cell.
 
-    Parameters
-    ----------
-    database : Database
+    It takes what `CellTable` takes.
     """
-
-    def __init__(self, database: Database) -> None:
-        self._database = database
-        self._scope = database.scope
 
     def read(self) -> dict[str, str]:
         """Return the settings that were saved last, by key; {} for a new store."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import StoreError, instead
 from ..records import RetrainReport
+from .cell_table import CellTable
 from .connections import Database
 from .events import EventTable
 from .ledger import state_sum
@@ -30,7 +31,7 @@ from .records import (
 from .schema import PRODUCT, VERSION, lock
 
 
-class VersionTable:
+class VersionTable(CellTable):
     """Stores and loads model versions.
 
     Parameters
@@ -43,9 +44,7 @@ class VersionTable:
     """
 
     def __init__(self, database: Database, events: EventTable, keep: int | None) -> None:
-        self._database = database
-        self._read = database.read
-        self._scope = database.scope
+        super().__init__(database)
         self._events = events
         self._keep = keep
 
