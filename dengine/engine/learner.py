@@ -13,6 +13,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -38,6 +39,7 @@ from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 log = logging.getLogger("dengine")
 # So many labels without any retrain were imported, and the first training is worth preparing.
 IMPORTED = 500
+PATIENCE = 20  # steps that a candidate leaves to the thread that stores its labels
 
 
 class Learner:
@@ -376,13 +378,14 @@ class Learner:
     def _see_through(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
         """See a candidate through from its training to its first answer.
 
-        The order has reasons. A model that does not answer as it was trained costs no commit, so it
-        is compared first. A version is stored with every label that came until then. It is stored
-        before it answers, since it would otherwise be gone with the process while its decisions
-        stay. While it is stored more labels may come, so it catches up once more.
+        A model that does not answer as it was trained costs no commit, so it is compared first. A
+        version is stored with every label that came until then. It is stored before it answers:
+        else a killed process would leave decisions of a version that nobody has. While it is stored
+        more labels may come, so it catches up once more.
 
         Yields after each step: None, or, where the store has not done its part yet, a function that
-        waits for it. Raises StoreError where the version cannot be stored; nothing after that.
+        waits for it. Raises StoreError if the version cannot be stored. The functions that it
+        yields raise StoreError if the labels cannot.
         """
         yield from candidate.check()
         yield from self._catch_up_candidate(candidate)
@@ -395,19 +398,25 @@ class Learner:
         self._swap(candidate)
 
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
-        """Make the candidate's references complete: a label with each step, once all are stored.
+        """Make references of all labels that came, one with each step, and have them stored.
 
-        Yields as `_see_through` does. It ends when no label is on its way to the store or missing.
+        Yields as `_see_through` does. It ends when no label is missing or on its way to the store.
+        In a cell that never pauses some label always is, so every `PATIENCE`-th time it waits here.
         """
-        is_missing = True
-        while is_missing:
+        n_waits = 0
+        while True:
             self._feedback.store_pending()
-            while self._outbox.request_label_drain():
-                yield self._outbox.drain
             self._feedback.number_labels()
-            is_missing = candidate.learn_next(self._window)
-            if is_missing:
+            while candidate.learn_next(self._window):
                 yield None
+            if not self._outbox.request_label_drain():
+                return
+            n_waits += 1
+            if n_waits % PATIENCE == 0:
+                with suppress(StoreError):
+                    self._outbox.drain()
+                    continue
+            yield self._outbox.drain
 
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
         """Complete the candidate's report, and submit report and model to the thread that stores
@@ -612,9 +621,9 @@ class Learner:
         """Let the earlier version `number` answer again, as a new version that is pinned, and store
         it with `event`.
 
-        The order has reasons. Until the version is stored nothing changes, so all that can fail
-        comes before: reading it, restoring it, and adding the later labels, up to the window's
-        capacity, as its references. Once it answers, news of peers is taken in, which become its
+        Until the version is stored nothing changes, so all that can fail comes before: reading it,
+        restoring it, and adding the later labels, up to the window's capacity, as its references.
+        Once it answers, news of peers is taken in, which become its
         references as well, and only then new labels count from zero: none that it knows is new.
 
         Raises StoreError for a version that is not kept, where a trace is damaged that the model

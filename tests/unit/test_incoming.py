@@ -74,6 +74,17 @@ def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(engine: D
     assert (report.version, report.n_traces, report.accepted, engine.version) == (1, 40, True, 1)
 
 
+def test_a_cell_that_never_pauses_gets_its_version(data: Dataset, tmp_path: Path) -> None:
+    pool = Held()
+    store = tmp_path / "engine.db"
+    with DataEngine(model=Counting(), recipe=RECIPE, executor=pool, store=store) as engine:
+        learn(engine, data, range(56))
+        pool.go.set()
+        pool.shutdown(wait=True)
+        learn(engine, data, range(56, 156))  # at each moment the store lacks a label
+        assert engine.version > 0
+
+
 def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(
     data, tmp_path: Path
 ) -> None:
