@@ -503,21 +503,23 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             VERIFY with `Reason.LATE`, without asking the model; a fault of the trace, or of the
             store, is the reason instead.
         wait : bool, default True
-            False is for a server that answers by a deadline. The call does not wait for another
-            call of the engine, nor for the disk; any thread may make it, and has one torch thread
-            from then on. It returns None, and changes nothing, where that cannot be: with an id,
-            before the first trace, while something is to be stored or rebuilt first, and where the
-            model is a baseline, uses classes of the user's or is not compiled. A trained version is
-            swapped in, and a safe mode announced, only by a later call of `poll`. No other thread
-            may use the engine meanwhile. With `timed_out` one may: the VERIFY is then recorded
-            beside its call, and waits for the disk, but not with a store in memory or before the
-            first trace; then ask for it again, with `wait`, in the engine's thread.
+            False is for a server that answers by a deadline: the call waits neither for another
+            call of the engine nor for the disk. Any thread may make it while no other thread uses
+            the engine; it has one torch thread from then on. The call returns None, and changes
+            nothing, if it cannot decide at once. That is so with an id, before the first trace,
+            while something must be stored or rebuilt first, and if the model is a baseline, uses
+            classes of the user's or is not compiled. Only a later `poll` lets a trained version
+            answer, and calls `on_safe_mode`.
+            With `timed_out` another thread may use the engine meanwhile. The VERIFY is recorded
+            beside that thread's call, and this call waits for the disk. With a store in memory,
+            and before the first trace, it is not recorded: call again with `wait`, in the engine's
+            thread.
 
         Returns
         -------
         Decision or None
-            None only with wait=False. VERIFY where anything else than the errors below fails. Where
-            an id cannot be looked up, the VERIFY is not recorded.
+            None only with wait=False. If anything fails that is not an error below, the decision is
+            VERIFY. If an id cannot be looked up, this VERIFY is not recorded.
 
         Raises
         ------
@@ -761,18 +763,20 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def retrain(self, wait: bool) -> RetrainReport | None: ...
 
     def retrain(self, wait: bool = True) -> RetrainReport | None:
-        """Retrain now, in this thread, and return the report; the new version is not pinned.
+        """Retrain now, in this thread, and return the report.
 
-        A version that fails, or cannot be stored, is dropped: the report has `accepted` False then.
-        Raises StoreError where the labels before it cannot be stored.
+        A pinned version is released first, as by `release`. A version that fails, or cannot be
+        stored, is dropped: the report has `accepted` False then. Raises StoreError if the labels
+        that came before cannot be stored.
 
         Parameters
         ----------
         wait : bool, default True
             False: begin to retrain in the executor, and return None, also if a retrain is under
-            way; `poll` brings it to its end. Without an executor it is the same as True. True ends
-            what is under way, and first waits for the imports that began with the engine, some two
-            seconds after its start.
+            way; `poll` brings it to its end. Without an executor it retrains in this thread.
+            True: a version that is trained is first brought to its end, and a training that is not
+            done is discarded. In the first two seconds of an engine the call also waits for the
+            modules that a retrain imports.
 
         Returns
         -------
@@ -792,15 +796,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def poll(self, brief: bool = False) -> RetrainReport | None:
         """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
 
-        `run` does so after each part. In a loop of your own, `decide` and `report` do all of it as
-        well, but for a version that the executor has trained only a step each.
+        `run` does so after each part. In a loop of your own, `decide` and `report` do the same,
+        except that each call brings a version that the executor has trained only one step further.
+        Without an executor a retrain that is due runs here, also with `brief`.
 
         Parameters
         ----------
         brief : bool, default False
-            A version that the executor has trained comes one step further, a few milliseconds;
-            else to its end, so that it answers or is dropped. Where cells share a product it always
-            comes to its end.
+            True: bring a version that the executor has trained only one step further, which takes
+            a few milliseconds. False: bring it to its end, so that it answers or is dropped. If
+            cells share a product, it is always brought to its end.
 
         Returns
         -------

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from ..errors import StoreError, listed
 from .journal import Journal, Record, decode_record
 from .lookup import DecisionIndex
-from .recording import RETRY_SECONDS, Entry, Recorder
+from .recording import RETRY_SECONDS, Recorder
 from .records import DATA_LOST, LOSS_REMEDY
 
 if TYPE_CHECKING:
@@ -107,7 +107,10 @@ class Drainer:
             self._recorder.request_sync()
 
     def drain(self) -> None:
-        """Wait until everything recorded so far is drained, as `Outbox.drain` says."""
+        """Wait until everything recorded so far is drained, as `Outbox.drain` says.
+
+        If that takes too long, the store has a `fault` until it answers again.
+        """
         with self._changed:
             if self.is_drained:
                 return
@@ -274,19 +277,27 @@ class Drainer:
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))
         records: list[Record] = []
-        damaged: list[Entry] = []
+        n_damaged = 0
+        lost: list[str] = []
         for entry in chunk:
             if self._index.is_replaced(entry):
                 continue
             try:
                 records.append(decode_record(self._journal.read(entry.offset)))
             except StoreError:
-                damaged.append(entry)
+                n_damaged += 1
                 copy = entry.record or self._index.recent.get(entry.decision_id)
-                if copy is not None:
+                if copy is None:
+                    lost.append(entry.decision_id)
+                else:
                     records.append(copy)
         numbers = self._store.apply_records(records)
-        self._report_damage(damaged)
+        if n_damaged:
+            self.report(
+                DATA_LOST if lost else "journal",
+                f"{n_damaged} records of the journal were damaged on disk and are stored from "
+                f"memory; decisions that are lost: {listed(lost) or 'none'}.",
+            )
         with self._changed:
             self._journal.drained_to = chunk[-1].end
             self._journal.head.n_drained += len(chunk)
@@ -298,25 +309,6 @@ class Drainer:
                 self._index.remove_drained(entry)
             self.n_drained += len(chunk)
             self._changed.notify_all()
-
-    def _report_damage(self, damaged: list[Entry]) -> None:
-        """Commit an event about records that were damaged in the journal; without any, none.
-
-        It names the decisions that are not in memory any more and so are lost. Raise StoreError if
-        the database refuses the event.
-        """
-        if not damaged:
-            return
-        lost = [
-            entry.decision_id
-            for entry in damaged
-            if not (entry.record or self._index.recent.get(entry.decision_id))
-        ]
-        self.report(
-            DATA_LOST if lost else "journal",
-            f"{len(damaged)} records of the journal were damaged on disk and are stored from "
-            f"memory; decisions that are lost: {listed(lost) or 'none'}.",
-        )
 
     def report(self, kind: str, text: str) -> None:
         """Log an error, and commit it to the store as an event, directly and not by the journal."""

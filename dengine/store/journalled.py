@@ -229,9 +229,9 @@ class JournalledStore(Outbox):
 
     def request_label_drain(self) -> bool:
         with self._changed:
-            if self._index.has_labels:
+            if self._index.has_undrained_labels:
                 self._drainer.request()
-            return self._index.has_labels
+            return self._index.has_undrained_labels
 
     def pop_label_numbers(self) -> list[tuple[str, int]]:
         return self._drainer.pop_label_numbers()
@@ -272,7 +272,7 @@ class JournalledStore(Outbox):
         for ids in self.store.decisions.ids():
             with self._changed:
                 self._index.add_ids(ids)
-        self._index.complete_ids()
+        self._index.has_all_ids = True
 
     def _load_ids(self) -> None:
         """Load the ids, again after each failure, until that succeeds or the outbox is closed.

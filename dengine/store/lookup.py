@@ -62,7 +62,10 @@ class BloomFilter:
 
 
 class DecisionIndex:
-    """Decisions and labels by id, as far as no database is needed for them.
+    """Finds decisions and labels by id in memory and in the journal, without the database.
+
+    It holds the newest decisions, every record that is not drained, and a Bloom filter of all ids,
+    which tells ids that are certainly new.
 
     It has no lock: whoever shares it between threads holds one.
 
@@ -74,7 +77,7 @@ class DecisionIndex:
     Attributes
     ----------
     recent : dict of str to StoredDecision
-        The newest N_RECENT decisions by id, without labels that are not drained.
+        The newest N_RECENT decisions by id, with those labels that are drained.
     has_all_ids : bool
         Whether all ids of the database were added.
     """
@@ -143,7 +146,7 @@ class DecisionIndex:
         return entry is not None and not entry.is_synced
 
     @property
-    def has_labels(self) -> bool:
+    def has_undrained_labels(self) -> bool:
         """Whether any label is not drained."""
         return bool(self._labels)
 
@@ -157,7 +160,3 @@ class DecisionIndex:
     def add_ids(self, ids: Sequence[str]) -> None:
         """Add ids of decisions that the database has."""
         self._ids.add(*ids)
-
-    def complete_ids(self) -> None:
-        """Note that all ids of the database were added: every new id is recognized from now on."""
-        self.has_all_ids = True

@@ -98,7 +98,10 @@ def opening(
 def open_outbox(
     store: SqlStore, window: int, *, reading: bool = False, patient: bool = False
 ) -> Outbox:
-    """Open what an engine records and looks up by, as it fits the store.
+    """Open the outbox by which an engine records and looks up, in the way that fits its store.
+
+    A `JournalledStore` claims the cell, drains what an earlier process left in the journal, and
+    starts its threads. Closing the outbox closes the store.
 
     Parameters
     ----------
@@ -108,7 +111,7 @@ def open_outbox(
     reading : bool, default False
         The engine only reads, so it does not own the cell.
     patient : bool, default False
-        Wait for disk and database without a time limit.
+        Wait for disk and database without a time limit, as a `MemoryStore` always does.
 
     Returns
     -------

@@ -169,10 +169,11 @@ class Outbox(ABC):
         """
 
     def number_label(self) -> int:
-        """Return a number for a new label, the next one of the cell's journal.
+        """Return the next number for a new label; each call uses up a number.
 
-        In a product it is negative and only provisional, since the store numbers the labels of all
-        cells: `pop_label_numbers` says which number a label got.
+        The numbers go on from the newest label of the cell's store. In a product they are negative
+        and only provisional, since the store numbers the labels of all its cells:
+        `pop_label_numbers` says which number a label got.
         """
         self._newest_label += 1 if self.store.product is None else -1
         return self._newest_label
@@ -330,7 +331,12 @@ class Outbox(ABC):
     def store_version(
         self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
     ) -> Future[int]:
-        """Begin to commit a retrain, as `SqlStore.versions.put` does, and return without waiting.
+        """Begin to commit a retrain, and return without waiting.
+
+        Parameters
+        ----------
+        report, last_seq, state
+            As of `VersionTable.put`.
 
         Returns
         -------

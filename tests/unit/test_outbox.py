@@ -317,11 +317,11 @@ def test_a_drainer_alone_stores_what_is_synced_and_makes_calls(
     records = [stored("a"), NewLabel("a", True, Source.VERIFICATION, 0, None)]
     for record in records:
         index.add(record, recorder.record(record))
-    assert (drainer.is_drained, index.has_labels) == (False, True)
+    assert (drainer.is_drained, index.has_undrained_labels) == (False, True)
     recorder.start()
     drainer.start()
     drainer.drain()
-    assert (drainer.is_drained, index.has_labels, drainer.n_drained) == (True, False, 2)
+    assert (drainer.is_drained, index.has_undrained_labels, drainer.n_drained) == (True, False, 2)
     assert drainer.wait_for_result(drainer.submit(store.decisions.newest_number)) == 1
     with pytest.raises(ZeroDivisionError):
         drainer.wait_for_result(drainer.submit(lambda: 1 // 0))
@@ -347,6 +347,6 @@ def test_an_index_finds_decisions_in_memory_and_in_the_journal_until_they_are_dr
     index.remove_drained(entry)
     assert index.find("a") == (None, None)
     assert not index.is_new("c")  # not all ids are known
-    index.complete_ids()
+    index.has_all_ids = True
     assert [index.is_new(name) for name in "abc"] == [False, False, True]
     assert recorder.stop(10.0)
