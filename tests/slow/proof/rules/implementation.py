@@ -29,7 +29,7 @@ NOVEL_SHARE = 0.2
 CALM = 25.0
 ENDINGS = {"local": "likelihood", "pooled": "bet", "cost": "account"}
 FEWEST_SINCE_ALARM = 25
-OVERDRAFTS = (3.0, 0.0)  # of accepting and of rejecting, in wrong decisions
+OVERDRAFTS = (2.0, 0.0)  # of accepting and of rejecting, in wrong decisions
 BET_SHARES = np.array([0.05, 0.1, 0.2, 0.4, 0.7, 0.98])
 
 
