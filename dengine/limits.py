@@ -1,8 +1,9 @@
 """An operator's limits of the force: the class `ForceLimits` and its text form, START:END:LOW:HIGH.
 A `Policy` holds them, and a part whose trace leaves them is verified or rejected.
 
-`Policy(windows=...)` takes them as objects or as texts, `--window` as text, and a store keeps the
-text. `traces.ForceLimitsGate` checks a trace against them, in the engine and in exported files.
+`Policy(force_limits=...)` takes them as objects or as texts, `--force-limit` as text, and a store
+keeps the text. `traces.ForceLimitsGate` checks a trace against them, in the engine and in exported
+files.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ class ForceLimits:
         valid = valid and _is_channel(self.channel)
         valid = valid and (self.along is None or _is_channel(self.along))
         wanted = "start <= end, low <= high, one of these finite, and channels from 0 on, or names"
-        expect(valid, f"a window with {wanted}", self)
+        expect(valid, f"force limits with {wanted}", self)
 
     def __str__(self) -> str:
         fields = [_number_text(value) for value in (self.start, self.end, self.low, self.high)]
@@ -93,7 +94,9 @@ class ForceLimits:
             raise
         except (TypeError, ValueError) as error:
             form = "START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
-            raise SettingError(f"Expected windows as {form}, got {shortened(text)}.") from error
+            raise SettingError(
+                f"Expected force limits as {form}, got {shortened(text)}."
+            ) from error
 
 
 def _is_channel(value: Any) -> bool:

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .decision.policy import Policy, check_radius
+from .decision.policy import OLD_NAME, Policy, check_radius
 from .errors import SettingError, StoreError, expect, instead, listed
 from .files import toml_value
 from .records import is_number, is_whole
@@ -219,6 +219,7 @@ class Recipe:
             isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer
         )
         expect(isinstance(policy, Mapping), f"in {where} policy to be a table, [policy]", policy)
+        policy = {"force_limits" if name == OLD_NAME else name: policy[name] for name in policy}
         _check_keys(policy, Policy, f"{where}, policy,")
         if isinstance(table.get("params"), Mapping):
             table["params"] = _with_none(table["params"])

@@ -9,7 +9,7 @@ what a cell returned.
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
+from enum import IntEnum, StrEnum
 from numbers import Integral, Real
 from typing import Any
 
@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .errors import ReportError, SettingError, StoreError, expect, instead, shortened
-from .representation import to_html
 
 PartNumber = str | int | None  # as a caller gives it
 TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
@@ -44,14 +43,19 @@ def is_number(value: Any) -> bool:
 
 
 class Action(StrEnum):
-    """What the cell does next.
-
-    Exported files give the position in this list: 0 for VERIFY, the safe action.
-    """
+    """What the cell does next. Compiled modules and exported files give its `ActionCode`."""
 
     VERIFY = "verify"
     ACCEPT = "accept"
     REJECT = "reject"
+
+
+class ActionCode(IntEnum):
+    """The integer that stands for an `Action`, its position there: 0 is the safe action."""
+
+    VERIFY = 0
+    ACCEPT = 1
+    REJECT = 2
 
 
 class Reason(StrEnum):
@@ -266,8 +270,6 @@ class Decision:
         alone = f", alone the model would {self.predicted.value}" if self.audit else ""
         summary = f"{self.action.value}, {self.reason.value}: {bound}{alone}"
         return f"<Decision {summary}, version {self.model_version}, id {self.id}>"
-
-    _repr_html_ = to_html
 
     @property
     def inclusion_probability(self) -> float:

@@ -1,33 +1,12 @@
-"""How records are shown: as HTML in a notebook, and as values that `json` takes. Records and
-replays, the command line and the HTTP service use these functions.
-
-`to_html` is the `_repr_html_` of every record that prints itself. `to_jsonable` makes what
-`--json` of the command line and the HTTP service answer.
-"""
+"""`to_jsonable` makes of a record what `--json` of the command line and the HTTP service answer."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
-from html import escape
 from typing import Any
 
 from .errors import without_password
-
-
-def to_html(record: Any) -> str:
-    """Return the `repr` of a record as an HTML table, for its `_repr_html_`.
-
-    The text before the first ": " is the heading; each part behind it, between ", ", is a row. The
-    texts in its attribute `sentences`, if it has one, are paragraphs below the table. All is
-    escaped.
-    """
-    title, _, parts = repr(record).strip("<>").partition(": ")
-    left = "style='text-align: left'"
-    rows = "".join(f"<tr><td {left}>{escape(part)}</td></tr>" for part in parts.split(", "))
-    sentences = getattr(record, "sentences", ())
-    paragraphs = "".join(f"<p>{escape(sentence)}</p>" for sentence in sentences)
-    return f"<table><tr><th {left}>{escape(title)}</th></tr>{rows}</table>{paragraphs}"
 
 
 def to_jsonable(value: Any) -> Any:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from .errors import DataError, SettingError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .limits import ForceLimits
-from .records import FITS, REASONS, Reason, TraceArray, TraceSpec
+from .records import FITS, REASONS, ActionCode, Reason, TraceArray, TraceSpec
 
 NOT_FINITE = REASONS.index(Reason.NOT_FINITE)
 CONSTANT = REASONS.index(Reason.CONSTANT)
@@ -331,16 +331,19 @@ class TraceGate(nn.Module):
         return reason, int(torch.dot(steps, self.weights).item())
 
 
-def check_rate(windows: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> None:
+def check_rate(force_limits: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> None:
     """Raise SettingError if a force limit is in seconds and the rate of the traces is unknown.
 
     It is unknown without a contract, too: the first trace does not tell its rate.
     """
-    in_seconds = [window for window in windows if window.along is None]
+    in_seconds = [limits for limits in force_limits if limits.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
         why = f"because force limits are in seconds ({listed(in_seconds)})"
         do = "state time.rate_hz of recordings, or start with TraceSpec(samples=..., rate_hz=...)"
         raise SettingError(f"Expected the rate of the traces, {why}, got an unknown one; {do}.")
+
+
+WITHIN_LIMITS = -1  # in place of an `ActionCode`
 
 
 class ForceLimitsGate(nn.Module):
@@ -350,7 +353,7 @@ class ForceLimitsGate(nn.Module):
 
     Parameters
     ----------
-    windows : sequence of ForceLimits
+    force_limits : sequence of ForceLimits
     trace_spec : TraceSpec
         Shape of the traces, their rate and the names of their columns.
 
@@ -366,9 +369,10 @@ class ForceLimitsGate(nn.Module):
     action: Tensor
     time: Tensor
 
-    def __init__(self, windows: Sequence[ForceLimits], trace_spec: TraceSpec) -> None:
+    def __init__(self, force_limits: Sequence[ForceLimits], trace_spec: TraceSpec) -> None:
         super().__init__()
-        check_rate(windows, trace_spec)
+        self.within = WITHIN_LIMITS
+        check_rate(force_limits, trace_spec)
         rate = trace_spec.rate_hz or 1.0  # if it is unknown, no limit reads the times
         time = torch.tensor([[i / rate for i in range(trace_spec.samples)]])
         rows: dict[Any, int] = {None: trace_spec.channels}  # time is the row behind the channels
@@ -376,15 +380,15 @@ class ForceLimitsGate(nn.Module):
         rows |= {name: i for i, name in enumerate(trace_spec.columns)}
         shape = f"{trace_spec.channels} x {trace_spec.samples} samples"
         shape += f" at {rate:g} Hz" if trace_spec.rate_hz else ""
-        wanted = f"a window on some of {shape} {listed(trace_spec.columns)}".rstrip()
-        for window in windows:
-            start, end = torch.tensor([window.start, window.end])
-            has_samples = window.along is not None or bool(((time >= start) & (time <= end)).any())
-            has_channels = {window.channel, window.along} <= rows.keys()
-            expect(has_samples and has_channels, wanted, str(window))
-        limits = [(window.start, window.end, window.low, window.high) for window in windows]
-        channels = [(rows[window.channel], rows[window.along]) for window in windows]
-        action = [1 + window.reject for window in windows]
+        wanted = f"force limits on some of {shape} {listed(trace_spec.columns)}".rstrip()
+        for item in force_limits:
+            start, end = torch.tensor([item.start, item.end])
+            has_samples = item.along is not None or bool(((time >= start) & (time <= end)).any())
+            has_channels = {item.channel, item.along} <= rows.keys()
+            expect(has_samples and has_channels, wanted, str(item))
+        limits = [(item.start, item.end, item.low, item.high) for item in force_limits]
+        channels = [(rows[item.channel], rows[item.along]) for item in force_limits]
+        action = [ActionCode.REJECT if item.reject else ActionCode.VERIFY for item in force_limits]
         limits_tensor = torch.tensor(limits, dtype=torch.float32).reshape(-1, 4, 1)
         self.register_buffer("limits", limits_tensor)
         channels_tensor = torch.tensor(channels, dtype=torch.int64).reshape(-1, 2)
@@ -395,18 +399,18 @@ class ForceLimitsGate(nn.Module):
     def forward(self, x: Tensor) -> int:
         """Check a trace (C, T) of float32.
 
-        Returns 0 if it keeps all limits, or there are none; 1 if it leaves one and is to be
-        verified; 2 if it leaves one that rejects. A trace without a sample in the stretch of a
-        limit leaves it; a NaN in the stretch does not.
+        Returns WITHIN_LIMITS if it keeps all limits, or there are none; else the `ActionCode`:
+        REJECT if it leaves a limit that rejects, otherwise VERIFY. A trace without a sample in the
+        stretch of a limit leaves it; a NaN in the stretch does not.
         """
         if self.limits.size(0) == 0:
-            return 0
+            return self.within
         start, end, low, high = self.limits.unbind(1)  # (W, 1) each
         values, where = torch.cat([x, self.time])[self.channels].unbind(1)  # (W, T) each
         inside = (where >= start) & (where <= end)
         broken = inside & ((values < low) | (values > high))
         kept = inside.any(1) & ~broken.any(1)
-        return int(torch.where(kept, 0, self.action).max().item())
+        return int(torch.where(kept, self.within, self.action).max().item())
 
 
 def convert_trace(trace: Any, trace_spec: TraceSpec | None, may_start_over: bool) -> TraceArray:

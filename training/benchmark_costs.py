@@ -4,9 +4,9 @@
 
 Three generated sets have known failure probabilities. Of each, 600 recordings are searched by three
 price triples, ten times with other recordings. Then an engine that has learned these recordings
-plays 10,000 further parts, and each candidate decides on its scores. A decision costs what it is
-expected to cost by the part's failure probability: the check, or an escape or a false reject times
-the probability that it is one.
+plays 10,000 further parts, with a retrain every 200 labels, and each candidate decides on its
+scores. A decision costs what it is expected to cost by the part's failure probability: the check,
+or an escape or a false reject times the probability that it is one.
 
 A run that was interrupted continues: each finished row stands in `costs.csv`. The table says, for
 each set and price triple, how much dearer than the best candidate the chosen policy is, in per cent
@@ -85,7 +85,8 @@ def run_one(name: str, run: int, n_later: int, names: Sequence[str]) -> list[dic
     rows = slice(0, N_RECORDINGS)
     recordings = replace(data, X=data.X[rows], y=data.y[rows])
     contender = Contender.load("rocket")
-    shadow = contender.with_policy(shadow=True)
+    recipe = contender.recipe.with_settings(retrain_every=200).with_policy(shadow=True)
+    shadow = replace(contender, recipe=recipe)
     scores = from_part(replay(data, shadow, run, shuffle=False), N_RECORDINGS)
     later = failure[N_RECORDINGS:]
     played: dict[Any, Replay] = {}  # the shared streams are the same for all prices

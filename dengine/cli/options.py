@@ -329,7 +329,7 @@ _NOVELTY = (
 )
 _WINDOWS = (
     "Verify a part whose force leaves limits between two times, in seconds. LOW or HIGH may be "
-    "empty; :reject rejects the part; '' removes all windows."
+    "empty; :reject rejects the part; '' removes all limits."
 )
 _WINDOW = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
@@ -344,12 +344,12 @@ POLICY = {
     "stops": click.option("--stops", type=NameChoice("stops"), help=_STOPS),
     "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
     "prices": click.option("--prices", type=CommaList(click.FloatRange(0.0)), help=_PRICES),
-    "windows": click.option(
-        "--window",
-        "windows",
+    "force_limits": click.option(
+        "--force-limit",
+        "force_limits",
         metavar=_WINDOW,
         multiple=True,
-        # None where the option was not given; an empty tuple removes all windows of a recipe.
+        # None where the option was not given; an empty tuple removes all limits of a recipe.
         callback=lambda _, option, values: tuple(filter(None, values)) if values else None,
         help=_WINDOWS,
     ),

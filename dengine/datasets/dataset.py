@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError, TraceError, expect, instead, listed
 from ..records import TraceSpec
-from ..representation import to_html
 from ..traces import as_traces
 
 if TYPE_CHECKING:
@@ -130,8 +129,6 @@ class Dataset:
             f"good, {len(self) - good} bad, {self.unlabelled} unlabelled, {len(self.faults)} left "
             f"out>"
         )
-
-    _repr_html_ = to_html
 
     @property
     def cube(self) -> NDArray[np.float32]:

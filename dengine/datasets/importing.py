@@ -217,8 +217,8 @@ def import_parts(
     counts: dict[str, Any] = dict.fromkeys(
         ("imported", "quarantined", "repeated", "contradicted"), 0
     )
-    counts_silence = policy.stops == "some"
-    n_silent = _count_silent(store, policy)
+    counts_unreported = policy.stops == "some"
+    n_unreported = _count_unreported(store, policy)
     for start in range(0, len(parts), CHUNK):
         chunk = parts[start : start + CHUNK]
         new: dict[str, StoredDecision] = {}
@@ -233,15 +233,15 @@ def import_parts(
             if stored is None:
                 stored = _as_stored(decision, trace, gate, policy, store.clock())
                 new[decision.id] = stored
-            if counts_silence and decision.action is Action.ACCEPT:
-                # A decision that was stored without a label was counted as silent.
-                n_silent += (label is None) - (earlier is not None)
+            if counts_unreported and decision.action is Action.ACCEPT:
+                # A decision that was stored without a label was counted as unreported.
+                n_unreported += (label is None) - (earlier is not None)
             if label is not None:
-                silent = n_silent * (not stored.quarantined)
-                n_silent -= silent
+                n_before = n_unreported * (not stored.quarantined)
+                n_unreported -= n_before
                 source = source_of(decision.action, decision.audit, label)
                 about = (store.clock(), stored.content_hash, stored.time)
-                labels.append(NewLabel(decision.id, label, source, 0, None, silent, *about))
+                labels.append(NewLabel(decision.id, label, source, 0, None, n_before, *about))
                 counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels])
         if on_traces is not None:
@@ -249,7 +249,7 @@ def import_parts(
     return ImportReport(**counts, resumed=True)
 
 
-def _count_silent(store: "SqlStore", policy: Policy) -> int:
+def _count_unreported(store: "SqlStore", policy: Policy) -> int:
     """Return how many accepted parts there are since the last label of which nothing was heard.
 
     If silence confirms a part, there is none.
@@ -257,7 +257,7 @@ def _count_silent(store: "SqlStore", policy: Policy) -> int:
     if policy.stops != "some":
         return 0
     since = int(store.settings.read().get("policy_since", 0))
-    return len(store.decisions.unreported_accepts(since)) - store.labels.silent_total(since)
+    return len(store.decisions.unreported_accepts(since)) - store.labels.unreported_total(since)
 
 
 def _as_stored(

@@ -82,43 +82,11 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Z, y = validate_data(self, Z, y)
         self.classes_ = classes_of(y)
         self._create_index(np.asarray(Z).shape[1])
-        return self._add(Z, y)
-
-    def partial_fit(self, Z: ArrayLike, y: ArrayLike, classes: ArrayLike | None = None) -> Self:
-        """Add references to those of earlier calls; beyond `capacity` the oldest leave.
-
-        Parameters
-        ----------
-        Z : array, shape (n, d)
-            Embeddings.
-        y : array, shape (n,)
-            Labels.
-        classes : array, optional
-            Both classes. It is read only if neither `fit` nor this was called before, and sets
-            `classes_`; None: those in `y`.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        ValueError
-            For a label that is not in `classes_`, more than two classes, and arrays that
-            scikit-learn refuses.
-        SettingError
-            On the first call, for a radius or a setting of the policy out of its range.
-        """
-        is_first = "index_" not in vars(self)
-        Z, y = validate_data(self, Z, y, reset=is_first)
-        if is_first:
-            self.classes_ = classes_of(y if classes is None else classes)
-            self._create_index(np.asarray(Z).shape[1])
-        unknown = np.setdiff1d(np.asarray(y), self.classes_)
-        if len(unknown):
-            do = "name all classes on the first call"
-            raise ValueError(f"Expected labels among {self.classes_}, got {unknown}; {do}.")
-        return self._add(Z, y)
+        success = np.asarray(y) == self.classes_[-1]
+        if len(self.classes_) == 1 and self.classes_[0] in (0, False, -1):
+            success = ~success  # a lone class of zeros is all failures
+        self.index_.add(Z, success)
+        return self
 
     def count(self, Z: ArrayLike) -> Counts:
         """Count the labels within the radius of each row.
@@ -209,22 +177,10 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self.index_ = RadiusIndex(dim, self.capacity)
         self.neighbours_ = self.neighbours_over(self.index_)
 
-    def _add(self, Z: Any, y: Any) -> Self:
-        """Add embeddings with labels to the index; returns self.
-
-        A label equal to the last of `classes_` is stored as success, any other as failure, which is
-        not checked. A lone class 0, False or -1 is stored as failure.
-        """
-        success = np.asarray(y) == self.classes_[-1]
-        if len(self.classes_) == 1 and self.classes_[0] in (0, False, -1):
-            success = ~success  # a lone class of zeros is all failures
-        self.index_.add(Z, success)
-        return self
-
     def _decisions(self, Z: ArrayLike) -> NDArray[np.float64]:
         """Decide on each row of Z (n, d); raises NotFittedError before `fit`.
 
-        Returns float64 (n, 5): position in `ACTIONS`, lower, upper, n_success, n_failure.
+        Returns float64 (n, 5): `ActionCode`, lower, upper, n_success, n_failure.
         """
         check_is_fitted(self)
         valid = validate_data(self, Z, reset=False)

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from ..folds import COIN_BITS, MIX, audit_salt
 from ..limits import ForceLimits
-from ..records import REASONS, Reason, TraceSpec
-from ..traces import ForceLimitsGate, TraceGate
+from ..records import REASONS, ActionCode, Reason, TraceSpec
+from ..traces import WITHIN_LIMITS, ForceLimitsGate, TraceGate
 
 # fault, content hash, action, predicted action, reason, lower, upper, n_success, n_failure,
 # embedding, propensity; see `Decider.forward`.
@@ -84,6 +84,7 @@ class Decider(nn.Module):
         self.n_spaces, self.dim = embedding_shape
         self.audit_reason = REASONS.index(Reason.AUDIT)
         self.outside_reason = REASONS.index(Reason.OUTSIDE)
+        self.within_limits = WITHIN_LIMITS
         self.coin_range = float(2**COIN_BITS)
         self.mix = MIX
         self.shift = 63 - COIN_BITS
@@ -117,7 +118,7 @@ class Decider(nn.Module):
         content : int
             Content hash of the trace (`folds.content_hash`).
         action, predicted : int
-            Positions in `Action`: what to do, and what the model alone would do. They differ in an
+            `ActionCode`s: what to do, and what the model alone would do. They differ in an
             audit, and where a force limit rejects. `predicted` is VERIFY where the model was not
             asked.
         reason : int
@@ -136,20 +137,19 @@ class Decider(nn.Module):
         if fault != 0:
             nothing = torch.full((self.n_spaces, self.dim), float("nan"))
             return fault, content, 0, 0, fault, 0.0, 1.0, 0, 0, nothing, 1.0
-        outside = self.limits(x)  # 0 within, 1 verify, 2 reject
-        if outside != 0:
+        action = self.limits(x)
+        if action != self.within_limits:
             z = self.predictor.embed(x)
-            action = 2 * (outside - 1)
-            propensity = float(2 - outside)
+            propensity = 1.0 if action == ActionCode.VERIFY.value else 0.0
             return 0, content, action, 0, self.outside_reason, 0.0, 1.0, 0, 0, z, propensity
         own_part = part if part != 0 else content
         predicted, reason, lower, upper, n_success, n_failure, z = self.predictor(x, own_part)
         action = predicted
         propensity = 1.0
-        if predicted != 0:
+        if predicted != ActionCode.VERIFY.value:
             propensity = float(self.audit_rate.item())
             if propensity > 0.0 and self.is_audited(content, propensity):
-                action = 0
+                action = ActionCode.VERIFY.value
                 reason = self.audit_reason
         return (
             0, content, action, predicted, reason,

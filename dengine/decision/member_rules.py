@@ -30,7 +30,7 @@ class MemberRule(DecisionRule):
         self.evidence = evidence
 
     def action(self, lower: float, upper: float) -> int:
-        """Return what a bound allows at present, as its position in `Action`."""
+        """Return what a bound allows at present, as its `ActionCode`."""
         return self.evidence.action(lower, upper)
 
     @torch.jit.export
@@ -46,9 +46,9 @@ class MemberRule(DecisionRule):
         self.evidence.update(lower, upper, success, predicted, inclusion_probability)
 
     @torch.jit.export
-    def observe(self, n_silent: int, novel: bool) -> None:
+    def observe(self, n_unreported: int, novel: bool) -> None:
         """Update the drift detectors, which may start the safe mode; as `DecisionRule.observe`."""
-        self.evidence.observe(n_silent, novel)
+        self.evidence.observe(n_unreported, novel)
 
     @torch.jit.export
     def safe_mode(self) -> int:
@@ -59,7 +59,7 @@ class MemberRule(DecisionRule):
     def start_in_safe_mode(self, safe_mode: int) -> None:
         """Verify everything from the start, as after an alarm.
 
-        `safe_mode` is the position of the reason in `SAFE_MODES`; 0 changes nothing.
+        `safe_mode` is a `SafeMode`; NONE changes nothing.
         """
         if safe_mode:
             self.evidence.start_safe_mode(safe_mode)

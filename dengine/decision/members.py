@@ -15,7 +15,7 @@ most alpha while that claim is true. So the pooled rule opens a level while the 
 1 / alpha. Statement, assumptions, proof and references: docs/explanation/pooled_proof.md.
 
 *The account.* The priced rule counts what accepting all members would have cost beyond checking
-them, in units of one false accept, and opens a level while the balance is at least -3.
+them, in units of one false accept, and opens a level while the balance is at least -`OVERDRAFT`.
 
 *Safe mode.* A mean over all members reacts late to drift. So CUSUM detectors (`certificate.cusum`)
 watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm every
@@ -25,13 +25,15 @@ detector's two hypotheses, the tolerance and twice the tolerance.
 """
 
 import math
+from enum import IntEnum
 
 import torch
 from torch import Tensor, nn
 
+from ..records import ActionCode
 from .certificate import cusum
 
-SAFE_MODES = (  # why every part is verified; the position is the integer in exported files
+SAFE_MODES = (  # why every part is verified, by `SafeMode`
     "",
     "accepted parts failed more often than the tolerance",
     "rejected parts were good more often than the tolerance",
@@ -46,6 +48,23 @@ FALSE_ALARMS = 100.0  # at the tolerance itself one alarm in 100 / alpha parts o
 NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
 FEWEST_SINCE_ALARM = 25.0  # members: an account over fewer says little
 FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1 / NOVEL_SHARE - 1
+
+
+class Detector(IntEnum):
+    """What a drift detector watches. The first two are also the sides of the rule."""
+
+    ACCEPTED_PARTS = 0
+    REJECTED_PARTS = 1
+    NOVEL_TRACES = 2
+
+
+class SafeMode(IntEnum):
+    """Why every part is verified, the detector that raised the alarm; exported files give it."""
+
+    NONE = 0
+    ACCEPTED_PARTS = 1
+    REJECTED_PARTS = 2
+    NOVEL_TRACES = 3
 
 
 def max_recent_errors(tolerance: float) -> int:
@@ -208,35 +227,38 @@ class MemberEvidence(nn.Module):
         self.register_buffer("detector_sums", torch.zeros(3, dtype=torch.float64))
 
     def action(self, lower: float, upper: float) -> int:
-        """Return the action that a bound allows at present: 0 verify, 1 accept, 2 reject.
+        """Return the `ActionCode` that a bound allows at present.
 
-        It accepts where `lower` reaches the threshold of side 0, and rejects where 1 - `upper`
-        reaches that of side 1. Where both hold, or neither, it verifies.
+        It accepts where `lower` reaches the accept threshold, and rejects where 1 - `upper` reaches
+        the reject threshold. Where both hold, or neither, it verifies.
         """
         thresholds: list[float] = self.thresholds.tolist()
         accepts = lower >= thresholds[0]
         rejects = upper <= 1.0 - thresholds[1]
         if accepts == rejects:
-            return 0
-        return 1 if accepts else 2
+            return ActionCode.VERIFY.value
+        return ActionCode.ACCEPT.value if accepts else ActionCode.REJECT.value
 
-    def observe(self, n_silent: int, novel: bool) -> None:
+    def observe(self, n_unreported: int, novel: bool) -> None:
         """Step the drift detectors with parts of unknown outcome and the novelty of one trace.
 
-        `n_silent` accepted parts went on since the last label. They count as not wrong, and outside
-        of the safe mode as not novel. `novel` says whether the trace of the part at hand was novel.
-        Outside of the safe mode it steps the detector of novel traces, which may start a safe mode.
-        In a safe mode for novel traces the same detector counts how long few have been novel. In
-        any other safe mode `novel` has no effect.
+        `n_unreported` accepted parts went on since the last label. They count as not wrong, and
+        outside of the safe mode as not novel. `novel` says whether the trace of the part at hand
+        was novel. Outside of the safe mode it steps the detector of novel traces, which may start a
+        safe mode. In a safe mode for novel traces the same detector counts how long few have been
+        novel. In any other safe mode `novel` has no effect.
         """
-        self.step_detector(0, self.correct_step, n_silent)
+        self.step_detector(Detector.ACCEPTED_PARTS.value, self.correct_step, n_unreported)
         safe_mode = int(self.safe_mode.item())
-        if safe_mode == 0:
-            self.step_detector(2, self.correct_step, n_silent)
-            self.step_detector(2, self.error_steps[2] if novel else self.correct_step, 1)
-        elif safe_mode == 3:  # the sum now counts how long few traces have been novel
+        novelty = Detector.NOVEL_TRACES.value
+        if safe_mode == SafeMode.NONE.value:
+            self.step_detector(novelty, self.correct_step, n_unreported)
+            step = self.error_steps[novelty] if novel else self.correct_step
+            self.step_detector(novelty, step, 1)
+        elif safe_mode == SafeMode.NOVEL_TRACES.value:  # the sum counts how long few were novel
             step = -self.novel_setback if novel else 1.0
-            self.detector_sums[2].fill_(max(float(self.detector_sums[2].item()), 0.0) + step)
+            before = max(float(self.detector_sums[novelty].item()), 0.0)
+            self.detector_sums[novelty].fill_(before + step)
 
     def update(
         self,
@@ -249,39 +271,43 @@ class MemberEvidence(nn.Module):
         """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
         `lower` and `upper` are the bound that the part was decided by, `success` is its label, and
-        `predicted` (position in `Action`) what the model alone would have done. Where all outcomes
+        `predicted` (an `ActionCode`) what the model alone would have done. Where all outcomes
         are known, every part counts as checked. Elsewhere `inclusion_probability`, with which the
         outcome would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0
         only the drift detectors see it. A wrong outcome may raise an alarm, which starts the safe
         mode. This ends when the side that raised the alarm has an open level again; after too many
         novel traces, when novel ones are few again and either side has an open level.
         """
-        self.count_outcome(0, lower, not success, predicted, inclusion_probability)
-        self.count_outcome(1, 1.0 - upper, success, predicted, inclusion_probability)
+        accepting, rejecting = Detector.ACCEPTED_PARTS.value, Detector.REJECTED_PARTS.value
+        self.count_outcome(accepting, lower, not success, predicted, inclusion_probability)
+        self.count_outcome(rejecting, 1.0 - upper, success, predicted, inclusion_probability)
         safe_mode = int(self.safe_mode.item())
-        if safe_mode == 3:
+        if safe_mode == SafeMode.NONE.value:
+            return
+        novelty = self.detector_sums[Detector.NOVEL_TRACES.value]
+        if safe_mode == SafeMode.NOVEL_TRACES.value:
             threshold = self.thresholds.min()
-            calm = float(self.detector_sums[2].item()) >= self.few_novel
+            calm = float(novelty.item()) >= self.few_novel
         else:
-            threshold = self.thresholds[max(0, safe_mode - 1)]
+            threshold = self.thresholds[safe_mode - 1]  # of the side that raised the alarm
             calm = True
-        if safe_mode != 0 and calm and float(threshold.item()) < self.closed:
+        if calm and float(threshold.item()) < self.closed:
             self.safe_mode.zero_()
-            self.detector_sums[2].zero_()
+            novelty.zero_()
 
     def count_outcome(
         self, side: int, score: float, wrong: bool, predicted: int, inclusion_probability: float
     ) -> None:
         """Count one part of known outcome on one side, then choose the threshold of that side.
 
-        Side 0 is accepting, with the lower bound as score; side 1 is rejecting, with 1 - upper
-        bound. `wrong` says whether the side's action would have been wrong. If the score reaches
-        the threshold, the drift detector of the side takes a step first, which may start the safe
-        mode. Then all levels that the score reaches count the part, and the members do if it
-        reaches the target level or `predicted` is the side's action. It counts as one part, without
-        a weight. If all outcomes are known, it counts as checked; else `inclusion_probability` says
-        how: 1 as checked, above 0 as audited, and 0 not at all. No threshold is chosen if the part
-        is counted nowhere.
+        The sides are the first two of `Detector`. The score for accepting is the lower bound, for
+        rejecting 1 - upper bound. `wrong` says whether the side's action would have been wrong. If
+        the score reaches the threshold, the drift detector of the side takes a step first, which
+        may start the safe mode. Then all levels that the score reaches count the part, and the
+        members do if it reaches the target level or `predicted` is the side's action. It counts as
+        one part, without a weight. If all outcomes are known, it counts as checked; else
+        `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. No
+        threshold is chosen if the part is counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -296,7 +322,7 @@ class MemberEvidence(nn.Module):
             n_reached += int(level <= score)
         # A part that the model was certain of is a member even where its label came late.
         target = int(self.target_level[side].item())
-        is_member = n_reached > n_levels - 1 - target or predicted == side + 1
+        is_member = n_reached > n_levels - 1 - target or predicted == ActionCode.ACCEPT.value + side
         if n_reached == 0 and not is_member:
             return
         first = n_levels - n_reached
@@ -313,8 +339,7 @@ class MemberEvidence(nn.Module):
     def step_detector(self, detector: int, step: float, times: int) -> None:
         """Add `step` to a CUSUM `times` times; start the safe mode if the sum reaches its limit.
 
-        Detector 0 watches accepted parts, 1 rejected parts, 2 novel traces. Nothing happens if
-        `times` is 0. An alarm sets the sums of all detectors to 0.
+        Nothing happens if `times` is 0. An alarm sets the sums of all detectors to 0.
         """
         if times > 0 and self.add_steps(detector, step, times) >= self.alarm_limits[detector]:
             self.raise_alarm(detector)
@@ -333,17 +358,17 @@ class MemberEvidence(nn.Module):
     def raise_alarm(self, detector: int) -> None:
         """Start the safe mode for the reason of a detector, or start it anew during one.
 
-        During one the reason is that of the two which stands first in `SAFE_MODES`: a side that has
+        During one the reason is that of the two which stands first in `SafeMode`: a side that has
         not shown its tolerance yet stays the reason when novel traces come on top.
         """
         safe_mode = int(self.safe_mode.item())
-        reason = detector + 1
-        self.start_safe_mode(reason if safe_mode == 0 else min(safe_mode, reason))
+        reason = SafeMode.ACCEPTED_PARTS.value + detector
+        self.start_safe_mode(reason if safe_mode == SafeMode.NONE.value else min(safe_mode, reason))
 
     def start_safe_mode(self, safe_mode: int) -> None:
         """Close both sides until the members from now on show recovery.
 
-        `safe_mode` is the position of the reason in `SAFE_MODES`. The detectors and the counts
+        `safe_mode` is a `SafeMode`, not NONE. The detectors and the counts
         since the last alarm restart at 0, and the target is the strictest level again. The counts
         over all time, and the newest errors of each level, stay.
         """
@@ -355,7 +380,7 @@ class MemberEvidence(nn.Module):
         self.safe_mode.fill_(safe_mode)
 
     def choose_threshold(self, side: int) -> None:
-        """Set target level and threshold of one side, 0 accept or 1 reject, from the counts.
+        """Set target level and threshold of one side from the counts.
 
         The target is the lowest level whose parts since the last alarm pass the bet (or, under the
         priced rule, the account) and, under the pooled rule, whose newest parts have few errors; if
@@ -381,7 +406,9 @@ class MemberEvidence(nn.Module):
                 break
             target -= 1
         self.target_level[side].fill_(max(0, target))
-        may_open = is_recovered or (since == members and int(self.safe_mode.item()) == 0)
+        may_open = is_recovered or (
+            since == members and int(self.safe_mode.item()) == SafeMode.NONE.value
+        )
         opens = target >= 0 and may_open and self.allows_more(side, members)
         self.thresholds[side].fill_(self.levels[side][target] if opens else self.closed)
 

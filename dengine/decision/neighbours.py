@@ -6,7 +6,7 @@ a `RadiusIndex` and asks a `DecisionRule` for bound and action. The module compi
 import torch
 from torch import Tensor, nn
 
-from ..records import REASONS, Reason
+from ..records import REASONS, ActionCode, Reason
 from .references import RadiusIndex
 from .rule import DecisionRule
 
@@ -63,7 +63,7 @@ class RadiusNeighbours(nn.Module):
     @torch.jit.export
     def reason(self, action: int) -> int:
         """Return the position in `Reason` of why the rule chose this action."""
-        if action != 0:
+        if action != ActionCode.VERIFY.value:
             return self.certain
         return self.uncertain if self.rule.safe_mode() == 0 else self.safe_mode
 

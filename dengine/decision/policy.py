@@ -29,7 +29,8 @@ RULES = {  # names in `member_rules`, by guarantee and by which line stops are k
     "cost": {"some": "PricedRule", "all": "PricedRule"},
 }
 
-NO_WINDOWS = "none"
+NO_LIMITS = "none"
+OLD_NAME = "windows"  # of the force limits, in recipes and stores of before
 # Squared, it is finite in float32, so that a query's own part, infinitely far, is never within it.
 LARGEST_RADIUS = 1e18
 PRICES = (5.0, 120.0, 47.5)  # seconds: the paper's check, a line stop, and the paper's cycle
@@ -67,7 +68,7 @@ class Policy:
         Number of decisions within which a verification or an audit must be reported. A later one
         counts as a wrong decision, in the certificate and in the rule, until it is reported. The
         unit is decisions, not seconds, so that a cell may stand still and a replay repeats.
-    windows : tuple of ForceLimits or str, default ()
+    force_limits : tuple of ForceLimits or str, default ()
         The operator's limits beside the model. A trace that leaves one is verified or rejected
         whatever the model says (`Reason.OUTSIDE`), and no claim counts it.
     prices : three floats, optional
@@ -97,7 +98,7 @@ class Policy:
     stops: Stops = "some"
     shadow: bool = False
     label_within: int = 1000
-    windows: tuple[ForceLimits, ...] = ()
+    force_limits: tuple[ForceLimits, ...] = ()
     prices: tuple[float, float, float] = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -129,7 +130,7 @@ class Policy:
         expect(isinstance(self.shadow, bool), "shadow to be True or False", self.shadow)
         is_count = is_whole(self.label_within, 1, 10**9)
         expect(is_count, "label_within of at least one decision", self.label_within)
-        object.__setattr__(self, "windows", self._checked_windows())
+        object.__setattr__(self, "force_limits", self._checked_limits())
         object.__setattr__(self, "prices", self._checked_prices())
         claims_members = self.guarantee in SORTING_GUARANTEES
         if claims_members and self.stops == "some" and self.audited_share == 0.0:
@@ -139,19 +140,19 @@ class Policy:
                 "stops='all' where every bad accepted part stops the system."
             )
 
-    def _checked_windows(self) -> tuple[ForceLimits, ...]:
-        """Return the windows as a tuple of `ForceLimits`, parsing texts.
+    def _checked_limits(self) -> tuple[ForceLimits, ...]:
+        """Return the force limits as a tuple of `ForceLimits`, parsing texts.
 
         Raises SettingError if they are no tuple or list, or one of them is neither a text of limits
         nor a `ForceLimits`.
         """
-        given = self.windows if isinstance(self.windows, tuple | list) else (None,)
-        windows: Any = tuple(
-            ForceLimits.parse(window) if isinstance(window, str) else window for window in given
+        given = self.force_limits if isinstance(self.force_limits, tuple | list) else (None,)
+        limits: Any = tuple(
+            ForceLimits.parse(item) if isinstance(item, str) else item for item in given
         )
-        are_limits = all(isinstance(window, ForceLimits) for window in windows)
-        expect(are_limits, "a list of windows, each a ForceLimits, or its text", self.windows)
-        return windows  # type: ignore[no-any-return]
+        are_limits = all(isinstance(item, ForceLimits) for item in limits)
+        expect(are_limits, "a list of force limits, or of their texts", self.force_limits)
+        return limits  # type: ignore[no-any-return]
 
     def _checked_prices(self) -> tuple[float, float, float]:
         """Return the three prices as floats.
@@ -170,20 +171,22 @@ class Policy:
         return prices
 
     def to_values(self) -> dict[str, Any]:
-        """Return every setting by its name; the windows are one text, "none" if there are none."""
-        return asdict(self) | {"windows": " ".join(map(str, self.windows)) or NO_WINDOWS}
+        """Return every setting by its name; the force limits are one text, "none" without any."""
+        limits = " ".join(map(str, self.force_limits)) or NO_LIMITS
+        return asdict(self) | {"force_limits": limits}
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
         """Return the policy whose settings `to_values` wrote; missing settings have their defaults.
 
-        The windows are one text, separated by spaces, or "none". Names that are no settings are
+        The force limits are one text, separated by spaces, or "none"; in older stores their name
+        is "windows". Names that are no settings are
         ignored. Raises SettingError for a value out of its range.
         """
         names = [field.name for field in fields(cls)]
         settings = {name: values[name] for name in names if name in values}
-        windows = settings.get("windows", NO_WINDOWS)
-        settings["windows"] = () if windows == NO_WINDOWS else tuple(windows.split())
+        limits = values.get("force_limits", values.get(OLD_NAME, NO_LIMITS))
+        settings["force_limits"] = () if limits == NO_LIMITS else tuple(limits.split())
         return cls(**settings)
 
     def changed(self, **settings: Any) -> Self:
@@ -221,9 +224,9 @@ class Policy:
 
     @property
     def limits(self) -> tuple[ForceLimits, ...]:
-        """The windows as they act: in shadow mode none rejects."""
+        """The force limits as they act: in shadow mode none rejects."""
         return tuple(
-            replace(window, reject=window.reject and not self.shadow) for window in self.windows
+            replace(item, reject=item.reject and not self.shadow) for item in self.force_limits
         )
 
     @property

@@ -16,11 +16,12 @@ from typing import Any, Self
 import torch
 from torch import nn
 
+from ..records import ActionCode
 from .intervals import SCALAR_BOUNDS, SORTING_ERROR_LEVEL, normal_quantile, scalar_interval
 
 
 def action_of(lower: float, upper: float, accept_threshold: float, reject_threshold: float) -> int:
-    """Return the action that a bound allows, as its position in `Action`.
+    """Return the action that a bound allows, as its `ActionCode`.
 
     Parameters
     ----------
@@ -32,11 +33,11 @@ def action_of(lower: float, upper: float, accept_threshold: float, reject_thresh
     Returns
     -------
     int
-        1 accept, 2 reject, otherwise 0 verify.
+        The `ActionCode`; VERIFY if neither threshold is reached.
     """
     if lower >= accept_threshold:
-        return 1
-    return 2 if upper <= reject_threshold else 0
+        return ActionCode.ACCEPT.value
+    return ActionCode.REJECT.value if upper <= reject_threshold else ActionCode.VERIFY.value
 
 
 class DecisionRule(nn.Module):
@@ -96,12 +97,12 @@ class DecisionRule(nn.Module):
         self.extra_arguments: tuple[Any, ...] = ()
 
     def forward(self, n_success: int, n_failure: int) -> tuple[int, float, float]:
-        """Return (action, lower, upper) for label counts: 0 verify, 1 accept, 2 reject."""
+        """Return (`ActionCode`, lower, upper) for label counts."""
         lower, upper = self.bound(n_success, n_failure, self.z)
         return self.action(lower, upper), lower, upper
 
     def action(self, lower: float, upper: float) -> int:
-        """Return what a bound allows at present, as its position in `Action`."""
+        """Return what a bound allows at present, as its `ActionCode`."""
         return action_of(lower, upper, self.accept_threshold, self.reject_threshold)
 
     @torch.jit.export
@@ -122,19 +123,19 @@ class DecisionRule(nn.Module):
         success : bool
             Its label.
         predicted : int, default 0
-            Position in `Action` of what the model alone would have done.
+            `ActionCode` of what the model alone would have done.
         inclusion_probability : float, default 1.0
             Probability, fixed beforehand, that the outcome of this part would be asked for: 1 for a
             check, the audit rate for an audit, 0 for a line stop or a confirmation.
         """
 
     @torch.jit.export
-    def observe(self, n_silent: int, novel: bool) -> None:
+    def observe(self, n_unreported: int, novel: bool) -> None:
         """Take note of what is known without a label; called before each `update`.
 
         Parameters
         ----------
-        n_silent : int
+        n_unreported : int
             Accepted parts since the last label whose outcome stays unknown.
         novel : bool
             Whether the trace of the part at hand was novel.
@@ -149,7 +150,7 @@ class DecisionRule(nn.Module):
     def start_in_safe_mode(self, safe_mode: int) -> None:
         """Verify everything from the start, as after an alarm; rules without a safe mode ignore it.
 
-        `safe_mode` is a position in `SAFE_MODES`; 0 changes nothing.
+        `safe_mode` is a `SafeMode`; NONE changes nothing.
         """
 
     @torch.jit.unused

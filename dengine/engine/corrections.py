@@ -275,7 +275,7 @@ class Corrections:
         policies errs with probability up to m alpha.
 
         A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that
-        was accepted before, and was not reported, stays unobserved. In the shadow mode,
+        was accepted before, and was not reported, stays unreported. In the shadow mode,
         `Policy(shadow=True)`, each part that the model is certain of is an audit:
         `Decision.predicted` says what the model would have done, and all is learned from as always.
         It lasts over restarts.
@@ -297,7 +297,7 @@ class Corrections:
         SettingError
             For what is no policy, for force limits that the traces cannot hold, or in seconds at an
             unknown rate, for a guarantee whose class cannot be imported or made, and, of a model
-            that was handed in, for anything but audit_rate, stops, label_within, windows and
+            that was handed in, for anything but audit_rate, stops, label_within, force_limits and
             shadow.
         StoreError
             Where the store does not answer.
@@ -305,7 +305,7 @@ class Corrections:
         example = "for example Policy(alpha=0.05, lower_bound=0.95)"
         expect(isinstance(policy, Policy), "a Policy", policy, example)
         present = self._settings.now
-        check_rate(policy.windows, present.trace)
+        check_rate(policy.force_limits, present.trace)
         old_values = present.recipe.policy.to_values()
         new_values = policy.to_values()
         changes = {name: value for name, value in new_values.items() if value != old_values[name]}
@@ -407,7 +407,7 @@ def _check_baseline_settings(changes: Settings) -> None:
     idle = sorted(set(changes) - set(BASELINE_SETTINGS))
     if idle:
         effect = f"so {', '.join(idle)} would have no effect"
-        do = "change only audit_rate, stops, label_within, windows and shadow"
+        do = "change only audit_rate, stops, label_within, force_limits and shadow"
         raise SettingError(
             f"A model that was handed in decides by its own numbers, {effect}; {do}."
         )

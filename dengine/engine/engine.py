@@ -51,7 +51,6 @@ from ..records import (
     source_of,
 )
 from ..reducers.base import Reducer
-from ..representation import to_html
 from ..store.journalled import CLOSE_SECONDS
 from ..store.opening import LONG_WAIT, open_outbox, opening
 from ..store.outbox import Outbox
@@ -137,7 +136,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         its own reducer.
     model : Model, optional
         A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
-        windows and shadow count then.
+        force_limits and shadow count then.
     executor : concurrent.futures.Executor, optional
         Where retrains run while the cell goes on. None: in the calling thread, between cycles;
         making the first engine of a process then takes about a second longer, since it loads what
@@ -227,7 +226,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         thread. Raises SettingError for force limits in seconds at an unknown rate.
         """
         recipe = settings.recipe
-        check_rate(recipe.policy.windows, settings.trace)
+        check_rate(recipe.policy.force_limits, settings.trace)
         torch.set_num_threads(1)
         self._retrains_in_line = executor is None and not reading
         if self._retrains_in_line:
@@ -440,18 +439,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         with self._exclusive:
             if self._outbox.is_usable:
-                self._feedback.store_pending()
+                self._feedback.store_confirmations()
                 self._learner.advance(to_the_end=True, wait=CLOSE_SECONDS)
             self._outbox.close()
 
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        Labels of silently confirmed parts, which wait in memory, are recorded first, so that they
-        are in the training window afterwards. Raises NotTakenError after `wait` seconds; None: the
-        store's own limit.
+        Labels of parts that the next decision confirmed, which wait in memory, are recorded first,
+        so that they are in the training window afterwards. Raises NotTakenError after `wait`
+        seconds; None: the store's own limit.
         """
-        self._feedback.store_pending()
+        self._feedback.store_confirmations()
         self._outbox.flush(wait)
         self._learner.catch_up()
 
@@ -562,7 +561,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
-        self._feedback.confirm_silent()
+        self._feedback.confirm_unreported()
         stored = self._maker.record(x, part, decision_id, reason)
         if decision_id is not None:
             stored = self._maker.sync(stored)
@@ -949,8 +948,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         elif self.policy.shadow:
             parts.append("shadow mode")
         return f"<DataEngine {self.recipe.name}: {', '.join(parts)}>"
-
-    _repr_html_ = to_html
 
     def __exit__(self, *exception: object) -> None:
         self.close()

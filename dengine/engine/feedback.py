@@ -6,7 +6,7 @@ With `Policy(stops="all")` a bad part stops the system before the next decision,
 decision confirms an accepted part: the rule is updated, the trace becomes a reference, and its
 label, CONFIRMED, is stored with the next report, before the next retrain, or when 100 of them wait.
 A line stop that comes later takes the confirmation back, in the store as a correction. With "some"
-the part counts as unobserved, which is no success.
+the part counts as unreported, which is no success.
 """
 
 import logging
@@ -57,7 +57,8 @@ class Feedback:
     labels : CellLabels or ProductLabels
         Takes each label that is recorded.
     settings : SettingsInForce
-        Whether silence until the next decision confirms an accepted part, and since which version.
+        Whether an accepted part without a report is confirmed by the next decision, and since which
+        version.
     on_safe_mode : callable, optional
         Called with the reason when a safe mode begins and with "" when it ends, after that was
         recorded.
@@ -85,19 +86,21 @@ class Feedback:
         # Accepted parts without an outcome yet.
         self._unreported: OrderedDict[str, StoredDecision] = OrderedDict()
         # Labels of confirmed parts that were not handed to the outbox.
-        self._pending: dict[str, tuple[StoredDecision, NewLabel]] = {}
+        self._confirmations: dict[str, tuple[StoredDecision, NewLabel]] = {}
         # Reports that were learned and are not known to be on disk.
         self._unsynced: dict[str, bool] = {}
         # Decisions whose check was asked for, not reported and not overdue, oldest first.
         self._awaiting_check: OrderedDict[str, StoredDecision] = OrderedDict()
-        self._unobserved = 0  # accepted parts that went on without an outcome since the last label
+        self._n_unreported = (
+            0  # accepted parts that went on without an outcome since the last label
+        )
         self._safe_mode = ""
         self._novel_share = 0.0  # of the recent decisions
         self._novelty_reported = False
 
     @property
     def _stops_all(self) -> bool:
-        """Whether every bad part stops the system, so that silence confirms an accepted part."""
+        """Whether the next decision confirms an unreported part: each bad one stops the system."""
         return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
@@ -105,7 +108,7 @@ class Feedback:
         outcome.
 
         The live model must be restored before. With `stops="all"` the accepted parts are kept, so
-        that the next trace confirms them. With "some" they are only counted, as unobserved since
+        that the next trace confirms them. With "some" they are only counted, as unreported since
         the last label. Raises StoreError where the store cannot be read.
         """
         self._safe_mode = self._live.newest.safe_mode
@@ -116,7 +119,7 @@ class Feedback:
         policy_since = self._settings.now.policy_since
         ids = store.decisions.unreported_accepts(policy_since)
         if not self._stops_all:
-            self._unobserved = len(ids) - store.labels.silent_total(policy_since)
+            self._n_unreported = len(ids) - store.labels.unreported_total(policy_since)
             return
         for id_ in ids:
             accepted = store.decisions.get(id_)
@@ -145,8 +148,8 @@ class Feedback:
         limit = 0.5 if self._novelty_reported else NEARLY_ALL
         self._novelty_reported = self._novel_share > limit
 
-    def confirm_silent(self) -> None:
-        """Count accepted parts without an outcome as confirmed, or as unobserved; the next trace
+    def confirm_unreported(self) -> None:
+        """Count accepted parts without an outcome as confirmed, or as unreported; the next trace
         has come.
 
         With `stops="all"` each is a success: rule and references learn it at once, and its label,
@@ -158,19 +161,20 @@ class Feedback:
         while self._unreported:
             id_, stored = self._unreported.popitem(last=False)
             if self._stops_all:
-                self._pending[id_] = stored, self._learn(stored, True, Source.CONFIRMED)
+                self._confirmations[id_] = stored, self._learn(stored, True, Source.CONFIRMED)
             else:
-                self._unobserved += 1
-        if len(self._pending) >= MOST_CONFIRMED:
-            self.store_pending()
+                self._n_unreported += 1
+        if len(self._confirmations) >= MOST_CONFIRMED:
+            self.store_confirmations()
 
     def take_in(self, stored: StoredDecision, success: bool) -> bool:
         """Learn a reported label and hand it to the outbox, without waiting for the disk.
 
         The same report once more, before `note_synced`, does nothing and returns False. Returns
-        whether silence had confirmed the part before this report, whatever its label is now. Raises
-        ReportError if the decision has a label already, except that a line stop may follow a
-        confirmation. `remedy` is set where the rule must be rebuilt, which is not done here.
+        whether the next decision had confirmed the part before this report, whatever its label is
+        now. Raises ReportError if the decision has a label already, except that a line stop may
+        follow a confirmation. `remedy` is set where the rule must be rebuilt, which is not done
+        here.
         """
         id_ = stored.decision.id
         was_confirmed = False
@@ -188,11 +192,11 @@ class Feedback:
     def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
         """Learn a label that is no repetition and hand it to the outbox, after labels that wait.
 
-        A confirmation by silence is taken back first. If its label went to the outbox before, the
-        new label goes there too, but is not learned yet: `remedy` is set to CORRECT. Otherwise its
-        reference is removed, and `remedy` is set to REBUILD_RULE. The latter is also set for a
-        check that the rule counted as overdue. Returns whether there was such a confirmation,
-        whatever the label is now. Raises ReportError for any other second label.
+        A confirmation by the next decision is taken back first. If its label went to the outbox
+        before, the new label goes there too, but is not learned yet: `remedy` is set to CORRECT.
+        Otherwise its reference is removed, and `remedy` is set to REBUILD_RULE. The latter is also
+        set for a check that the rule counted as overdue. Returns whether there was such a
+        confirmation, whatever the label is now. Raises ReportError for any other second label.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -201,17 +205,17 @@ class Feedback:
             reported = (success, source)
             if (earlier, reported) != LATE_STOP:
                 raise already_reported(decision.id, earlier, reported)
-            self.store_pending()
+            self.store_confirmations()
             self.remedy = Remedy.CORRECT
             label = NewLabel(decision.id, False, source, self._live.version, None)
             self._outbox.record_labels([(stored, label)])
             return True
-        confirmation = self._pending.pop(decision.id, None)
+        confirmation = self._confirmations.pop(decision.id, None)
         was_confirmed = confirmation is not None
-        self.store_pending()
+        self.store_confirmations()
         if confirmation is not None:
             self._live.unlearn(stored, confirmation[1].seq)
-            self._labels.count_unlearned()
+            self._labels.count_learned(-1)
         self._record([(stored, self._learn(stored, success, source))])
         self._unreported.pop(decision.id, None)
         self._awaiting_check.pop(decision.id, None)
@@ -224,27 +228,32 @@ class Feedback:
 
         A trace with a fault updates neither; any other outcome counts as a new label. A rejected
         part that was inspected does not update the rule: which of them are inspected is somebody's
-        choice, and no sample. An outcome that updates the rule sets the count of unobserved parts
+        choice, and no sample. An outcome that updates the rule sets the count of unreported parts
         back to zero; its label holds the count from before, less one if the part itself was in it.
         """
         decision = stored.decision
         version = self._live.version
         number = self._outbox.number_label()
         point = None
-        silent = 0
-        if stored.quarantined:
-            pass  # an unusable trace teaches nothing
-        elif source is Source.INSPECTION:
-            point = self._live.learn(stored, success, number, None)
-            self._labels.count_learned()
-        else:
-            silent = self._unobserved - self._was_unobserved(stored)
-            self._unobserved = 0
-            point = self._live.learn(stored, success, number, silent)
-            self._labels.count_learned()
+        n_unreported = 0
+        if not stored.quarantined:  # an unusable trace teaches nothing
+            updates_rule = source is not Source.INSPECTION
+            if updates_rule:
+                n_unreported = self._n_unreported - self._was_unreported(stored)
+                self._n_unreported = 0
+            known = n_unreported if updates_rule else None
+            point = self._live.learn(stored, success, number, known)
+            self._labels.count_learned(1)
         overdue_to = self._live.overdue_to
         return NewLabel(
-            decision.id, success, source, version, point, silent, overdue_to=overdue_to, seq=number
+            decision.id,
+            success,
+            source,
+            version,
+            point,
+            n_unreported,
+            overdue_to=overdue_to,
+            seq=number,
         )
 
     def _record(self, labels: Collection[tuple[StoredDecision, NewLabel]]) -> None:
@@ -254,8 +263,8 @@ class Feedback:
             if not stored.quarantined:
                 self._labels.add(stored, label)
 
-    def _was_unobserved(self, stored: StoredDecision) -> bool:
-        """Return whether this part is one of those counted as unobserved.
+    def _was_unreported(self, stored: StoredDecision) -> bool:
+        """Return whether this part is one of those counted as unreported.
 
         It is, if it was accepted under the present policy with stops="some", and the next trace
         came before its outcome.
@@ -266,15 +275,15 @@ class Feedback:
         is_of_policy = decision.model_version >= self._settings.now.policy_since
         return decision.id not in self._unreported and is_of_policy
 
-    def store_pending(self) -> bool:
-        """Hand the labels of silently confirmed parts to the outbox, without waiting.
+    def store_confirmations(self) -> bool:
+        """Hand the labels of parts that the next decision confirmed to the outbox, without waiting.
 
         Returns False, and does nothing, if there are none; else True.
         """
-        if not self._pending:
+        if not self._confirmations:
             return False
-        self._record(self._pending.values())
-        self._pending.clear()
+        self._record(self._confirmations.values())
+        self._confirmations.clear()
         self.number_labels()
         return True
 
@@ -313,13 +322,13 @@ class Feedback:
         return remedy
 
     def retry_remedy(self, remedy: Remedy) -> None:
-        """Put a remedy back that failed because the store is away."""
+        """Put a remedy back that failed because the store is unavailable."""
         self.remedy = remedy
 
     def begin_policy(self) -> None:
         """Forget which accepted parts have no outcome, because another policy begins."""
         self._unreported.clear()
-        self._unobserved = 0
+        self._n_unreported = 0
 
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
         """Record an event and call `on_safe_mode` if a safe mode began or ended since the last

@@ -45,13 +45,9 @@ class CellLabels:
         """Count again, after the window was filled anew because labels were corrected."""
         self.resume(counts_from)
 
-    def count_learned(self) -> None:
-        """Count a label that was just learned."""
-        self.new_labels += 1
-
-    def count_unlearned(self) -> None:
-        """Count a label no more that was learned and taken back before the store had it."""
-        self.new_labels -= 1
+    def count_learned(self, n: int) -> None:
+        """Count a label that was just learned, 1, or taken back before the store had it, -1."""
+        self.new_labels += n
 
     def add(self, stored: StoredDecision, label: NewLabel) -> None:
         """Add a learned label, which is recorded, to the window."""
@@ -129,10 +125,7 @@ class ProductLabels:
         newer = self._window.newer(self._trained_to)
         self._since = [(number, number in own_numbers) for number in newer]
 
-    def count_learned(self) -> None:
-        """Do nothing: a label counts when it enters the window."""
-
-    def count_unlearned(self) -> None:
+    def count_learned(self, n: int) -> None:
         """Do nothing: a label counts when it enters the window."""
 
     @property

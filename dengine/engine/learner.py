@@ -149,7 +149,7 @@ class Learner:
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
         # A rule that is rebuilt from the store would forget labels that wait in memory.
-        if self._feedback.store_pending() and not self._outbox.is_drained:
+        if self._feedback.store_confirmations() and not self._outbox.is_drained:
             return
         remedy = self._feedback.take_remedy()
         if remedy is None:
@@ -167,10 +167,10 @@ class Learner:
     def store_labels(self) -> None:
         """Wait until every label is in the store and has its number.
 
-        That includes labels of silently confirmed parts. Raises StoreError where the store is
-        unavailable.
+        That includes labels of parts that the next decision confirmed. Raises StoreError where the
+        store is unavailable.
         """
-        self._feedback.store_pending()
+        self._feedback.store_confirmations()
         self._drain_labels()
 
     def _drain_labels(self) -> None:
@@ -405,7 +405,7 @@ class Learner:
         """
         n_waits = 0
         while True:
-            self._feedback.store_pending()
+            self._feedback.store_confirmations()
             self._feedback.number_labels()
             while candidate.learn_next(self._window):
                 yield None
@@ -505,8 +505,8 @@ class Learner:
     def _take_in_all_news(self) -> None:
         """Take in the peers' news until there is no more, but at most `ROUNDS` times.
 
-        Where the store is away it stops, `Peers.is_lost` is set, and nothing is raised. Without
-        peers it does nothing.
+        Where the store is unavailable it stops, `Peers.is_lost` is set, and nothing is raised.
+        Without peers it does nothing.
         """
         peers = self._peers
         if peers is None:
@@ -519,7 +519,7 @@ class Learner:
         """Take in the peers' newest version, at most `MOST` labels, and corrections.
 
         Before, it waits until this cell's recorded labels are in the store. Returns the number of
-        labels; 0 also where the store is away, which is noted in `peers` and not raised.
+        labels; 0 also where the store is unavailable, which is noted in `peers` and not raised.
         Corrections that cannot be read come with the next news.
         """
         version = None
@@ -554,7 +554,7 @@ class Learner:
         """Finish what is under way before a person's change: labels and news of peers.
 
         A training is ended, as `end_training` does; of the news at most `ROUNDS` times `MOST`
-        labels are taken in. Raises StoreError where the store is away, or where labels
+        labels are taken in. Raises StoreError where the store is unavailable, or where labels
         of peers before one of this cell's are missing.
         """
         self.end_training()
@@ -572,7 +572,7 @@ class Learner:
         A model that cannot change a reference is retrained, or a pinned one fitted again, if
         `may_retrain`: only the cell that corrected does so. Where labels were forgotten, what the
         next training starts from is prepared in a thread. Raises StoreError where the store is
-        away.
+        unavailable.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         # In a product, labels after the window's newest come as news.

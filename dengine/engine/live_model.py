@@ -167,17 +167,17 @@ class LiveModel:
         self.lacks_steps = report.n_steps > 0 and report.n_steps_left > 0
 
     def learn(
-        self, stored: StoredDecision, success: bool, number: int, unobserved: int | None
+        self, stored: StoredDecision, success: bool, number: int, n_unreported: int | None
     ) -> Point | None:
         """Update the rule with an outcome, and make the trace a reference of the answering model.
 
-        `number` is that of the label. `unobserved` is the number of accepted parts without an
+        `number` is that of the label. `n_unreported` is the number of accepted parts without an
         outcome since the previous update; with None, or for a decision before the present rule
         began, the rule is not updated. Returns the reference point, float32 of shape (d,), to be
         stored with the label; None where there is none: no model yet, a failure, or a baseline.
         """
         decision = stored.decision
-        if unobserved is not None and decision.model_version >= self.evidence.since:
+        if n_unreported is not None and decision.model_version >= self.evidence.since:
             guarded(
                 RULE_MISSED,
                 self.newest.update_rule,
@@ -185,7 +185,7 @@ class LiveModel:
                 decision.upper,
                 success,
                 decision.reason is Reason.NOVEL,
-                unobserved,
+                n_unreported,
                 ACTIONS.index(decision.predicted),
                 decision.inclusion_probability,
             )
@@ -246,7 +246,7 @@ class LiveModel:
         It is the rule of the answering model, or of the template before the first retrain. Overdue
         checks are among the outcomes. Labels that are not in the store yet are not, so the rule
         forgets them: store them before. The ledger is not checked here. Raises StoreError, and
-        changes nothing, where the store is away.
+        changes nothing, where the store is unavailable.
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
@@ -275,7 +275,7 @@ class LiveModel:
         Returns False where the model must be trained again: always for a baseline, and where it
         cannot change a reference. The caller must retrain then, because each correction is read
         only once. Returns True before the first retrain. The rule is left to `rebuild_rule`. Raises
-        StoreError where the store is away.
+        StoreError where the store is unavailable.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

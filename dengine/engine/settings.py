@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from .. import __version__
 from ..decision.decider import DecisionConditions
-from ..decision.policy import NO_WINDOWS, Policy
+from ..decision.policy import NO_LIMITS, Policy
 from ..errors import ImportRefusedError, SettingError, StoreError, expect, listed, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
@@ -28,7 +28,7 @@ log = logging.getLogger("dengine")
 
 MAX_SEED = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # Settings of a policy that have an effect on a baseline.
-BASELINE_SETTINGS = ("audit_rate", "stops", "label_within", "windows", "shadow")
+BASELINE_SETTINGS = ("audit_rate", "stops", "label_within", "force_limits", "shadow")
 # Settings that have an effect on any model, a baseline included.
 LOOP_SETTINGS = (
     "seed",
@@ -51,7 +51,7 @@ class EvidenceWindow:
     since : int
         First model version whose decisions count.
     began_in : int
-        Safe mode in which the rule started, a position in `SAFE_MODES`.
+        Safe mode in which the rule started, a `SafeMode`.
     """
 
     since: int = 0
@@ -102,7 +102,9 @@ class EngineSettings:
         is_spec = self.trace is None or isinstance(self.trace, TraceSpec)
         expect(is_spec, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
         if self.trace is not None:
-            ForceLimitsGate(self.recipe.policy.windows, self.trace)  # raises before it is in force
+            ForceLimitsGate(
+                self.recipe.policy.force_limits, self.trace
+            )  # raises before it is in force
 
     def to_store(self) -> dict[str, str]:
         """Return the settings as texts by name, as `SqlStore.settings.save` takes them.
@@ -246,8 +248,8 @@ class EngineSettings:
             # An object was compared when the store was opened.
             requested.pop("reducer", None)
             requested.pop("params", None)
-        if requested.get("windows") == NO_WINDOWS:
-            requested.pop("windows")
+        if requested.get("force_limits") == NO_LIMITS:
+            requested.pop("force_limits")
         compared = {*(present if self.model is None else LOOP_SETTINGS)} - {"shadow"}
         different = sorted(
             name for name in compared & requested.keys() if requested[name] != present[name]
@@ -407,7 +409,7 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     The caller has such a model. `reducer` is the setting of that name, and `given` holds the other
     settings by name; None is a setting that was not given. Without effect are reducer, radius,
     folds, and a policy that differs from the default in more than `BASELINE_SETTINGS`: audit_rate,
-    stops, label_within, windows and shadow.
+    stops, label_within, force_limits and shadow.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:

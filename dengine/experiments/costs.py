@@ -372,7 +372,7 @@ class PolicySearch:
         # Plays the scores of all candidates; a baseline has none.
         self._scores: Contender | None = None
         if contender.baseline is None:
-            shadow = Policy(shadow=True, windows=contender.recipe.policy.windows)
+            shadow = Policy(shadow=True, force_limits=contender.recipe.policy.force_limits)
             self._scores = replace(contender, recipe=replace(contender.recipe, policy=shadow))
         self._replays: dict[Policy, dict[int, Replay]] = defaultdict(dict)  # by seed
         self._fresh: set[int] = set()  # seeds of the shuffles that choose nothing

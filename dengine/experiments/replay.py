@@ -30,7 +30,6 @@ from ..recipe import RECIPES, Recipe
 from ..records import ACTIONS, Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec
 from ..reducers import has_own_unit
 from ..reducers.base import Reducer
-from ..representation import to_html
 from .baselines import BASELINES, make_baseline
 from .metrics import VERIFY_SECONDS, Costs
 
@@ -207,8 +206,6 @@ class Replay:
             summary += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}"
         cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
         return f"<Replay of {self.name or 'a run'}{where}: {cycles}, {summary}>"
-
-    _repr_html_ = to_html
 
     @property
     def dropped(self) -> list[str]:
@@ -600,7 +597,7 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     asked = np.isin(scores.reason, ASKED)
     novel = scores.novel
     actions = np.zeros(len(scores), dtype=np.int64)
-    n_silent = 0
+    n_unreported = 0
     with torch.inference_mode():
         for i, success in enumerate(scores.truth.tolist()):
             predicted = 0
@@ -617,11 +614,11 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
             if actions[i] == 2:  # nobody learns whether a rejected part was good
                 continue
             if actions[i] == 1 and success and policy.stops != "all":
-                n_silent += 1
+                n_unreported += 1
                 continue
             asked_with = policy.audited_share if predicted else 1.0
-            rule.observe(n_silent, bool(novel[i]))
+            rule.observe(n_unreported, bool(novel[i]))
             rule.update(lower, upper, success, predicted, 0.0 if actions[i] else asked_with)
-            n_silent = 0
+            n_unreported = 0
     recipe = replace(scores.recipe, policy=policy)
     return replace(scores, action=np.array(ACTIONS)[actions].astype(np.str_), recipe=recipe)

@@ -154,7 +154,9 @@ def prepare_export(
             f"{model.name} cannot be exported, for it has no module: give it `module()`, which "
             "returns the embedding as an nn.Module (see `Reducer.module`)."
         )
-    conditions = DecisionConditions(source.trace, source.windows, source.audit_rate, source.seed)
+    conditions = DecisionConditions(
+        source.trace, source.force_limits, source.audit_rate, source.seed
+    )
     shape = (model.n_spaces, model.index.dim)
     examples = source.examples
     points = model.scaled_points(examples) if len(examples) else examples
@@ -198,7 +200,7 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
         audit_rate=engine.policy.audited_share,
         seed=engine.seed,
         stops_all=engine.policy.stops == "all",
-        windows=engine.policy.limits,
+        force_limits=engine.policy.limits,
         model_version=engine.version,
         recipe=engine.recipe.to_toml(),
         examples=engine.store.labels.with_traces(N_EXAMPLES).traces,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..decision.decider import Decider
-from ..records import FITS, REASONS, Reason, TraceSpec
+from ..records import FITS, REASONS, ActionCode, Reason, TraceSpec
 from ..traces import can_fit_length, fit_length
 
 # action, reason, lower, upper, n_success, n_failure, embedding
@@ -60,7 +60,7 @@ class DecisionModule(nn.Module):
     pending_lower, pending_upper : float
         Its bound.
     pending_embedding : Tensor of float32, shape (K, d)
-    n_silent : int
+    n_unreported : int
         Accepted parts since the last label whose outcome stays unknown.
     """
 
@@ -92,7 +92,7 @@ class DecisionModule(nn.Module):
         self.pending_novel = False
         self.pending_lower = 0.0
         self.pending_upper = 1.0
-        self.n_silent = 0
+        self.n_unreported = 0
         self.register_buffer("pending_embedding", torch.zeros(embedding_shape))
 
     @torch.jit.export
@@ -100,7 +100,8 @@ class DecisionModule(nn.Module):
         """Decide on one trace, and make this the pending decision.
 
         Before that, a pending accept is settled, see `settle`: it is learned as good or counted as
-        silent; another pending decision is forgotten. After a faulty trace no decision is pending.
+        unreported; another pending decision is forgotten. After a faulty trace no decision is
+        pending.
 
         Parameters
         ----------
@@ -223,14 +224,15 @@ class DecisionModule(nn.Module):
         """Settle a pending accept: the next part comes, and nothing was reported.
 
         With `stops_all` the part is learned as good and becomes a reference, else it counts as
-        silent; none is pending then. Returns whether it was learned. Other pending decisions stay.
+        unreported; none is pending then. Returns whether it was learned. Other pending decisions
+        stay.
         """
-        if self.pending_action != 1:
+        if self.pending_action != ActionCode.ACCEPT.value:
             return False
         if self.stops_all:
             self.learn_pending(True)
             return True
-        self.n_silent += 1
+        self.n_unreported += 1
         self.pending_action = self.none_pending
         return False
 
@@ -270,7 +272,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why every part is verified at present, as a position in `SAFE_MODES`."""
+        """Return why every part is verified at present, as a `SafeMode`."""
         safe_mode: int = self.decider.predictor.neighbours.rule.safe_mode()
         return safe_mode
 
@@ -313,19 +315,19 @@ class DecisionModule(nn.Module):
 
         `part` is the hash of the part, which also gives the space of the reference. The rule gets
         as inclusion probability the audit rate if the part was audited, 1 if it was verified for
-        another reason, and 0 if it was accepted or rejected. It also gets the number of silent
+        another reason, and 0 if it was accepted or rejected. It also gets the number of unreported
         parts, whose count restarts at 0.
         """
         inclusion_probability = 0.0
-        if action == 0:
+        if action == ActionCode.VERIFY.value:
             audit_rate = float(self.decider.audit_rate.item())
-            inclusion_probability = 1.0 if predicted == 0 else audit_rate
+            inclusion_probability = 1.0 if predicted == action else audit_rate
         neighbours = self.decider.predictor.neighbours
-        neighbours.rule.observe(self.n_silent, novel)
+        neighbours.rule.observe(self.n_unreported, novel)
         neighbours.rule.update(lower, upper, success, predicted, inclusion_probability)
         space = self.decider.toss(part) % self.n_spaces
         neighbours.references.put(z[space], 1.0 if success else 0.0, space, part)
-        self.n_silent = 0
+        self.n_unreported = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:
         """Return the trace as (C, T) float32 with the number of samples of the contract.

@@ -162,8 +162,8 @@ def _refuse_unsupported(source: Exportable) -> None:
     elif n_repeats > 0:
         repeats = f"{n_repeats} of the references are of parts that were there already"
         problem = f"votes: {repeats}; export torchscript"
-    elif source.windows:
-        problem = "an operator's windows; export torchscript"
+    elif source.force_limits:
+        problem = "an operator's force limits; export torchscript"
     if problem:
         raise ExportError(f"ONNX carries no {problem}.")
 

@@ -26,7 +26,6 @@ from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
 from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
-from ..representation import to_html
 from ..store.records import SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from .envelope import Envelope, envelope_of
@@ -134,8 +133,6 @@ class Explanation:
         decision = self.decision.decision
         result = f"{decision.action.value}, {decision.reason.value}"
         return f"<Explanation of {decision.id}: {result}, {len(self.neighbours)} neighbours>"
-
-    _repr_html_ = to_html
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:

@@ -19,7 +19,7 @@ from ..folds import COIN_BITS, audit_salt, content_hash, toss
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceArray, TraceSpec
 from ..store.records import StoredDecision
-from ..traces import LARGEST, ForceLimitsGate
+from ..traces import LARGEST, WITHIN_LIMITS, ForceLimitsGate
 from .past_versions import Novelty, Thresholds
 
 MAX_NEEDED = 20_000  # more labels within the radius than that are not considered
@@ -237,10 +237,14 @@ def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Cir
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
     x = torch.from_numpy(trace)
-    windows = circumstances.recipe.policy.windows
-    left = [str(limits) for limits in windows if ForceLimitsGate([limits], circumstances.spec)(x)]
+    all_limits = circumstances.recipe.policy.force_limits
+    left = [
+        str(limits)
+        for limits in all_limits
+        if ForceLimitsGate([limits], circumstances.spec)(x) != WITHIN_LIMITS
+    ]
     return (
-        f": it leaves an operator's window, {' and '.join(left) or 'which is not known'}, "
+        f": it leaves the operator's force limits, {' and '.join(left) or 'which is not known'}, "
         "whatever the model says."
     )
 

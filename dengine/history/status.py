@@ -34,7 +34,6 @@ from ..records import (
     TraceSpec,
     stored_trace_spec,
 )
-from ..representation import to_html
 from ..store.records import (
     LOSS_REMEDY,
     SAFE_MODE_BEGAN,
@@ -261,8 +260,6 @@ class Status:
     retraining: bool = False
     store_lag: float = 0.0
 
-    _repr_html_ = to_html
-
     def __repr__(self) -> str:
         counts = self.ever
         name = (
@@ -322,7 +319,7 @@ class Status:
             ),
             (
                 2 * newest.outside > newest.decisions,
-                f"{newest.outside} of the newest parts leave a window.",
+                f"{newest.outside} of the newest parts leave the force limits.",
             ),
             (newest.errors, f"The model failed on {newest.errors} of the newest decisions."),
         )

@@ -269,7 +269,7 @@ class EngineModel(ABC):
         upper: float,
         success: bool,
         novel: bool,
-        unobserved: int,
+        n_unreported: int,
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
@@ -283,16 +283,16 @@ class EngineModel(ABC):
             The label.
         novel : bool
             Whether the decision's reason was `Reason.NOVEL`.
-        unobserved : int
+        n_unreported : int
             Accepted parts without a known outcome since the previous update.
         predicted : int
-            Position in `ACTIONS` of what the model alone would have done.
+            `ActionCode` of what the model alone would have done.
         inclusion_probability : float
             Probability, fixed beforehand, that the outcome would be asked for.
         """
 
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
-        """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`.
+        """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
 
         Position 0 is no safe mode. The default does nothing.
         """
@@ -467,7 +467,7 @@ class Exportable:
         Of the coin that draws audits.
     stops_all : bool
         Whether silence until the next decision confirms an accepted part.
-    windows : tuple of ForceLimits
+    force_limits : tuple of ForceLimits
         As they act on traces.
     model_version, recipe
         What the file says of the engine; 0 and "" without one.
@@ -482,7 +482,7 @@ class Exportable:
     audit_rate: float = 0.0
     seed: int = 0
     stops_all: bool = False
-    windows: tuple[ForceLimits, ...] = ()
+    force_limits: tuple[ForceLimits, ...] = ()
     model_version: int = 0
     recipe: str = ""
     examples: Floats = field(default_factory=lambda: NO_TRACES)

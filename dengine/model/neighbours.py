@@ -649,21 +649,21 @@ class ModelPrediction(EngineModel):
         upper: float,
         success: bool,
         novel: bool,
-        unobserved: int,
+        n_unreported: int,
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
         """Update the rule in place with the outcome of one part and the novelty of its trace.
 
-        The rule's `observe` gets `unobserved`, the accepted parts without a known outcome since the
-        last update, and `novel`; then its `update` gets the other arguments. The compiled decider
-        decides by the new state at once. If either raises, `rule_is_stale` is set and the exception
-        goes on to the caller.
+        The rule's `observe` gets `n_unreported`, the accepted parts without a known outcome since
+        the last update, and `novel`; then its `update` gets the other arguments. The compiled
+        decider decides by the new state at once. If either raises, `rule_is_stale` is set and the
+        exception goes on to the caller.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
         before = dict(self.rule.state_dict())
-        self.rule.observe(unobserved, novel)
+        self.rule.observe(n_unreported, novel)
         self.rule.update(lower, upper, success, predicted, inclusion_probability)
         for name, value in self.rule.state_dict().items():
             # The compiled module reads the tensor that it shares, so a tensor that was bound anew
@@ -675,7 +675,7 @@ class ModelPrediction(EngineModel):
         self.rule_is_stale = was_stale
 
     def reset_rule(self, safe_mode: int) -> None:
-        """Make the rule forget every outcome and start in a safe mode, a position in `SAFE_MODES`.
+        """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
 
         Position 0 is no safe mode. The rule is reset in place, because the compiled module shares
         its tensors. `rule_is_stale` stays as it is.

@@ -305,10 +305,6 @@ class RocketReducer(Reducer):
     max_iter: int = 20
     random_state: Any = 0
 
-    @property
-    def n_spaces(self) -> int:
-        return int(self.folds)
-
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Draw the kernels anew and fit the heads; earlier fits are forgotten.
 

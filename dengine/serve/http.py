@@ -124,7 +124,7 @@ class HttpApi:
         good: Json = {"id": "order-7", "success": True}
         bad: Json = {"part": "P-1007", "success": False, "author": "Kim"}
         # A guarantee may name a class, and no request over the network may cause an import.
-        policy = field_types(Policy, "guarantee") | {"windows": list[str]}
+        policy = field_types(Policy, "guarantee") | {"force_limits": list[str]}
         filter_ = field_types(HistoryFilter, "label")
         return [
             Operation(

@@ -291,7 +291,7 @@ class LabelTable(CellTable):
             outcomes += overdue_outcomes(item.decision)
         return outcomes
 
-    def silent_total(self, since_version: int = 0) -> int:
+    def unreported_total(self, since_version: int = 0) -> int:
         """Return how many accepted parts went on without a report, as the cell's labels count them.
 
         Parameters

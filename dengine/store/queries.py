@@ -212,7 +212,7 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
 def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     """Return two SQL columns of a decision: `predicted` and `inclusion_probability`.
 
-    `predicted`, what the model alone would have done, is a position in `ACTIONS`. The probability
+    `predicted`, what the model alone would have done, is an `ActionCode`. The probability
     is the decision's propensity if its action is VERIFY, else 0.
     """
     positions = {action.value: position for position, action in enumerate(ACTIONS)}

@@ -303,7 +303,7 @@ class OutcomeRecord(NamedTuple):
     silent : int
         Number of accepted parts since the previous label of which nothing was reported.
     predicted : int
-        Position in `ACTIONS` of what the model alone would have done.
+        `ActionCode` of what the model alone would have done.
     inclusion_probability : float
         Probability, fixed beforehand, that this part's outcome would be asked for.
     """

@@ -117,7 +117,7 @@ def test_a_batch_longer_than_a_chunk_is_taken_whole(store: SqlStore) -> None:
     )
     assert put_labels(store, *(label(name, silent=1) for name in names)) == list(range(1, 1204))
     assert store.labels.with_traces().hashes.tolist() == list(range(1203))
-    assert store.labels.silent_total() == 1203
+    assert store.labels.unreported_total() == 1203
 
 
 def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: SqlStore) -> None:
@@ -150,7 +150,7 @@ def test_an_empty_store_has_empty_arrays(store: SqlStore, limit: int | None) -> 
     assert (store.versions.newest(), store.versions.retrains()) == (None, [])
     assert (
         store.decisions.unreported_accepts(),
-        store.labels.silent_total(),
+        store.labels.unreported_total(),
         store.decisions.tally().outcomes,
     ) == (
         [],
@@ -215,7 +215,7 @@ def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_qu
         int,
         float,
     ]  # for compiled code
-    assert store.labels.silent_total() == 0 + 2 + 3
+    assert store.labels.unreported_total() == 0 + 2 + 3
     assert store.labels.outcomes_since(4) == []
 
 
@@ -377,7 +377,7 @@ def test_everything_is_there_after_opening_again(place: tuple[str, str]) -> None
         assert store.decisions.get("unreported") is not None
         assert (
             store.decisions.unreported_accepts(),
-            store.labels.silent_total(),
+            store.labels.unreported_total(),
             store.decisions.tally().outcomes.accepted,
         ) == (["accepted"], 4, 1)
         assert store.decisions.get("accepted").decision.part == "SN-1"
@@ -403,7 +403,7 @@ def test_two_cells_in_one_database_do_not_see_each_other(place: tuple[str, str])
         assert (
             other.events.newest(),
             other.decisions.unreported_accepts(),
-            other.labels.silent_total(),
+            other.labels.unreported_total(),
         ) == ([], [], 0)
         assert other.decisions.tally().outcomes.accepted == 0
         other.events.put("note", "other's")
@@ -459,7 +459,7 @@ def test_reads_of_labels_use_an_index(tmp_path: Path) -> None:
             store.labels.with_traces(100)
             store.decisions.get("a")
             store.labels.outcomes_since(0)
-            store.labels.silent_total()
+            store.labels.unreported_total()
             store.events.newest(5)
             put_label(store, "a", True, Source.VERIFICATION, 0, None)
     assert len(result) >= 7

@@ -364,7 +364,7 @@ def test_limits_in_seconds_need_a_rate_that_the_recordings_or_an_option_state(
 ) -> None:
     data = Path(shutil.copy(data, tmp_path / "parts.npz"))
     words = (*verb.split(), "--data", data, "--reducer", "pca", *POLICY, "--store")
-    limits = ("--window", "0.01:0.02:-500:")
+    limits = ("--force-limit", "0.01:0.02:-500:")
     refused = dengine(*words, tmp_path / "new.db", *limits)
     assert refused.exit_code == 1
     assert "state time.rate_hz of recordings" in refused.stderr
@@ -372,7 +372,7 @@ def test_limits_in_seconds_need_a_rate_that_the_recordings_or_an_option_state(
     succeed(*words, tmp_path / "new.db", *limits)
     with DataEngine.open(tmp_path / "new.db") as engine:
         assert (engine.trace.rate_hz, engine.trace.unit) == (100.0, "kN")
-        assert engine.policy.windows
+        assert engine.policy.force_limits
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def test_a_part_is_found_and_reported_by_its_number(store: Path, make_data) -> N
     x = make_data(1).X[0]
     with DataEngine.open(store) as engine:
         engine.decide(np.roll(x, 7), "P-7")
-        engine.set_policy(replace(engine.policy, windows=("0:0:1000::reject",)))
+        engine.set_policy(replace(engine.policy, force_limits=("0:0:1000::reject",)))
         engine.decide(np.roll(x, 9), "P-8")
         while_it_runs = dengine("report", store, "P-7", "bad").stderr
         assert "or its HTTP where it is served" in while_it_runs
@@ -141,9 +141,9 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(
     shown = policy()
     assert all(words in shown for words in ("alpha 0.2", "audit rate 10.0 %", "stops all"))
     limits = "0.05:0.1:-5:60:reject"
-    assert f"windows none -> {limits}. Event" in policy("--window", limits)
-    assert document("policy", store, "--window", "")["policy"]["windows"] == []
-    wrong = dengine("policy", store, "--window", "0.05:0.1:-5::channel=4")
+    assert f"force_limits none -> {limits}. Event" in policy("--force-limit", limits)
+    assert document("policy", store, "--force-limit", "")["policy"]["force_limits"] == []
+    wrong = dengine("policy", store, "--force-limit", "0.05:0.1:-5::channel=4")
     assert "got '0.05:0.1:-5::channel=4'" in " ".join(wrong.stderr.split())
     assert "interval wilson -> jeffreys. Event 4, by" in policy("--interval", "jeffreys")
     assert policy("--shadow", "on", "--author", "kim").startswith("Shadow mode: every part")

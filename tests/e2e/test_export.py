@@ -118,7 +118,7 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
         guarantee=guarantee,
         stops=stops,
         label_within=2000,
-        windows=["0.1:0.15:-20:"],
+        force_limits=["0.1:0.15:-20:"],
     )
     engine = DataEngine(
         recipe=settings,

@@ -258,7 +258,7 @@ CHANGES = [
     ("correct", {"id": "wrong-0", "success": False}),
     ("forget", {"ids": ["wrong-1", "wrong-2"], "reason": "a dirty sensor"}),
     ("policy", {"alpha": 0.2, "audit_rate": 0.1}),
-    ("policy", {"windows": ["-100:100:-5::along=0"]}),
+    ("policy", {"force_limits": ["-100:100:-5::along=0"]}),
     ("policy", {"shadow": True}),
 ]
 
@@ -300,7 +300,7 @@ NOT_PUT_RIGHT = [
     (422, "policy", {"alpha": 7, "author": "Kim"}),
     # Nothing is imported since a request names it.
     (422, "policy", {"guarantee": "os:system", "author": "Kim"}),
-    (422, "policy", {"windows": ["0.1:0.2:high"], "author": "Kim"}),
+    (422, "policy", {"force_limits": ["0.1:0.2:high"], "author": "Kim"}),
     (422, "export", {"author": "Kim"}),  # there is no model yet
 ]
 

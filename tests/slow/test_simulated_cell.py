@@ -72,7 +72,7 @@ def test_the_cell_still_makes_the_bundled_traces() -> None:
 
 
 def test_the_clock_charges_cycles_verifications_and_stops() -> None:
-    cell = SimulatedCell(replace(ALWAYS_MISSED, silent_share=0.0))
+    cell = SimulatedCell(replace(ALWAYS_MISSED, unreported_share=0.0))
     cell.insert()
     assert not cell.verify()
     for again in (cell.verify, cell.proceed, cell.reject):  # a part is taken once

@@ -62,16 +62,6 @@ def test_scripted_the_rule_over_the_ring_answers_as_the_classifier_does() -> Non
     assert [scripted(q) for q in queries] == [model.neighbours_(q) for q in queries]
 
 
-def test_learning_in_parts_is_learning_at_once_and_knows_the_classes_of_the_first_call() -> None:
-    Z, y = blobs()
-    whole, parts = WilsonRadiusClassifier().fit(Z, y), WilsonRadiusClassifier()
-    for start in range(0, len(Z), 37):
-        parts.partial_fit(Z[start : start + 37], y[start : start + 37], classes=[0, 1])
-    np.testing.assert_array_equal(parts.count(Z), whole.count(Z))
-    with pytest.raises(ValueError, match="Expected labels among"):
-        parts.partial_fit(Z[:1], [2])
-
-
 @pytest.mark.parametrize(
     "settings_", [{"radius": 0.0}, {"radius": 1e19}, {"radius": np.inf}, {"alpha": 2.0}]
 )

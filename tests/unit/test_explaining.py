@@ -303,7 +303,7 @@ def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_mad
     changes = [
         {"lower_bound": 0.95},
         {"shadow": True},
-        {"shadow": False, "windows": (window,)},
+        {"shadow": False, "force_limits": (window,)},
         {"alpha": 0.3},
     ]
     for change in changes:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from dengine import Action, DataEngine, Policy, Reason, Recipe, TraceSpec
 from dengine.errors import SettingError
 from dengine.limits import ForceLimits
-from dengine.traces import ForceLimitsGate
+from dengine.records import ActionCode
+from dengine.traces import WITHIN_LIMITS, ForceLimitsGate
 from tests.support.driving import Counting
 from tests.support.exports import SAMPLES, recipe, trained
 
@@ -54,11 +55,11 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(
         ({"interval": "wald"}, "wilson, binomial, clopper_pearson, jeffreys"),
         ({"audit_rate": 1.1}, "audit_rate"),
         ({"audit_rate": -0.1}, "audit_rate"),
-        ({"windows": ["0.2:0.1:0:"]}, "start <= end"),
-        ({"windows": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, .*canal"),
-        ({"windows": ["0.1:0.2:30"]}, r"behind it, got '0.1:0.2:30'\.$"),
-        ({"windows": ["0.1:0.2::1:reject=no"]}, "a window with .*reject='no'"),
-        ({"windows": ["0.1:0.2:1::channel=F Z"]}, "or names"),
+        ({"force_limits": ["0.2:0.1:0:"]}, "start <= end"),
+        ({"force_limits": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, .*canal"),
+        ({"force_limits": ["0.1:0.2:30"]}, r"behind it, got '0.1:0.2:30'\.$"),
+        ({"force_limits": ["0.1:0.2::1:reject=no"]}, "force limits with .*reject='no'"),
+        ({"force_limits": ["0.1:0.2:1::channel=F Z"]}, "or names"),
     ],
 )
 def test_a_setting_out_of_range_is_named_with_what_was_expected(
@@ -69,16 +70,16 @@ def test_a_setting_out_of_range_is_named_with_what_was_expected(
 
 
 HELD = {  # by seconds, or by channel 1, of samples 0 to 5 ten a second, and of their negatives
-    "0.2:0.4:2:4": 0,  # its ends and its limits are within
-    "0.2:0.4::3.9": 1,
-    "0.2:0.4:2.1::reject": 2,
-    "5.1:5.9:0::along=0": 1,  # no sample lies there
-    "-5:-3::5:along=1": 0,
-    "-5:-3::4.9:along=1:reject": 2,
-    "-7:-6:-6.5::channel=1:along=0": 1,
-    "-5:-3::5:along=Z": 0,
-    "3:3:-3:-3:channel=Z:along=F:reject": 0,
-    "3:3:3:3:channel=Z:along=F:reject": 2,
+    "0.2:0.4:2:4": WITHIN_LIMITS,  # its ends and its limits are within
+    "0.2:0.4::3.9": ActionCode.VERIFY,
+    "0.2:0.4:2.1::reject": ActionCode.REJECT,
+    "5.1:5.9:0::along=0": ActionCode.VERIFY,  # no sample lies there
+    "-5:-3::5:along=1": WITHIN_LIMITS,
+    "-5:-3::4.9:along=1:reject": ActionCode.REJECT,
+    "-7:-6:-6.5::channel=1:along=0": ActionCode.VERIFY,
+    "-5:-3::5:along=Z": WITHIN_LIMITS,
+    "3:3:-3:-3:channel=Z:along=F:reject": WITHIN_LIMITS,
+    "3:3:3:3:channel=Z:along=F:reject": ActionCode.REJECT,
 }
 
 
@@ -87,14 +88,21 @@ def test_a_window_holds_the_samples_of_its_stretch_of_time_or_path_to_its_limits
     window: str, expected: int
 ) -> None:
     x = torch.arange(6, dtype=torch.float32)
-    limited = recipe(windows=(window,))
+    limited = recipe(force_limits=(window,))
     spec = TraceSpec(6, rate_hz=10.0, channels=2, columns=("F", "Z"))
-    assert ForceLimitsGate(limited.policy.windows, spec)(torch.stack([x, -x])) == expected
+    assert ForceLimitsGate(limited.policy.force_limits, spec)(torch.stack([x, -x])) == expected
     assert Recipe.from_toml(limited.to_toml()) == limited
-    assert str(*limited.policy.windows) == window
+    assert str(*limited.policy.force_limits) == window
 
 
-IN_SECONDS = Policy(windows=("0.02:0.1::1e6",))
+def test_force_limits_under_their_old_name_are_read_in_recipes_and_stores() -> None:
+    limits = (ForceLimits(0.1, 0.2, high=30.0),)
+    old = Recipe.from_toml('reducer = "pca"\n[policy]\nwindows = ["0.1:0.2::30"]\n').policy
+    assert old.force_limits == Policy.from_values({"windows": "0.1:0.2::30"}).force_limits == limits
+    assert "windows" not in Policy(force_limits=limits).to_values()
+
+
+IN_SECONDS = Policy(force_limits=("0.02:0.1::1e6",))
 UNSTATED = "Expected the rate of the traces, because force limits are in seconds"
 
 
@@ -116,7 +124,7 @@ def test_force_limits_in_seconds_are_refused_at_once_while_the_rate_is_unknown(b
 
 
 def test_force_limits_along_a_path_need_no_rate(make_data) -> None:
-    policy = Policy(windows=("-1e9:1e9::1e6:along=0",))
+    policy = Policy(force_limits=("-1e9:1e9::1e6:along=0",))
     with DataEngine("pca", policy=policy) as engine:
         assert engine.decide(make_data(1).X[0]).reason is Reason.NO_MODEL
         assert engine.trace.rate_hz is None
@@ -128,7 +136,9 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
     store, data = tmp_path / "cell.db", make_data(300, SAMPLES)
     with trained(data, store) as engine:
         x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT)
-        engine.set_policy(replace(engine.policy, windows=(f"0:0.1::{x[:50].max() - 0.1}:reject",)))
+        engine.set_policy(
+            replace(engine.policy, force_limits=(f"0:0.1::{x[:50].max() - 0.1}:reject",))
+        )
         decision = engine.decide(x)
         decided = decision.action, decision.predicted, decision.reason, decision.propensity
         assert decided == (Action.REJECT, Action.VERIFY, Reason.OUTSIDE, 0.0)
@@ -136,18 +146,21 @@ def test_a_part_outside_a_window_is_no_decision_of_the_model_and_no_claim_counts
         assert engine.decide(x).action is Action.VERIFY
         for nowhere in ("0.3:0.4:0:", "0.1001:0.1019:0:", "0:1:0::channel=1", "0:1:0::along=FZ"):
             with pytest.raises(SettingError, match="on some of 1 x 100 samples"):
-                engine.set_policy(Policy(windows=(nowhere,)))
+                engine.set_policy(Policy(force_limits=(nowhere,)))
     with DataEngine.open(store) as engine:
         status = engine.status(last=3)
         newest = engine.status().newest
         assert (newest.outside, newest.rejected, status.actions["reject"]) == (2, 0, 1)
         assert (status.certificate.rejected.n, status.certificate.accepted.n) == (0, 0)
-        assert status.alarm == "2 of the newest parts leave a window."
-        assert "leaves an operator's window, 0:0.1::" in engine.explain(decision.id).sentences[0]
+        assert status.alarm == "2 of the newest parts leave the force limits."
+        assert (
+            "leaves the operator's force limits, 0:0.1::"
+            in engine.explain(decision.id).sentences[0]
+        )
     with pytest.raises(
-        SettingError, match=r"\(windows 0:0\.1::.*:reject\), got windows 0:0\.2:0:;"
+        SettingError, match=r"\(force_limits 0:0\.1::.*:reject\), got force_limits 0:0\.2:0:;"
     ):
-        DataEngine.open_or_create(store, recipe=recipe(windows=["0:0.2:0:"]))
+        DataEngine.open_or_create(store, recipe=recipe(force_limits=["0:0.2:0:"]))
 
 
 @pytest.mark.parametrize("text", ["0.2=9:0.4::60", "0.2:0.4::60=7", "0.2:0.4::60:channel=1=2"])

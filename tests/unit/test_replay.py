@@ -132,7 +132,8 @@ def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(
     highest = data.X.max(axis=1)
     limit = np.quantile(highest, 0.8)
     tight, wide = (
-        RECIPE.with_policy(windows=[window]) for window in (f"0:1:-1e9:{limit}:reject", "0:1:-1e9:")
+        RECIPE.with_policy(force_limits=[window])
+        for window in (f"0:1:-1e9:{limit}:reject", "0:1:-1e9:")
     )
     with pytest.raises(SettingError, match="Expected the rate of the traces"):
         replay(data, tight)
@@ -161,7 +162,6 @@ def test_a_notebook_sees_short_records_the_status_and_times_as_datetimes(
     )
     for item in (engine, decision, data, played, engine.explain(decision.id), engine.status()):
         assert len(repr(item)) < 240
-        assert item._repr_html_().startswith("<table>")
 
 
 def test_a_recipe_is_named_as_it_was_asked_for_or_after_its_reducer(

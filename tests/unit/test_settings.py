@@ -179,7 +179,7 @@ def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stat
     make_data, tmp_path: Path
 ) -> None:
     url = tmp_path / "engine.db"
-    limited = Recipe("pca", policy=Policy(windows=("0.02:0.1::1e9",)))
+    limited = Recipe("pca", policy=Policy(force_limits=("0.02:0.1::1e9",)))
     DataEngine("pca", store=url).close()
     with DataEngine.open(url) as engine:
         engine.store.settings.save(engine.store.settings.read() | {"recipe": limited.to_toml()})
@@ -191,7 +191,7 @@ def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stat
 
 
 def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path: Path) -> None:
-    url, policy = tmp_path / "line.db", Policy(windows=("0.02:0.1::1e9",))
+    url, policy = tmp_path / "line.db", Policy(force_limits=("0.02:0.1::1e9",))
     for cell, trace in (("a", STATED), ("b", None)):
         DataEngine("pca", policy, store=address(url, cell, "nut"), trace=trace).close()
     with DataEngine.open(address(url, "b", "nut")) as engine:

@@ -277,7 +277,7 @@ class SimulatedCell:
         """Pass the part on without a check; return what became known of it.
 
         A bad part stops the line (STOPPED, and the clock goes on by `stop_s`), except for a share
-        `CellParameters.silent_share`, of which nothing becomes known (UNKNOWN). Of good parts a
+        `CellParameters.unreported_share`, of which nothing becomes known (UNKNOWN). Of good parts a
         share `confirm_share` is CONFIRMED, the others are UNKNOWN. Raise DengineError if no part
         waits.
         """
@@ -286,7 +286,7 @@ class SimulatedCell:
         chance = float(_make_generators(self.seed, self._done - 1)[2].random())
         if success:
             return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
-        if chance < self.parameters.silent_share:
+        if chance < self.parameters.unreported_share:
             return Outcome.UNKNOWN
         self.clock += self.parameters.stop_s
         return Outcome.STOPPED

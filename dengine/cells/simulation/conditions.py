@@ -16,7 +16,7 @@ Range = tuple[float, float]  # (low, high) of a uniform draw
 SAMPLES = 1000
 RATE_HZ = 500.0
 FAULTS = ("missed_grasp", "weak_grip", "debris", "wrong_part")
-_PROBABILITIES = {"silent_share", "confirm_share", *FAULTS}
+_PROBABILITIES = {"unreported_share", "confirm_share", *FAULTS}
 _SIGNED = {"bias_n", "drift_n", "bias_offset_n"}
 
 
@@ -32,7 +32,7 @@ class CellParameters:
     cycle_s, verify_s, stop_s : float
         Seconds for a pick and insertion, for a height check, and for a line stop, operator
         included.
-    silent_share : float
+    unreported_share : float
         Probability that a bad part which was passed on does not stop the line.
     confirm_share : float
         Probability that a good part which was passed on is confirmed as good later.
@@ -89,7 +89,7 @@ class CellParameters:
     verify_s: float = 5.0
     stop_s: float = 120.0
 
-    silent_share: float = 0.1
+    unreported_share: float = 0.1
     confirm_share: float = 0.0
 
     height_tolerance_mm: float = 0.5

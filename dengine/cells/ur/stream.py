@@ -395,7 +395,10 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         while not self._closing.is_set():
             try:
                 return self._open()
-            except (CellError, SettingError) as error:  # a controller may change while it is away
+            except (
+                CellError,
+                SettingError,
+            ) as error:  # a controller may change while it is unavailable
                 if until < float("inf") and not (
                     isinstance(error, HeldError) and time.monotonic() < until
                 ):

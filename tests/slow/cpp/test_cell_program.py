@@ -31,7 +31,7 @@ class Learned(NamedTuple):
 
 
 POLICIES = {
-    "local": {"guarantee": "local", "stops": "some", "windows": WINDOWS},
+    "local": {"guarantee": "local", "stops": "some", "force_limits": WINDOWS},
     "pooled": {"guarantee": "pooled", "stops": "some", "audit_rate": 0.6},  # its only evidence
     "all": {"guarantee": "pooled", "stops": "all"},
 }

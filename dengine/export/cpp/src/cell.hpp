@@ -141,7 +141,7 @@ class Cell {
         if (is_last) return model->tell(record.samples, record.part, action, success);
         // What waits steps aside and comes back: nothing has been heard of it yet.
         model->drop();
-        if (action == ACCEPT && !model->stops_all) model->set_silent(model->silent() - 1);  // it is silent no longer
+        if (action == ACCEPT && !model->stops_all) model->set_unreported(model->unreported() - 1);  // its outcome is known
         put_back(record);
         model->tell(record.samples, record.part, action, success);
         const auto last = parts_.find(last_);

@@ -52,8 +52,8 @@ class Model {
                          double lower, double upper) = 0;
 
     // Accepted parts since the last label of which nothing was heard.
-    virtual std::int64_t silent() = 0;
-    virtual void set_silent(std::int64_t n) = 0;
+    virtual std::int64_t unreported() = 0;
+    virtual void set_unreported(std::int64_t n) = 0;
 
     Shape shape;
     std::vector<std::string> actions, reasons;

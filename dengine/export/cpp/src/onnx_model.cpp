@@ -62,11 +62,11 @@ class OnnxModel final : public Model {
 
     void tell(std::vector<float>&, const std::string&, std::int64_t, bool) override { refuse(); }
     void restore(std::vector<float>&, const std::string&, std::int64_t, const std::string&, double, double) override { refuse(); }
-    void set_silent(std::int64_t) override { refuse(); }
+    void set_unreported(std::int64_t) override { refuse(); }
     void drop() override {}
     void settle() override {}
     std::int64_t predicted() override { return VERIFY; }
-    std::int64_t silent() override { return 0; }
+    std::int64_t unreported() override { return 0; }
 
   private:
     struct Values {

@@ -63,9 +63,9 @@ class TorchModel final : public Model {
         module_.run_method("restore", tensor(x), part_hash(part), action, position(reasons, reason), lower, upper);
     }
 
-    std::int64_t silent() override { return module_.attr("n_silent").toInt(); }
+    std::int64_t unreported() override { return module_.attr("n_unreported").toInt(); }
 
-    void set_silent(std::int64_t n) override { module_.setattr("n_silent", n); }
+    void set_unreported(std::int64_t n) override { module_.setattr("n_unreported", n); }
 
   private:
     Decision decide(torch::jit::Method& method, std::vector<float>& x, const std::string& part) const {

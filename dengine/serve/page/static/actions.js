@@ -44,7 +44,7 @@ function requestBody() {
   const body = { ...current.body, author: at("confirm-author").value.trim() };
   for (const { name, type } of current.fields ?? []) {
     const value = at(`confirm-${name}`).value.trim();
-    if (name === "windows") body[name] = value.split(/\s+/).filter(Boolean);
+    if (name === "force_limits") body[name] = value.split(/\s+/).filter(Boolean);
     else if (value !== "") body[name] = type === "number" || name === "version" ? Number(value) : value;
   }
   return body;
@@ -115,7 +115,7 @@ export const policy = (now) => ({
     { name: "alpha", label: "alpha, the error level of the interval", type: "number", min: 0.0001, max: 0.9999, step: "any", value: now.alpha, required: true },
     { name: "lower_bound", label: "Lower bound that a success rate must reach", type: "number", min: 0.5001, max: 0.9999, step: "any", value: now.lower_bound, required: true },
     { name: "audit_rate", label: "Share of certain parts that are verified (audits)", type: "number", min: 0, max: 1, step: "any", value: now.audit_rate, required: true },
-    { name: "windows", label: "Force limits, START:END:LOW:HIGH, separated by blanks; :reject rejects", value: now.windows.map(limitsText).join(" ") },
+    { name: "force_limits", label: "Force limits, START:END:LOW:HIGH, separated by blanks; :reject rejects", value: now.force_limits.map(limitsText).join(" ") },
   ],
 });
 

@@ -55,7 +55,7 @@ const timeText = ({ rate_hz }, time, digits) => (rate_hz === null ? `${number(ti
 function limitsOf(explanation, channel) {
   const { spec, spec: { columns } } = explanation;
   const at = (named) => (typeof named === "string" ? columns.indexOf(named) : named);
-  return explanation.windows.filter((each) => at(each.channel) === channel).map((each) => {
+  return explanation.limits.filter((each) => at(each.channel) === channel).map((each) => {
     if (each.along === null) return { ...each, from: each.start, to: each.end };
     const there = explanation.trace[at(each.along)].flatMap((at, i) => (at !== null && at >= each.start && at <= each.end ? [timeOf(spec, i)] : []));
     return { ...each, from: there[0], to: there.at(-1) };
@@ -63,12 +63,12 @@ function limitsOf(explanation, channel) {
 }
 
 // Draw force limits as brackets; the bent ends point to the side that is not allowed.
-function drawLimits({ ctx, bbox, valToPos }, windows) {
+function drawLimits({ ctx, bbox, valToPos }, limits) {
   ctx.save();
   ctx.strokeStyle = colour("link");
   ctx.lineWidth = 2 * devicePixelRatio;
   ctx.beginPath();
-  for (const { from, to, low, high } of windows) {
+  for (const { from, to, low, high } of limits) {
     const [left, right] = [from, to].map((time) => Math.min(Math.max(valToPos(time, "x", true), bbox.left), bbox.left + bbox.width));
     for (const [limit, outwards] of [[high, -1], [low, 1]]) {
       if (limit === null) continue;
@@ -105,16 +105,16 @@ function traceChart(explanation, channel, height) {
   const trace = explanation.trace[channel];
   const band = explanation.low && [explanation.high[channel], explanation.low[channel], explanation.median[channel]];
   const bads = explanation.bads.map((bad) => bad[channel]);
-  const windows = limitsOf(explanation, channel);
-  const limits = windows.flatMap(({ low, high }) => [low, high]).filter((limit) => limit !== null);
-  const key = [explanation.decision.id, channel, explanation.envelope?.n, bads.length, JSON.stringify(windows)].join(" ");
+  const limits = limitsOf(explanation, channel);
+  const levels = limits.flatMap(({ low, high }) => [low, high]).filter((limit) => limit !== null);
+  const key = [explanation.decision.id, channel, explanation.envelope?.n, bads.length, JSON.stringify(limits)].join(" ");
   const caption = traceCaption(explanation, channel);
   const line = (name, width, dash) => ({ stroke: colour(name), width, dash, points: { show: false } });
   const makePlot = () => ({
     data: [trace.map((_, i) => timeOf(explanation.spec, i)), ...(band ?? []), ...bads, trace],
     options: {
-      scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...limits), Math.max(high, ...limits), 0.1, true) } },
-      hooks: { draw: [(plot) => drawLimits(plot, windows)] },
+      scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...levels), Math.max(high, ...levels), 0.1, true) } },
+      hooks: { draw: [(plot) => drawLimits(plot, limits)] },
       axes: [axis(2, { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56 })],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
       series: [
@@ -153,7 +153,7 @@ export function traceLegend(explanation) {
     swatch("line-trace", "this part"),
     envelope && [swatch("area-band", `95 % of ${number(envelope.n)} good parts`), swatch("line-median", "their median")],
     explanation.bads.length > 0 && swatch("line-bad", `bad parts (${number(explanation.bads.length)})`),
-    explanation.windows.length > 0 && swatch("line-window", `operator's limits (${number(explanation.windows.length)})`));
+    explanation.limits.length > 0 && swatch("line-window", `operator's limits (${number(explanation.limits.length)})`));
 }
 
 // The course of decisions

@@ -147,7 +147,7 @@ function detail(explanation, level) {
 
 // The chart of a trace shows the force limits that are set now, for earlier parts too.
 async function getExplanation(get, id, status) {
-  return { ...await get(`explanations/${encodeURIComponent(id)}`), windows: status.recipe.policy.windows };
+  return { ...await get(`explanations/${encodeURIComponent(id)}`), limits: status.recipe.policy.force_limits };
 }
 
 // The views: called with `get`, the URL's query and the status; each returns its title and its elements

@@ -104,7 +104,7 @@ def summarize(case: Case, pieces: list[dict[str, float]]) -> dict[str, Any]:
     row |= {
         "accepted": total["accepted"] / n,
         "a perfect bet": None if case.stream in WITHOUT_BET else total["perfect"] / n,
-        "account above 3": total["over_account"] / n if case.rule == "cost" else None,
+        "account above 2": total["over_account"] / n if case.rule == "cost" else None,
         "certificate broke": total["certificate_broke"] / n,
         "certificate, high": high,
         "certificate": verdict(total["certificate_broke"], n, ALPHA),

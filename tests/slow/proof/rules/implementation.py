@@ -305,14 +305,14 @@ class Rules:
         rejects = upper <= 1.0 - self.sides[1].threshold
         return np.where(accepts == rejects, VERIFY, np.where(accepts, ACCEPT, REJECT))
 
-    def observe(self, known: Bools, n_silent: Ints, novel: Bools) -> None:
+    def observe(self, known: Bools, n_unreported: Ints, novel: Bools) -> None:
         """Tell of accepted parts without an outcome, and whether the trace at hand was novel."""
-        silent = known & (n_silent > 0)
+        silent = known & (n_unreported > 0)
         before = self.safe_mode.copy()
         accepting = self.sides[0]
-        accepting.cusum = np.where(silent, _fall(accepting.cusum, n_silent), accepting.cusum)
+        accepting.cusum = np.where(silent, _fall(accepting.cusum, n_unreported), accepting.cusum)
         outside = known & (before == 0)
-        self.novelty = np.where(outside & silent, _fall(self.novelty, n_silent), self.novelty)
+        self.novelty = np.where(outside & silent, _fall(self.novelty, n_unreported), self.novelty)
         step = np.where(novel, float(self.novel_step), -1.0)
         stepped = np.maximum(self.novelty, 0.0) + step
         calm = np.maximum(self.novelty, 0.0) + np.where(novel, 1.0 - 1.0 / NOVEL_SHARE, 1.0)

@@ -6,7 +6,7 @@ What is judged at each moment at which the rule would accept a part:
 
 - **pooled**: the mean failure probability of all members so far is at most the tolerance.
 - **cost**, all outcomes known: accepting the members whose outcomes were reported has cost at most
-  three false accepts more than checking them. This follows from the rule itself, so no replay may
+  two false accepts more than checking them. This follows from the rule itself, so no replay may
   break it.
 - **cost**, audited: the rule's account is an estimate. With A the estimate and B the account of
   all outcomes, exp(s (B - A)) divided by the product of its conditional means is a martingale for
@@ -143,7 +143,7 @@ class JudgedReplays:
         self.n_bad_certified = zeros.copy()
         self.sum_certified = zeros.copy()
         self.certificate_broke = zeros.astype(bool)
-        self.n_silent = zeros.astype(np.int64)
+        self.n_unreported = zeros.astype(np.int64)
         self.n_accepted = zeros.copy()
         self.history: list[Report] = []
 
@@ -209,9 +209,9 @@ class JudgedReplays:
         self.n_accepted += accepts
         silent = accepts & ~report.asked
         if self.is_audited:
-            self._count_silent(report, silent)
+            self._count_unreported(report, silent)
             stops = silent & ~report.good & (self.rng.random(self.n_replays) < SHARE_STOPS)
-            self.n_silent += silent & ~stops
+            self.n_unreported += silent & ~stops
             known = (report.asked & ~report.late & ~report.missing) | stops
             inclusion = np.where(stops, 0.0, report.inclusion)
             self._update(known, report, report.good, inclusion)
@@ -248,8 +248,8 @@ class JudgedReplays:
         """
         lower = report.score if lower is None else lower
         upper = report.score if upper is None else upper
-        self.rules.observe(known, self.n_silent, np.zeros(self.n_replays, dtype=bool))
-        self.n_silent[known] = 0
+        self.rules.observe(known, self.n_unreported, np.zeros(self.n_replays, dtype=bool))
+        self.n_unreported[known] = 0
         members = self.rules.update(known, lower, upper, good, report.predicted, inclusion)[0]
         self._count_members(members, report, asked=True)
         certified = known & (report.predicted == ACCEPT) & (inclusion > 0.0)
@@ -257,7 +257,7 @@ class JudgedReplays:
         self.n_bad_certified += certified & ~good
         self.sum_certified += np.where(certified, report.p, 0.0)
 
-    def _count_silent(self, report: Report, silent: Bools) -> None:
+    def _count_unreported(self, report: Report, silent: Bools) -> None:
         """Count accepted parts that nobody asks for: members, and parts of the certificate."""
         self._count_members(silent, report, asked=False)
         self.n_certified += silent
