@@ -108,6 +108,16 @@ def percent(share: float, form: str = ".1f") -> str:
     return "-" if math.isnan(share) else f"{100 * share:{form}} %"
 
 
+def counted(n: int, noun: str) -> str:
+    """Return a number with its noun, "1 part" or "1,200 parts"."""
+    return f"{n:,} {noun}{'' if n == 1 else 's'}"
+
+
+def amount(value: float) -> str:
+    """Return a cost for people, in money or time: three digits, and whole from 1,000 on."""
+    return f"{value:,.0f}" if value >= 999.5 else f"{value:.3g}"
+
+
 class DengineError(Exception):
     """Base of all errors that dengine raises on purpose.
 

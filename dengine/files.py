@@ -185,13 +185,12 @@ def toml_value(value: Any) -> str:
     if isinstance(value, float):
         return repr(float(value))  # JSON has no infinity
     # JSON's texts, lists and booleans are TOML's, but for DEL, which TOML wants escaped.
-    text = json.dumps(value, ensure_ascii=False, default=_plain_value)
+    text = json.dumps(
+        value,
+        ensure_ascii=False,
+        default=lambda item: item.item() if isinstance(item, np.generic) else str(item),
+    )
     return text.replace("\x7f", "\\u007f")
-
-
-def _plain_value(value: Any) -> Any:
-    """Return a number of NumPy as Python's, anything else as its text."""
-    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 def check_output(path: FilePath, force: bool = False) -> None:

@@ -65,7 +65,10 @@ class ForceLimits:
         expect(valid, f"force limits with {wanted}", self)
 
     def __str__(self) -> str:
-        fields = [_number_text(value) for value in (self.start, self.end, self.low, self.high)]
+        fields = [
+            "" if math.isinf(value) else repr(float(value)).removesuffix(".0")
+            for value in (self.start, self.end, self.low, self.high)
+        ]
         if self.channel != 0:
             fields.append(f"channel={self.channel}")
         if self.along is not None:
@@ -104,8 +107,3 @@ def _is_channel(value: Any) -> bool:
     if not isinstance(value, str):
         return is_whole(value, 0, MOST)
     return is_name(value) and not value.isdecimal() and {*" :="}.isdisjoint(value)
-
-
-def _number_text(value: float) -> str:
-    """Return a number as the text form writes it, "" for an infinity."""
-    return "" if math.isinf(value) else repr(float(value)).removesuffix(".0")

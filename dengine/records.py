@@ -179,6 +179,11 @@ class TraceSpec:
         """The unit of each channel, a tuple of `channels` texts; "" for an unknown unit."""
         return self.unit if isinstance(self.unit, tuple) else (self.unit or "",) * self.channels
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The name of each channel: of its column if that is known, else "channel 0" and so on."""
+        return self.columns or tuple(f"channel {i}" for i in range(self.channels))
+
     def time_text(self, sample: int) -> str:
         """Return the time from the first sample to another, "0.060 s" or "30 samples"."""
         return f"{sample} samples" if self.rate_hz is None else f"{sample / self.rate_hz:.3f} s"

@@ -67,7 +67,7 @@ GROUPS |= dict.fromkeys(("test_estimators", "test_reducers", "test_umap"), "umap
 # `make test` leaves out what is slow: these folders, and the cases of other tests that have these
 # names.
 SLOW = REPO / "tests" / "slow"
-SLOW_CASES = ("umap-learn", "postgres", "minirocket")
+SLOW_CASES = ("umap-learn", "UmapLearn", "postgres", "minirocket")
 # What is slow and yet run before each merge: tests that start many processes, a browser or a
 # compiler. Single tests are marked where they stand.
 MERGE = (
@@ -91,14 +91,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         stem, case = item.path.stem, item.callspec.id if hasattr(item, "callspec") else ""
         item.add_marker(pytest.mark.xdist_group(GROUPS.get(stem, stem)))
-        runs_before_merge = stem in MERGE and item.get_closest_marker("slow") is None
-        if runs_before_merge or "postgres" in case:
+        is_slow_case = any(name in case for name in SLOW_CASES)
+        is_slow = is_slow_case or item.get_closest_marker("slow") is not None
+        if (stem in MERGE and not is_slow) or "postgres" in case:
             item.add_marker("merge")
-        if (
-            item.get_closest_marker("merge")
-            or SLOW in item.path.parents
-            or any(name in case for name in SLOW_CASES)
-        ):
+        if item.get_closest_marker("merge") or SLOW in item.path.parents or is_slow_case:
             item.add_marker("slow")
 
 

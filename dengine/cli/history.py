@@ -285,13 +285,12 @@ def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
     There are none without an envelope.
     """
     spec = explanation.spec
-    names = spec.columns or [f"channel {i + 1}" for i in range(spec.channels)]
     if explanation.envelope is None:
         return
     for excess in explanation.envelope.excesses[:MOST_EXCESSES]:
         side = "above" if excess.above else "below"
         yield (
-            names[excess.channel],
+            spec.names[excess.channel],
             spec.time_text(excess.first),
             spec.time_text(excess.last),
             f"{excess.widths:.1f} {side}",

@@ -370,13 +370,10 @@ RECIPE = {
 }
 
 
-def _recipe_choice(name: str | None, **settings: Any) -> RecipeChoice:
-    """Return the choice of a recipe from the values of `--reducer` and of a policy's options."""
-    return RecipeChoice(name, drop_none(**settings))
-
-
 policy_options = bundle_options("settings", drop_none, SETTINGS)
-recipe_options = bundle_options("choice", _recipe_choice, RECIPE | SETTINGS)
+recipe_options = bundle_options(
+    "choice", lambda name, **given: RecipeChoice(name, drop_none(**given)), RECIPE | SETTINGS
+)
 
 
 @dataclass(frozen=True)

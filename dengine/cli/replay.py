@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 from click.core import ParameterSource
 
-from ..errors import percent
+from ..errors import amount, counted, percent
 from . import options
 from .options import (
     ALPHA,
@@ -375,8 +375,7 @@ def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
     seconds = format_value("seconds", costs["seconds"])
     core_seconds = format_value("core_seconds", costs["core_seconds"])
     kept = f"; {costs['kept']} of them were kept from before" if costs["kept"] else ""
-    plural = "" if n_replays == 1 else "s"
-    return f"{n_replays} replay{plural} in {seconds}, {core_seconds} of one core{kept}."
+    return f"{counted(n_replays, 'replay')} in {seconds}, {core_seconds} of one core{kept}."
 
 
 def _group_replays(
@@ -421,12 +420,8 @@ def _replay_files(
     for name, (first, *_) in _group_replays(replays, lambda replay: replay.name).items():
         if not np.isnan(first.position).all():  # baselines embed nothing
             map_title = f"{name}, newest parts of one replay (seed {first.seed})"
-            yield _file_name(f"map_{name}"), embedding_map(first, title=map_title)
-
-
-def _file_name(title: str) -> str:
-    """Return a title as the name of a .png file, in characters that every file system takes."""
-    return re.sub(r"[^\w.=-]+", "_", title) + ".png"
+            file_name = re.sub(r"[^\w.=-]+", "_", f"map_{name}") + ".png"  # for every file system
+            yield file_name, embedding_map(first, title=map_title)
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
@@ -447,7 +442,7 @@ def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
 
 
 CAPTION = (
-    "cost: of a part, the mean over {shuffles} shuffles of {cycles} parts that chose nothing; "
+    "cost: of a part, the mean over {shuffles} of {cycles} parts that chose nothing; "
     "below it a 95 % interval, with the luck of the recordings and of the order. late: over the "
     "last third of a shuffle, when something has been learned. verified: share of the parts that "
     "were checked. bad of accepted, good of rejected: over these shuffles, with their intervals "
@@ -543,7 +538,7 @@ def costs(
     if curve is None:
         _end(error, "Interrupted: too little was finished; there is nothing to show.", False)
         return
-    check = f"{curve.costs.check:.3g}"
+    check = amount(curve.costs.check)
     verify_all = ("" if curve.policy else ">", "check all", "-", check, check, "100 %", "-", "-")
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
     title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
@@ -562,7 +557,9 @@ def costs(
         table_of_numbers(
             title,
             [dict(zip(COLUMNS, row, strict=True)) for row in rows],
-            legend_or_hint(CAPTION.format(shuffles=curve.shuffles, cycles=curve.cycles)),
+            legend_or_hint(
+                CAPTION.format(shuffles=counted(curve.shuffles, "shuffle"), cycles=curve.cycles)
+            ),
         ),
         *lines,
         out=out,
@@ -583,7 +580,7 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
     repeats = survey_dataset(dataset).duplicates
     if repeats:
         lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
-    by_shuffles = [f"{policy_name(row.policy)} {row.cost:.3g}" for row in curve.left_behind]
+    by_shuffles = [f"{policy_name(row.policy)} {amount(row.cost)}" for row in curve.left_behind]
     if by_shuffles:
         lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")
     if curve.out_of_reach:
@@ -608,8 +605,8 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
         ">" if is_chosen else "",
         f"alpha {policy.alpha:g}" if is_local else policy.guarantee,
         "-" if policy.guarantee == "cost" else percent(policy.lower_bound, "g"),
-        f"{row.cost:.3g}\n{row.lower:.3g} to {row.upper:.3g}",
-        f"{row.late:.3g}",
+        f"{amount(row.cost)}\n{amount(row.lower)} to {amount(row.upper)}",
+        amount(row.late),
         percent(row.verified, ".0f"),
         _error_cell(row.bad),
         _error_cell(row.good),

@@ -38,7 +38,7 @@ from bisect import bisect_left
 from dataclasses import dataclass, replace
 from functools import partial
 
-from ..errors import expect, percent
+from ..errors import counted, expect, percent
 
 BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capital would stay 0
 
@@ -360,10 +360,10 @@ class Certificate:
         that nothing can be said if the group is empty, no outcome was asked for (`unknown` is the
         reason), or the bound is 1.
         """
-        parts = f"{group.n:,} part{'s' if group.n != 1 else ''}"
+        parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""
         if group.n == 0:
-            return f"Nothing can be said yet: no part was one {which}."
+            return f"Nothing can be said yet: no part was {which}."
         if group.propensity == 0.0:
             return f"Of {parts} {which} nothing can be said{but}, for {unknown}."
         if group.shadowed:
@@ -462,7 +462,7 @@ def certify(
         accepted = _bound_audits(*accepts, audit_rate, (1.0 - share) * alpha)
     rejects = o.rejected, o.audited_rejects, o.audited_rejects_good, o.false_rejects
     rejected = _bound_audits(*rejects, audit_rate, alpha)
-    return Certificate(alpha, tolerance, accepted, rejected)
+    return Certificate(alpha, round(tolerance, 12), accepted, rejected)
 
 
 def _bound_audits(

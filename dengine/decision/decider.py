@@ -140,7 +140,7 @@ class Decider(nn.Module):
         action = self.limits(x)
         if action != self.within_limits:
             z = self.predictor.embed(x)
-            propensity = 1.0 if action == ActionCode.VERIFY.value else 0.0
+            propensity = float(action == ActionCode.VERIFY.value)
             return 0, content, action, 0, self.outside_reason, 0.0, 1.0, 0, 0, z, propensity
         own_part = part if part != 0 else content
         predicted, reason, lower, upper, n_success, n_failure, z = self.predictor(x, own_part)

@@ -151,7 +151,9 @@ class Policy:
             ForceLimits.parse(item) if isinstance(item, str) else item for item in given
         )
         are_limits = all(isinstance(item, ForceLimits) for item in limits)
-        expect(are_limits, "a list of force limits, or of their texts", self.force_limits)
+        expect(
+            are_limits, "force_limits, a list of ForceLimits or of their texts", self.force_limits
+        )
         return limits  # type: ignore[no-any-return]
 
     def _checked_prices(self) -> tuple[float, float, float]:

@@ -446,7 +446,7 @@ def train_candidate(
             reason = f"dropped: {defect}"
         else:
             model = successor
-            remarks = (TRAINED, report.note, LATE if stop.late else "")
+            remarks = (TRAINED, report.note, LATE if stop.late and report.n_steps_left else "")
             reason = "; ".join(filter(None, remarks))
     except DengineError as error:
         reason = f"dropped: {error}"

@@ -35,7 +35,7 @@ from scipy.stats import t as student
 from ..datasets import load_dataset
 from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import AUDIT_RATE, RULES, Policy
-from ..errors import SettingError, expect, percent
+from ..errors import SettingError, amount, expect, percent
 from ..files import FilePath
 from .grid import Task, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
@@ -233,19 +233,20 @@ class CostCurve:
         cheapest = self.rows[0]
         missing = self.missing
         verify_all = f"verifying everything costs {self.costs.check:g} a part"
-        cost = f"{row.cost:.3g} a part, with a 95 % interval of {row.lower:.3g} to {row.upper:.3g}"
+        interval = f"{amount(row.lower)} to {amount(row.upper)}"
+        cost = f"{amount(row.cost)} a part, with a 95 % interval of {interval}"
         text = f"{policy_name(row.policy)} {self.verdict}: {cost}; {verify_all}."
         if row.verified == 1.0:
             text = f"Nothing pays: {verify_all}, and everything was verified. Record more."
         elif self.policy is None:
             text = (
                 f"Nothing pays: {verify_all}; the cheapest policy, {policy_name(row.policy)}, "
-                f"costs {cost}, or {row.expected_cost:.3g} with half an error more."
+                f"costs {cost}, or {amount(row.expected_cost)} with half an error more."
             )
         elif cheapest != row:
             text += (
-                f" {policy_name(cheapest.policy)} costs {cheapest.cost:.3g}, which is not cheaper "
-                f"beyond chance, and lets more bad parts through: of 1,000 parts "
+                f" {policy_name(cheapest.policy)} costs {amount(cheapest.cost)}, which is not "
+                f"cheaper beyond chance, and lets more bad parts through: of 1,000 parts "
                 f"{1000 * cheapest.escaped:.2g}, not {1000 * row.escaped:.2g}."
             )
         if missing is not None:

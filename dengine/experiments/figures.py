@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets import Dataset
-from ..errors import OutputError, instead
+from ..errors import OutputError, amount, counted, instead
 from ..files import write_output
 from ..history.explain import Explanation
 from ..records import Action, TraceSpec
@@ -352,8 +352,8 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     costs = curve.costs
     title = (
         f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape {costs.escape:g} "
-        f"{unit}, false reject {costs.false_reject:g} {unit}\n{curve.shuffles} shuffles of "
-        f"{curve.cycles} parts, with 95 % intervals"
+        f"{unit}, false reject {costs.false_reject:g} {unit}\n"
+        f"{counted(curve.shuffles, 'shuffle')} of {curve.cycles} parts, with 95 % intervals"
     )
     n_last = len(curve.rows)
     rows = [*curve.rows, *curve.left_behind]
@@ -370,7 +370,7 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
         fill = BLUE if is_last else "none"
         left.errorbar(row.cost, y, xerr=errors, label=label, markerfacecolor=fill, **style)
         if row.upper > end:
-            left.text(end, y, f"to {row.upper:.3g} \u2192", ha="right", va="bottom", size=SMALL)
+            left.text(end, y, f"to {amount(row.upper)} \u2192", ha="right", va="bottom", size=SMALL)
         right.barh(y, 100 * (row.accepted + row.rejected), color=BLUE, fill=is_last)
     if curve.policy is not None:
         ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
@@ -385,8 +385,7 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
 
 def _axis_labels(spec: TraceSpec) -> list[str]:
     """Return the label of each channel's axis: its name, and its unit in brackets if known."""
-    numbered = [f"channel {i + 1}" for i in range(spec.channels)]
-    names = spec.columns or (numbered if spec.channels > 1 else ["trace"])
+    names = spec.names if spec.columns or spec.channels > 1 else ["trace"]
     return [
         f"{name} [{unit}]" if unit else name for name, unit in zip(names, spec.units, strict=True)
     ]

@@ -183,11 +183,10 @@ def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Dr
 
     The labels are those of all traces, the means those of usable traces of X (n, C, T) alone.
     """
-    names = data.channels or tuple(f"channel {i + 1}" for i in range(X.shape[1]))
     means = channel_means(np.where(usable[:, None, None], X, 0))
     means = np.where(usable[:, None], means, np.nan)
     quantities = [data.y.astype(np.float64), *means.T]
-    return tuple(_drift(*pair) for pair in zip(("good", *names), quantities, strict=True))
+    return tuple(_drift(*pair) for pair in zip(("good", *data.spec.names), quantities, strict=True))
 
 
 def _drift(name: str, values: NDArray[np.float64]) -> Drift:

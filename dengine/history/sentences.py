@@ -229,7 +229,7 @@ def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Cir
     if not len(touching):
         return ": the trace touched the sensor's range."
     channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
-    first = f"first after {spec.time_text(sample)} (channel {channel + 1})"
+    first = f"first after {spec.time_text(sample)} ({spec.names[channel]})"
     text = spec.value_text(limit, channel)
     return f": {len(touching)} samples touch the sensor's range of {text}, {first}."
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from ..decision.certificate import Certificate
 from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
-from ..errors import StoreError, expect
+from ..errors import StoreError, counted, expect
 from ..recipe import Recipe
 from ..records import (
     REPEATS,
@@ -262,10 +262,7 @@ class Status:
 
     def __repr__(self) -> str:
         counts = self.ever
-        name = (
-            f"{self.cell}: version {self.version}, {counts.decisions} "
-            f"decision{'' if counts.decisions == 1 else 's'}"
-        )
+        name = f"{self.cell}: version {self.version}, {counted(counts.decisions, 'decision')}"
         return (
             f"<Status of {name}, {counts.verified} verified, {counts.accepted} accepted, "
             f"{counts.false_accepts} known bad, {counts.rejected} rejected>"

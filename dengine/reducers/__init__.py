@@ -69,7 +69,8 @@ def reducer_class(name: str) -> type:
     missing = [method for method in TRANSFORMER_METHODS if not callable(getattr(cls, method, None))]
     if missing:
         actual = f"{name} has no {' and no '.join(missing)}"
-        raise SettingError(f"Expected a scikit-learn transformer as reducer, {actual}.")
+        wanted = "Expected a scikit-learn transformer as reducer, for a network a TorchReducer"
+        raise SettingError(f"{wanted}, {actual}.")
     return cls
 
 

@@ -376,7 +376,8 @@ class RocketReducer(Reducer):
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
         with torch.inference_mode():
-            points = apply_in_chunks(self._embed_raw, raw, 16 * CHUNK)
+            scale, embed = self.net_.encoder.scale_features, self.net_.embed_features
+            points = apply_in_chunks(lambda part: embed(scale(part)), raw, 16 * CHUNK)  # (n, K, d)
             return points_in_fold_space(points.numpy(), folds)
 
     def untrained_module(self, X: Floats) -> FeatureEmbedding:
@@ -639,10 +640,6 @@ class RocketReducer(Reducer):
         with torch.inference_mode():
             points: Floats = apply_in_chunks(self.net_, torch.from_numpy(traces)).numpy()
         return points
-
-    def _embed_raw(self, raw: Tensor) -> Tensor:
-        """Raw features (n, P) -> (n, K, d)."""
-        return self.net_.embed_features(self.net_.encoder.scale_features(raw))
 
     def module(self) -> FeatureEmbedding:
         check_is_fitted(self, "net_")

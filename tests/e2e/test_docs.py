@@ -2,8 +2,8 @@
 type it; only smaller.
 
 Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command
-gets options behind its own, of which the last counts. `make test` runs two pages, `make test-merge`
-README and two others in one folder, `make test-all` every one.
+gets options behind its own, of which the last counts. `make test` runs one page, `make test-merge` README,
+`make test-all` every one, and README and two others in one folder.
 """
 
 import json
@@ -23,7 +23,7 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[2]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
-QUICK = {"docs/howto/own_reducer.md", "docs/howto/parts.md"}
+QUICK = {"docs/howto/parts.md"}
 
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
@@ -239,15 +239,23 @@ def test_every_shortened_command_is_on_a_page() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.merge
+@pytest.mark.parametrize(
+    "pages",
+    [
+        pytest.param(["README.md"], marks=pytest.mark.merge, id="README"),
+        pytest.param(
+            ["README.md", "docs/tutorials/first_part.md", "docs/howto/production.md"], id="all"
+        ),
+    ],
+)
 def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(
-    desk: Path,
+    desk: Path, pages: list[str]
 ) -> None:
     (suggested,) = re.findall(
         r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8")
     )
     shell(suggested.replace("--cycles 600", "--cycles 80"), desk)
-    for page in ("README.md", "docs/tutorials/first_part.md", "docs/howto/production.md"):
+    for page in pages:
         type_page(REPO / page, desk)
 
 

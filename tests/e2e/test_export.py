@@ -106,8 +106,8 @@ def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fi
     [
         ("local", "all", 900),
         ("pooled", "some", 1500),
-        ("pooled", "all", 900),
-        ("cost", "all", 1500),
+        pytest.param("pooled", "all", 900, marks=pytest.mark.slow),
+        pytest.param("cost", "all", 1500, marks=pytest.mark.slow),
     ],
 )
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(

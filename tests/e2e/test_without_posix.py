@@ -82,7 +82,7 @@ def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_
     assert not set('<>:"/\\|?*') & set("".join(results))
 
 
-@pytest.mark.merge
+@pytest.mark.slow
 def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
     tests = (
         "tests/contract/test_store.py",

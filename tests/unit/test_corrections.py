@@ -224,7 +224,9 @@ def step(engine: DataEngine, data: Dataset, kind: str, value) -> None:
         engine.set_policy(replace(engine.policy, **{kind: value}))
 
 
-@pytest.mark.parametrize("recipe", [RECIPE, POOLED], ids=["local", "pooled"])
+@pytest.mark.parametrize(
+    "recipe", [pytest.param(RECIPE, marks=pytest.mark.slow), POOLED], ids=["local", "pooled"]
+)
 @settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
 @given(steps=STEPS)
 def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(

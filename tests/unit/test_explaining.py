@@ -192,7 +192,7 @@ def test_each_reason_is_explained_by_what_it_rests_on(
         "novel": [f"in level {novel.novelty.level:.2f} times the limit"],
         "constant": ["every sample is 4 Nm: a dead sensor", "The trace is quarantined"],
         "not_finite": ["1 of 60 samples are NaN or infinite", "The trace is quarantined"],
-        "saturated": ["first after 0.060 s (channel 1)", "The trace is quarantined"],
+        "saturated": ["first after 0.060 s (channel 0)", "The trace is quarantined"],
         "audit": ["the model alone would have", "below the audit rate 0.1"],
         "no_model": ["no model had been trained yet", "the trace was not embedded"],
         "lost": ["the decision was lost, and recorded again", "turned out bad (stop)"],

@@ -399,7 +399,7 @@ def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(
     assert heard == [engine.safe_mode]
 
 
-@pytest.mark.parametrize("guarantee", ["local", "pooled"])
+@pytest.mark.parametrize("guarantee", ["local", pytest.param("pooled", marks=pytest.mark.slow)])
 def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_evidence_keeps_the_tolerance(
     stream: Dataset, make_data, guarantee: str
 ) -> None:

@@ -203,11 +203,14 @@ def taught(reducer: Any, store: Path | None = None, traces: Any = None) -> DataE
 
 
 ANSWERING = [
-    *(TiedWeights, Recurrent, UnsavedBuffer, PlainTensor, WeightNorm),
+    *(UnsavedBuffer, WeightNorm),
     # Each takes seconds.
     *(
-        pytest.param(network, marks=pytest.mark.merge)
-        for network in (TwoNames, ChangedInTraining, NestedTensors, OwnNumber)
+        pytest.param(network, marks=pytest.mark.slow)
+        for network in (
+            *(TiedWeights, Recurrent, PlainTensor, TwoNames),
+            *(ChangedInTraining, NestedTensors, OwnNumber),
+        )
     ),
 ]
 

@@ -3,7 +3,7 @@
 import { capital, el, labelOf, labelWord, nameOf, number, partAddress, percent, svg } from "./dom.js";
 
 const CHANNELS = 3; // channels drawn: those farthest outside the band
-const HEIGHTS = [220, 118, 84]; // of each chart, by the number of charts, so that what is below keeps its place
+const HEIGHTS = [220, 150, 120]; // of each chart, by the number of charts
 const drawn = new Map(); // by a chart's element: its uPlot, and the observer of its width
 const probe = document.createElement("span");
 
@@ -98,10 +98,12 @@ export function traceCharts(explanation) {
   for (const each of explanation.envelope?.excesses ?? []) widest[each.channel] = Math.max(widest[each.channel], each.widths);
   const order = widest.map((_, channel) => channel).sort((a, b) => widest[b] - widest[a] || a - b);
   const shown = order.slice(0, CHANNELS).sort((a, b) => a - b);
-  return shown.map((channel) => traceChart(explanation, channel, HEIGHTS[shown.length - 1]));
+  const height = HEIGHTS[shown.length - 1];
+  return shown.map((channel, i) => traceChart(explanation, channel, height, i === shown.length - 1));
 }
 
-function traceChart(explanation, channel, height) {
+// Only the lowest chart has the time axis' label, for they are one below the other.
+function traceChart(explanation, channel, height, isLast) {
   const trace = explanation.trace[channel];
   const band = explanation.low && [explanation.high[channel], explanation.low[channel], explanation.median[channel]];
   const bads = explanation.bads.map((bad) => bad[channel]);
@@ -115,7 +117,10 @@ function traceChart(explanation, channel, height) {
     options: {
       scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...levels), Math.max(high, ...levels), 0.1, true) } },
       hooks: { draw: [(plot) => drawLimits(plot, limits)] },
-      axes: [axis(2, { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 }), axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56 })],
+      axes: [
+        axis(2, isLast ? { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 } : { size: 24 }),
+        axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56, space: 20 }),
+      ],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
       series: [
         {},
@@ -133,7 +138,7 @@ function traceCaption(explanation, channel) {
   const values = explanation.trace[channel].filter((value) => value !== null);
   const [low, high] = values.length ? [Math.min(...values), Math.max(...values)] : [0, 0];
   const several = explanation.trace.length > 1;
-  const what = isForce(spec) ? "Force" : spec.columns[channel] ?? (several ? `Channel ${channel + 1}` : "Trace");
+  const what = isForce(spec) ? "Force" : spec.columns[channel] ?? (several ? `Channel ${channel}` : "Trace");
   const duration = timeText(spec, timeOf(spec, explanation.trace[channel].length), 1);
   const range = `${number(low, 1)} to ${number(high, 1)} ${unitOf(spec, channel)}`.trim();
   const limits = limitsOf(explanation, channel).map((each) => limitsText(spec, each)).join("");
