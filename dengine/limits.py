@@ -62,7 +62,7 @@ class ForceLimits:
         valid = valid and _is_channel(self.channel)
         valid = valid and (self.along is None or _is_channel(self.along))
         wanted = "start <= end, low <= high, one of these finite, and channels from 0 on, or names"
-        expect(valid, f"force limits with {wanted}", self)
+        expect(valid, f"force_limits with {wanted}", self)
 
     def __str__(self) -> str:
         fields = [
@@ -98,7 +98,7 @@ class ForceLimits:
         except (TypeError, ValueError) as error:
             form = "START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
             raise SettingError(
-                f"Expected force limits as {form}, got {shortened(text)}."
+                f"Expected force_limits as {form}, got {shortened(text)}."
             ) from error
 
 

@@ -58,7 +58,7 @@ def test_a_stricter_policy_is_certain_only_where_the_looser_is(
         ({"force_limits": ["0.2:0.1:0:"]}, "start <= end"),
         ({"force_limits": ["0.1:0.2::1:canal=2"]}, r"START:END:LOW:HIGH, .*canal"),
         ({"force_limits": ["0.1:0.2:30"]}, r"behind it, got '0.1:0.2:30'\.$"),
-        ({"force_limits": ["0.1:0.2::1:reject=no"]}, "force limits with .*reject='no'"),
+        ({"force_limits": ["0.1:0.2::1:reject=no"]}, "force_limits with .*reject='no'"),
         ({"force_limits": ["0.1:0.2:1::channel=F Z"]}, "or names"),
     ],
 )

@@ -118,7 +118,7 @@ function traceChart(explanation, channel, height, isLast) {
       scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...levels), Math.max(high, ...levels), 0.1, true) } },
       hooks: { draw: [(plot) => drawLimits(plot, limits)] },
       axes: [
-        axis(2, isLast ? { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 } : { size: 24 }),
+        axis(2, isLast ? { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 } : { size: 34 }),
         axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56, space: 20 }),
       ],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],

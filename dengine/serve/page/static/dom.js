@@ -69,7 +69,7 @@ export const reasonOf = (name) => REASONS[name] ?? name.replace("_", " ");
 export const labelWord = (name) => LABELS[name];
 export const labelOf = (success) => (success === null ? "none" : success ? "good" : "bad");
 export const sourceOf = (name) => SOURCES[name] ?? name;
-export const nameOf = (part, id) => part ?? id.slice(0, 12);
+export const nameOf = (part, id) => part ?? id.slice(-12);
 export const partAddress = (id, view = "part") => `${view}?id=${encodeURIComponent(id)}`;
 
 export const chip = (action) => el("span", { class: `chip ${action}` }, icon(action), capital(action));
