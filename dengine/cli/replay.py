@@ -420,8 +420,11 @@ def _replay_files(
     for name, (first, *_) in _group_replays(replays, lambda replay: replay.name).items():
         if not np.isnan(first.position).all():  # baselines embed nothing
             map_title = f"{name}, newest parts of one replay (seed {first.seed})"
-            file_name = re.sub(r"[^\w.=-]+", "_", f"map_{name}") + ".png"  # for every file system
-            yield file_name, embedding_map(first, title=map_title)
+            # In characters that every file system takes.
+            yield (
+                re.sub(r"[^\w.=-]+", "_", f"map_{name}") + ".png",
+                embedding_map(first, title=map_title),
+            )
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:

@@ -233,8 +233,10 @@ class CostCurve:
         cheapest = self.rows[0]
         missing = self.missing
         verify_all = f"verifying everything costs {self.costs.check:g} a part"
-        interval = f"{amount(row.lower)} to {amount(row.upper)}"
-        cost = f"{amount(row.cost)} a part, with a 95 % interval of {interval}"
+        cost = (
+            f"{amount(row.cost)} a part, with a 95 % interval of {amount(row.lower)} to "
+            f"{amount(row.upper)}"
+        )
         text = f"{policy_name(row.policy)} {self.verdict}: {cost}; {verify_all}."
         if row.verified == 1.0:
             text = f"Nothing pays: {verify_all}, and everything was verified. Record more."

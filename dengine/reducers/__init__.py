@@ -69,8 +69,10 @@ def reducer_class(name: str) -> type:
     missing = [method for method in TRANSFORMER_METHODS if not callable(getattr(cls, method, None))]
     if missing:
         actual = f"{name} has no {' and no '.join(missing)}"
-        wanted = "Expected a scikit-learn transformer as reducer, for a network a TorchReducer"
-        raise SettingError(f"{wanted}, {actual}.")
+        raise SettingError(
+            "Expected a scikit-learn transformer as reducer, for a network a TorchReducer, "
+            f"{actual}."
+        )
     return cls
 
 

@@ -555,6 +555,15 @@ def test_lines_of_json_under_another_suffix_are_refused_until_that_is_stated(
     assert load_dataset(path, describe(path, {"format": "jsonl"})).y.tolist() == [1, 0, 1, 0]
 
 
+def test_a_column_named_part_with_short_runs_is_asked_about(tmp_path: Path) -> None:
+    path = tmp_path / "all.csv"
+    rows = [f"{i // 3},{10 if i < 29 else 0},{i / 7},OK" for i in range(30)]
+    path.write_text("\n".join(["part,travel,FZ,verdict", *rows]) + "\n", encoding="utf-8")
+    proposal = describe(path)
+    assert "part.column" in proposal.open_keys
+    assert "one of part, travel" in proposal.notes["part.column"]
+
+
 def test_times_that_repeat_are_asked_about(tmp_path: Path) -> None:
     for i in range(5):
         rows = [f"10:00:{k // 10:02},{k * i % 7}" for k in range(60)]

@@ -59,15 +59,16 @@ def _propose_part(p: Proposal, columns: Iterable[Column]) -> bool:
     """Find the column that tells the parts of a table apart; return whether there is any.
 
     It has the name of a part, or is the only one, or the only one whose words have numbers in them.
+    If a column with the name of a part has no runs that are long enough, it is asked.
     """
+    named = [column for column in columns if PART_NAME.search(column.name)]
     runs = [column for column in columns if _has_runs(column)]
-    named = [column for column in runs if PART_NAME.search(column.name)]
     numbered = [column for column in runs if re.search(r"\d", min(column.counts))]
-    best = named[:1] or numbered or runs
-    names = [column.name for column in named or runs]
+    certain = [column for column in named if column in runs]
+    best = certain or [*named, *(numbered or runs)]
     if runs:
-        note = f"one of {listed(names)}" if len(names) > 1 else ""
-        p.put("part.column", best[0].name if len(best) == 1 else UNKNOWN, note)
+        note = f"one of {listed(column.name for column in best)}" if len(best) > 1 else ""
+        p.put("part.column", best[0].name if certain or len(best) == 1 else UNKNOWN, note)
     return bool(runs)
 
 

@@ -3,7 +3,7 @@
 import { capital, el, labelOf, labelWord, nameOf, number, partAddress, percent, svg } from "./dom.js";
 
 const CHANNELS = 3; // channels drawn: those farthest outside the band
-const HEIGHTS = [220, 150, 120]; // of each chart, by the number of charts
+const HEIGHTS = [151, 80, 64]; // of each chart inside its axes, by the number of charts: the figures below stay above the fold
 const drawn = new Map(); // by a chart's element: its uPlot, and the observer of its width
 const probe = document.createElement("span");
 
@@ -98,11 +98,11 @@ export function traceCharts(explanation) {
   for (const each of explanation.envelope?.excesses ?? []) widest[each.channel] = Math.max(widest[each.channel], each.widths);
   const order = widest.map((_, channel) => channel).sort((a, b) => widest[b] - widest[a] || a - b);
   const shown = order.slice(0, CHANNELS).sort((a, b) => a - b);
-  const height = HEIGHTS[shown.length - 1];
-  return shown.map((channel, i) => traceChart(explanation, channel, height, i === shown.length - 1));
+  const isLast = (i) => i === shown.length - 1;
+  return shown.map((channel, i) => traceChart(explanation, channel, HEIGHTS[shown.length - 1] + (isLast(i) ? 69 : 25), isLast(i)));
 }
 
-// Only the lowest chart has the time axis' label, for they are one below the other.
+// Only the lowest chart has the numbers of the time axis, for they are one below the other.
 function traceChart(explanation, channel, height, isLast) {
   const trace = explanation.trace[channel];
   const band = explanation.low && [explanation.high[channel], explanation.low[channel], explanation.median[channel]];
@@ -118,7 +118,7 @@ function traceChart(explanation, channel, height, isLast) {
       scales: { x: { time: false }, y: { range: (_, low, high) => uPlot.rangeNum(Math.min(low, ...levels), Math.max(high, ...levels), 0.1, true) } },
       hooks: { draw: [(plot) => drawLimits(plot, limits)] },
       axes: [
-        axis(2, isLast ? { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 } : { size: 34 }),
+        axis(2, isLast ? { label: explanation.spec.rate_hz === null ? "samples" : "time in s", size: 32, labelSize: 20, labelGap: -4 } : { size: 8, values: (_, splits) => splits.map(() => "") }),
         axis(3, { label: unitOf(explanation.spec, channel), labelSize: 22, size: 56, space: 20 }),
       ],
       bands: band ? [{ series: [1, 2], fill: colour("good-soft") }] : [],
