@@ -1,5 +1,6 @@
 """What a user installs: small to import, complete, and nothing but `dengine`."""
 
+import re
 import shutil
 import subprocess
 import sys
@@ -37,6 +38,20 @@ def test_every_public_name_is_there_and_listed() -> None:
         dengine.Dataengine  # noqa: B018 -- the access is what is tested
 
 
+PROJECT_PAGE = "docs/hooks/project_page.md"
+
+
+def test_the_page_of_an_index_has_no_link_that_leads_into_a_checkout_and_its_example_runs(
+    repo: Path, tmp_path: Path, monkeypatch
+) -> None:
+    page = (repo / PROJECT_PAGE).read_text("utf-8")
+    assert "](" not in page
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(example, PROJECT_PAGE, "exec"), {})
+    assert (tmp_path / "engine.db").is_file()
+
+
 @pytest.fixture(scope="module")
 def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     # From a copy: setuptools leaves build/ behind and must not meet an old one.
@@ -47,7 +62,8 @@ def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for folder in ("models", "training", "tests", "notebooks"):
         (source / folder).mkdir()
         (source / folder / "__init__.py").touch()  # a trap: none of these may be packaged
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+    (source / PROJECT_PAGE).parent.mkdir(parents=True)
+    for name in ("pyproject.toml", PROJECT_PAGE, "LICENSE"):
         shutil.copy(repo / name, source / name)
     command = [
         sys.executable,
