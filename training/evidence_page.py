@@ -30,6 +30,7 @@ from matplotlib.figure import Figure
 from paper import INTERVALS, findings, paper_table
 from scipy.stats import t as student_t
 
+from dengine.errors import counted
 from dengine.experiments.baselines import BASELINES
 from dengine.experiments.figures import LIMIT, RECIPES, blank, finish, save
 from dengine.experiments.metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS
@@ -551,7 +552,7 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
         "",
         '`conv` where every bad accepted part stops the line and is known (`stops="all"`), by '
         f"`python training/evidence_guarantees.py` at commit {commits}: means over "
-        f"{played['seed'].nunique()} shuffles. An entry is: **net seconds** / certain decisions / "
+        f"{counted(played['seed'].nunique(), 'shuffle')}. An entry is: **net seconds** / certain decisions / "
         "share of the accepted parts that were bad. The two columns on the right are limits: with "
         "all labels known, the best two thresholds on the scores that the parts had when they were "
         "decided, and on scores of a model that was trained beforehand on all labels of the set. "
