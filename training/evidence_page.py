@@ -552,8 +552,9 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
         "",
         '`conv` where every bad accepted part stops the line and is known (`stops="all"`), by '
         f"`python training/evidence_guarantees.py` at commit {commits}: means over "
-        f"{counted(played['seed'].nunique(), 'shuffle')}. An entry is: **net seconds** / certain decisions / "
-        "share of the accepted parts that were bad. The two columns on the right are limits: with "
+        f"{counted(played['seed'].nunique(), 'shuffle')}. An entry is: **net seconds** / certain "
+        "decisions / share of the accepted parts that were bad. The two columns on the right are "
+        "limits: with "
         "all labels known, the best two thresholds on the scores that the parts had when they were "
         "decided, and on scores of a model that was trained beforehand on all labels of the set. "
         "No engine can know these thresholds. [guarantees.csv](guarantees.csv) has a row for each "

@@ -38,7 +38,7 @@ def test_every_public_name_is_there_and_listed() -> None:
         dengine.Dataengine  # noqa: B018 -- the access is what is tested
 
 
-PROJECT_PAGE = "docs/hooks/project_page.md"
+PROJECT_PAGE = "dengine/data/project_page.md"
 
 
 def test_the_page_of_an_index_has_no_link_that_leads_into_a_checkout_and_its_example_runs(
@@ -62,8 +62,7 @@ def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for folder in ("models", "training", "tests", "notebooks"):
         (source / folder).mkdir()
         (source / folder / "__init__.py").touch()  # a trap: none of these may be packaged
-    (source / PROJECT_PAGE).parent.mkdir(parents=True)
-    for name in ("pyproject.toml", PROJECT_PAGE, "LICENSE"):
+    for name in ("pyproject.toml", "LICENSE"):
         shutil.copy(repo / name, source / name)
     command = [
         sys.executable,
