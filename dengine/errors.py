@@ -109,12 +109,12 @@ def percent(share: float, form: str = ".1f") -> str:
 
 
 def counted(n: int, noun: str) -> str:
-    """Return a number with its noun, "1 part" or "1,200 parts"."""
+    """Return a number with its noun, of which the plural ends in s: "1 part", "1,200 parts"."""
     return f"{n:,} {noun}{'' if n == 1 else 's'}"
 
 
 def amount(value: float) -> str:
-    """Return a cost for people, in money or time: three digits, and whole from 1,000 on."""
+    """Return a cost of 0 or more as text: three significant digits, and whole from 1,000 on."""
     return f"{value:,.0f}" if value >= 999.5 else f"{value:.3g}"
 
 

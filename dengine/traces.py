@@ -401,7 +401,8 @@ class ForceLimitsGate(nn.Module):
 
         Returns WITHIN_LIMITS if it keeps all limits, or there are none; else the `ActionCode`:
         REJECT if it leaves a limit that rejects, otherwise VERIFY. A trace without a sample in the
-        stretch of a limit leaves it; a NaN in the stretch does not.
+        stretch of a limit leaves it. A NaN among the values leaves no limit; a NaN as the position
+        along a path lies in no stretch.
         """
         if self.limits.size(0) == 0:
             return self.within

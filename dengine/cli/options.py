@@ -327,11 +327,11 @@ _NOVELTY = (
     "Verify a trace that is this many times less like the learned traces than they are like each "
     "other; 0: off."
 )
-_WINDOWS = (
+_FORCE_LIMITS = (
     "Verify a part whose force leaves limits between two times, in seconds. LOW or HIGH may be "
     "empty; :reject rejects the part; '' removes all limits."
 )
-_WINDOW = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
+_FORCE_LIMIT = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
 _SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 
 
@@ -347,11 +347,11 @@ POLICY = {
     "force_limits": click.option(
         "--force-limit",
         "force_limits",
-        metavar=_WINDOW,
+        metavar=_FORCE_LIMIT,
         multiple=True,
         # None where the option was not given; an empty tuple removes all limits of a recipe.
         callback=lambda _, option, values: tuple(filter(None, values)) if values else None,
-        help=_WINDOWS,
+        help=_FORCE_LIMITS,
     ),
 }
 SETTINGS = POLICY | {

@@ -188,11 +188,12 @@ def import_parts(
     policy: Policy,
     on_traces: Progress | None = None,
 ) -> ImportReport:
-    """Put parts with their decisions into a store, in chunks that are stored all or none.
+    """Put parts with their decisions into a store, in chunks.
 
-    A decision whose id has a label in the store stays as it is, and its label here is counted as
-    repeated or contradicted. A trace with a fault is stored, with the fault as its decision's
-    reason, but never trains.
+    Each chunk is one transaction; chunks before an error stay. With `stops="some"` each label holds
+    how many accepted parts went on without a report since the label before. A decision whose id has
+    a label in the store stays as it is, and its label here is counted as repeated or contradicted.
+    A trace with a fault is stored, with the fault as its decision's reason, but never trains.
 
     Parameters
     ----------
@@ -203,8 +204,8 @@ def import_parts(
     trace_spec : TraceSpec
         Of the traces.
     policy : Policy
-        Under which the decisions were made. It sets the propensity of each stored decision; the one
-        that was passed is ignored.
+        Under which the decisions were made. Each stored decision gets its propensity from it;
+        `Decision.propensity` is not read.
     on_traces : callable, optional
         Called with the number of parts of each chunk.
 
@@ -237,11 +238,11 @@ def import_parts(
                 # A decision that was stored without a label was counted as unreported.
                 n_unreported += (label is None) - (earlier is not None)
             if label is not None:
-                n_before = n_unreported * (not stored.quarantined)
-                n_unreported -= n_before
+                n_since = n_unreported * (not stored.quarantined)
+                n_unreported -= n_since
                 source = source_of(decision.action, decision.audit, label)
                 about = (store.clock(), stored.content_hash, stored.time)
-                labels.append(NewLabel(decision.id, label, source, 0, None, n_before, *about))
+                labels.append(NewLabel(decision.id, label, source, 0, None, n_since, *about))
                 counts["quarantined" if stored.quarantined else "imported"] += 1
         store.apply_records([*new.values(), *labels])
         if on_traces is not None:
@@ -250,9 +251,9 @@ def import_parts(
 
 
 def _count_unreported(store: "SqlStore", policy: Policy) -> int:
-    """Return how many accepted parts there are since the last label of which nothing was heard.
+    """Return how many parts that this policy accepted have no label, and are in no label's count.
 
-    If silence confirms a part, there is none.
+    With `stops="all"` there is none: the next decision confirms them.
     """
     if policy.stops != "some":
         return 0

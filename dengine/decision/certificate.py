@@ -462,6 +462,7 @@ def certify(
         accepted = _bound_audits(*accepts, audit_rate, (1.0 - share) * alpha)
     rejects = o.rejected, o.audited_rejects, o.audited_rejects_good, o.false_rejects
     rejected = _bound_audits(*rejects, audit_rate, alpha)
+    # 1 - 0.95 is 0.05000000000000004.
     return Certificate(alpha, round(tolerance, 12), accepted, rejected)
 
 

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from ..folds import COIN_BITS, MIX, audit_salt
 from ..limits import ForceLimits
 from ..records import REASONS, ActionCode, Reason, TraceSpec
-from ..traces import WITHIN_LIMITS, ForceLimitsGate, TraceGate
+from ..traces import ForceLimitsGate, TraceGate
 
 # fault, content hash, action, predicted action, reason, lower, upper, n_success, n_failure,
 # embedding, propensity; see `Decider.forward`.
@@ -84,7 +84,6 @@ class Decider(nn.Module):
         self.n_spaces, self.dim = embedding_shape
         self.audit_reason = REASONS.index(Reason.AUDIT)
         self.outside_reason = REASONS.index(Reason.OUTSIDE)
-        self.within_limits = WITHIN_LIMITS
         self.coin_range = float(2**COIN_BITS)
         self.mix = MIX
         self.shift = 63 - COIN_BITS
@@ -138,7 +137,7 @@ class Decider(nn.Module):
             nothing = torch.full((self.n_spaces, self.dim), float("nan"))
             return fault, content, 0, 0, fault, 0.0, 1.0, 0, 0, nothing, 1.0
         action = self.limits(x)
-        if action != self.within_limits:
+        if action != self.limits.within:
             z = self.predictor.embed(x)
             propensity = float(action == ActionCode.VERIFY.value)
             return 0, content, action, 0, self.outside_reason, 0.0, 1.0, 0, 0, z, propensity

@@ -51,7 +51,10 @@ FEW_NOVEL = 25.0  # traces in a row that are not novel; a novel one takes back 1
 
 
 class Detector(IntEnum):
-    """What a drift detector watches. The first two are also the sides of the rule."""
+    """What a drift detector watches; the first two are also the rule's sides, accept and reject.
+
+    The value is the detector's position in `detector_sums`, and its `SafeMode` minus 1.
+    """
 
     ACCEPTED_PARTS = 0
     REJECTED_PARTS = 1
@@ -59,7 +62,10 @@ class Detector(IntEnum):
 
 
 class SafeMode(IntEnum):
-    """Why every part is verified, the detector that raised the alarm; exported files give it."""
+    """The detector whose alarm has every part verified; NONE outside of a safe mode.
+
+    An alarm during a safe mode keeps the smaller of the two values. Exported files give the value.
+    """
 
     NONE = 0
     ACCEPTED_PARTS = 1
@@ -242,23 +248,25 @@ class MemberEvidence(nn.Module):
     def observe(self, n_unreported: int, novel: bool) -> None:
         """Step the drift detectors with parts of unknown outcome and the novelty of one trace.
 
-        `n_unreported` accepted parts went on since the last label. They count as not wrong, and
-        outside of the safe mode as not novel. `novel` says whether the trace of the part at hand
-        was novel. Outside of the safe mode it steps the detector of novel traces, which may start a
-        safe mode. In a safe mode for novel traces the same detector counts how long few have been
-        novel. In any other safe mode `novel` has no effect.
+        It is called just before `update`, for the same part. `n_unreported` accepted parts went on
+        since the last label. They count as not wrong, and outside of a safe mode as not novel, so
+        they lower the sums. `novel` says whether the trace of this part was novel. Outside of a
+        safe mode it steps the detector of novel traces, which may start one. In a safe mode for
+        novel traces the same sum counts how long few have been novel; `update` ends it. In any
+        other safe mode `novel` has no effect.
         """
         self.step_detector(Detector.ACCEPTED_PARTS.value, self.correct_step, n_unreported)
         safe_mode = int(self.safe_mode.item())
         novelty = Detector.NOVEL_TRACES.value
         if safe_mode == SafeMode.NONE.value:
             self.step_detector(novelty, self.correct_step, n_unreported)
-            step = self.error_steps[novelty] if novel else self.correct_step
-            self.step_detector(novelty, step, 1)
+            self.step_detector(
+                novelty, self.error_steps[novelty] if novel else self.correct_step, 1
+            )
         elif safe_mode == SafeMode.NOVEL_TRACES.value:  # the sum counts how long few were novel
             step = -self.novel_setback if novel else 1.0
-            before = max(float(self.detector_sums[novelty].item()), 0.0)
-            self.detector_sums[novelty].fill_(before + step)
+            total = self.detector_sums[novelty]
+            total.fill_(max(float(total.item()), 0.0) + step)
 
     def update(
         self,
@@ -275,12 +283,13 @@ class MemberEvidence(nn.Module):
         are known, every part counts as checked. Elsewhere `inclusion_probability`, with which the
         outcome would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0
         only the drift detectors see it. A wrong outcome may raise an alarm, which starts the safe
-        mode. This ends when the side that raised the alarm has an open level again; after too many
-        novel traces, when novel ones are few again and either side has an open level.
+        mode. A safe mode ends only here: when the side that raised the alarm has an open level
+        again; after too many novel traces, when novel ones are few again and either side has one.
         """
-        accepting, rejecting = Detector.ACCEPTED_PARTS.value, Detector.REJECTED_PARTS.value
-        self.count_outcome(accepting, lower, not success, predicted, inclusion_probability)
-        self.count_outcome(rejecting, 1.0 - upper, success, predicted, inclusion_probability)
+        side = Detector.ACCEPTED_PARTS.value
+        self.count_outcome(side, lower, not success, predicted, inclusion_probability)
+        side = Detector.REJECTED_PARTS.value
+        self.count_outcome(side, 1.0 - upper, success, predicted, inclusion_probability)
         safe_mode = int(self.safe_mode.item())
         if safe_mode == SafeMode.NONE.value:
             return
@@ -303,11 +312,11 @@ class MemberEvidence(nn.Module):
         The sides are the first two of `Detector`. The score for accepting is the lower bound, for
         rejecting 1 - upper bound. `wrong` says whether the side's action would have been wrong. If
         the score reaches the threshold, the drift detector of the side takes a step first, which
-        may start the safe mode. Then all levels that the score reaches count the part, and the
-        members do if it reaches the target level or `predicted` is the side's action. It counts as
-        one part, without a weight. If all outcomes are known, it counts as checked; else
-        `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. No
-        threshold is chosen if the part is counted nowhere.
+        may start the safe mode. Then each level that the score reaches counts the part. It is a
+        member if it reaches the target level, after an alarm the strictest, or if `predicted` is
+        the side's action. It counts as one part, without a weight. If the rule knows all outcomes,
+        it counts as checked; else this part's `inclusion_probability` says how: 1 as checked, above
+        0 as audited, and 0 not at all. No threshold is chosen if the part is counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -368,9 +377,9 @@ class MemberEvidence(nn.Module):
     def start_safe_mode(self, safe_mode: int) -> None:
         """Close both sides until the members from now on show recovery.
 
-        `safe_mode` is a `SafeMode`, not NONE. The detectors and the counts
-        since the last alarm restart at 0, and the target is the strictest level again. The counts
-        over all time, and the newest errors of each level, stay.
+        `safe_mode` is a `SafeMode`, not NONE. The detectors and the counts since the last alarm
+        restart at 0, and the target is the strictest level again. The counts over all time, and the
+        newest errors of each level, stay.
         """
         self.detector_sums.zero_()
         self.member_counts_since_alarm.zero_()

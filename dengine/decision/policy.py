@@ -150,10 +150,8 @@ class Policy:
         limits: Any = tuple(
             ForceLimits.parse(item) if isinstance(item, str) else item for item in given
         )
-        are_limits = all(isinstance(item, ForceLimits) for item in limits)
-        expect(
-            are_limits, "force_limits, a list of ForceLimits or of their texts", self.force_limits
-        )
+        wanted = "force_limits, a list of ForceLimits or of their texts"
+        expect(all(isinstance(item, ForceLimits) for item in limits), wanted, self.force_limits)
         return limits  # type: ignore[no-any-return]
 
     def _checked_prices(self) -> tuple[float, float, float]:
@@ -182,8 +180,8 @@ class Policy:
         """Return the policy whose settings `to_values` wrote; missing settings have their defaults.
 
         The force limits are one text, separated by spaces, or "none"; in older stores their name
-        is "windows". Names that are no settings are
-        ignored. Raises SettingError for a value out of its range.
+        is "windows". Names that are no settings are ignored. Raises SettingError for a value out of
+        its range.
         """
         names = [field.name for field in fields(cls)]
         settings = {name: values[name] for name in names if name in values}

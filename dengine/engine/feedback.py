@@ -91,9 +91,8 @@ class Feedback:
         self._unsynced: dict[str, bool] = {}
         # Decisions whose check was asked for, not reported and not overdue, oldest first.
         self._awaiting_check: OrderedDict[str, StoredDecision] = OrderedDict()
-        self._n_unreported = (
-            0  # accepted parts that went on without an outcome since the last label
-        )
+        # Accepted parts that went on without an outcome since the last label.
+        self._n_unreported = 0
         self._safe_mode = ""
         self._novel_share = 0.0  # of the recent decisions
         self._novelty_reported = False
@@ -149,8 +148,7 @@ class Feedback:
         self._novelty_reported = self._novel_share > limit
 
     def confirm_unreported(self) -> None:
-        """Count accepted parts without an outcome as confirmed, or as unreported; the next trace
-        has come.
+        """Settle accepted parts without an outcome, because the next trace has come.
 
         With `stops="all"` each is a success: rule and references learn it at once, and its label,
         CONFIRMED, waits in memory; when `MOST_CONFIRMED` labels wait, all are handed to the outbox.
@@ -226,23 +224,22 @@ class Feedback:
     def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
         """Update rule and references with the outcome of a part; return its label for the store.
 
-        A trace with a fault updates neither; any other outcome counts as a new label. A rejected
-        part that was inspected does not update the rule: which of them are inspected is somebody's
-        choice, and no sample. An outcome that updates the rule sets the count of unreported parts
-        back to zero; its label holds the count from before, less one if the part itself was in it.
+        A trace with a fault updates neither, but its label takes a number. A rejected part that was
+        inspected becomes a reference and does not update the rule: which parts are inspected is
+        somebody's choice, and no sample. Any other label takes over the count of unreported parts,
+        which begins again at 0, also if the decision is from before the present rule. If this part
+        was itself counted as unreported it is subtracted, so a late report may give -1.
         """
         decision = stored.decision
         version = self._live.version
         number = self._outbox.number_label()
         point = None
-        n_unreported = 0
+        n_unreported = None  # the rule is not updated
         if not stored.quarantined:  # an unusable trace teaches nothing
-            updates_rule = source is not Source.INSPECTION
-            if updates_rule:
+            if source is not Source.INSPECTION:
                 n_unreported = self._n_unreported - self._was_unreported(stored)
                 self._n_unreported = 0
-            known = n_unreported if updates_rule else None
-            point = self._live.learn(stored, success, number, known)
+            point = self._live.learn(stored, success, number, n_unreported)
             self._labels.count_learned(1)
         overdue_to = self._live.overdue_to
         return NewLabel(
@@ -251,7 +248,7 @@ class Feedback:
             source,
             version,
             point,
-            n_unreported,
+            n_unreported or 0,
             overdue_to=overdue_to,
             seq=number,
         )

@@ -46,7 +46,7 @@ class CellLabels:
         self.resume(counts_from)
 
     def count_learned(self, n: int) -> None:
-        """Count a label that was just learned, 1, or taken back before the store had it, -1."""
+        """Change the count: by 1 for a label just learned, by -1 for one taken back unstored."""
         self.new_labels += n
 
     def add(self, stored: StoredDecision, label: NewLabel) -> None:

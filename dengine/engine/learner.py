@@ -16,6 +16,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from itertools import count
 from typing import Any
 
 import torch
@@ -400,23 +401,23 @@ class Learner:
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
         """Make references of all labels that came, one with each step, and have them stored.
 
-        Yields as `_see_through` does. It ends when no label is missing or on its way to the store.
-        In a cell that never pauses some label always is, so every `PATIENCE`-th time it waits here.
+        Confirmations are handed over, and overdue checks counted, before each look. Yields as
+        `_see_through` does. It ends when no label is missing or waits to be stored. In a cell that
+        never pauses some label always waits, so every `PATIENCE`-th time this call waits for the
+        store itself; a StoreError there is ignored.
         """
-        n_waits = 0
-        while True:
+        for n_waits in count(1):
             self._feedback.store_confirmations()
             self._feedback.number_labels()
             while candidate.learn_next(self._window):
                 yield None
             if not self._outbox.request_label_drain():
                 return
-            n_waits += 1
-            if n_waits % PATIENCE == 0:
-                with suppress(StoreError):
+            if n_waits % PATIENCE:
+                yield self._outbox.drain
+            else:
+                with suppress(StoreError):  # then the next time is a step again
                     self._outbox.drain()
-                    continue
-            yield self._outbox.drain
 
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
         """Complete the candidate's report, and submit report and model to the thread that stores
@@ -623,8 +624,8 @@ class Learner:
 
         Until the version is stored nothing changes, so all that can fail comes before: reading it,
         restoring it, and adding the later labels, up to the window's capacity, as its references.
-        Once it answers, news of peers is taken in, which become its
-        references as well, and only then new labels count from zero: none that it knows is new.
+        Once it answers, news of peers is taken in, which become its references as well, and only
+        then new labels count from zero: none that it knows is new.
 
         Raises StoreError for a version that is not kept, where a trace is damaged that the model
         must be fitted on again, and where it cannot be stored.

@@ -102,9 +102,8 @@ class EngineSettings:
         is_spec = self.trace is None or isinstance(self.trace, TraceSpec)
         expect(is_spec, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
         if self.trace is not None:
-            ForceLimitsGate(
-                self.recipe.policy.force_limits, self.trace
-            )  # raises before it is in force
+            # It raises before the policy is in force.
+            ForceLimitsGate(self.recipe.policy.force_limits, self.trace)
 
     def to_store(self) -> dict[str, str]:
         """Return the settings as texts by name, as `SqlStore.settings.save` takes them.

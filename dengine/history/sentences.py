@@ -237,10 +237,9 @@ def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Cir
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
     x = torch.from_numpy(trace)
-    all_limits = circumstances.recipe.policy.force_limits
     left = [
         str(limits)
-        for limits in all_limits
+        for limits in circumstances.recipe.policy.force_limits
         if ForceLimitsGate([limits], circumstances.spec)(x) != WITHIN_LIMITS
     ]
     return (

@@ -294,7 +294,7 @@ class EngineModel(ABC):
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
         """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
 
-        Position 0 is no safe mode. The default does nothing.
+        NONE is no safe mode. The default does nothing.
         """
 
     @abstractmethod

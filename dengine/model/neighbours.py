@@ -677,7 +677,7 @@ class ModelPrediction(EngineModel):
     def reset_rule(self, safe_mode: int) -> None:
         """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
 
-        Position 0 is no safe mode. The rule is reset in place, because the compiled module shares
+        NONE is no safe mode. The rule is reset in place, because the compiled module shares
         its tensors. `rule_is_stale` stays as it is.
         """
         self.rule.load_state_dict(self.rule.clone().state_dict())

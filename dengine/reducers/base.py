@@ -182,7 +182,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     @property
     def n_spaces(self) -> int:
         """Return K, the number of embedding spaces."""
-        return int(getattr(self, "folds", 1))
+        return 1
 
     def train(
         self,
@@ -592,6 +592,10 @@ class CrossFitted(_Wrapping):
     uses_labels = True
 
     folds: int = 2
+
+    @property
+    def n_spaces(self) -> int:
+        return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Fit clone k on the traces outside fold k, for every k, and replace `clones_` and `dim_`.

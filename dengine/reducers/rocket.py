@@ -305,6 +305,10 @@ class RocketReducer(Reducer):
     max_iter: int = 20
     random_state: Any = 0
 
+    @property
+    def n_spaces(self) -> int:
+        return int(self.folds)
+
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Draw the kernels anew and fit the heads; earlier fits are forgotten.
 
@@ -376,8 +380,7 @@ class RocketReducer(Reducer):
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
         with torch.inference_mode():
-            scale, embed = self.net_.encoder.scale_features, self.net_.embed_features
-            points = apply_in_chunks(lambda part: embed(scale(part)), raw, 16 * CHUNK)  # (n, K, d)
+            points = apply_in_chunks(self._embed_raw, raw, 16 * CHUNK)
             return points_in_fold_space(points.numpy(), folds)
 
     def untrained_module(self, X: Floats) -> FeatureEmbedding:
@@ -640,6 +643,10 @@ class RocketReducer(Reducer):
         with torch.inference_mode():
             points: Floats = apply_in_chunks(self.net_, torch.from_numpy(traces)).numpy()
         return points
+
+    def _embed_raw(self, raw: Tensor) -> Tensor:
+        """Raw features (n, P) -> (n, K, d)."""
+        return self.net_.embed_features(self.net_.encoder.scale_features(raw))
 
     def module(self) -> FeatureEmbedding:
         check_is_fitted(self, "net_")

@@ -201,6 +201,10 @@ class TorchReducer(Reducer):
     checkpoint: str = ""
     random_state: Any = 0
 
+    @property
+    def n_spaces(self) -> int:
+        return int(self.folds)
+
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Train `fit_steps` steps from initial weights; earlier trainings are forgotten.
 

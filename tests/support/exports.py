@@ -20,7 +20,7 @@ from dengine import (
 from tests.support.driving import learn
 
 SAMPLES, LIMIT = 100, 500.0
-WINDOWS = (
+FORCE_LIMITS = (
     ForceLimits(0.02, 0.06, high=5.0),
     ForceLimits(0.1, 0.15, low=-20.0, high=22.5, reject=True),
 )

@@ -395,10 +395,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         while not self._closing.is_set():
             try:
                 return self._open()
-            except (
-                CellError,
-                SettingError,
-            ) as error:  # a controller may change while it is unavailable
+            # A controller may change while it is unavailable.
+            except (CellError, SettingError) as error:
                 if until < float("inf") and not (
                     isinstance(error, HeldError) and time.monotonic() < until
                 ):

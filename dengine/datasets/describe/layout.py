@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -55,16 +55,17 @@ def _is_wide(kind: str, files: Files) -> bool:
     return kind == "ts" or has_curves or bool(numbered_columns(first)) or _has_lists(first)
 
 
-def _propose_part(p: Proposal, columns: Iterable[Column]) -> bool:
-    """Find the column that tells the parts of a table apart; return whether there is any.
+def _propose_part(p: Proposal, columns: Collection[Column]) -> bool:
+    """Propose `part.column`, and return whether any column has runs, see `_has_runs`.
 
-    It has the name of a part, or is the only one, or the only one whose words have numbers in them.
-    If a column with the name of a part has no runs that are long enough, it is asked.
+    It is the first column with runs that is named like a part. If none is, it is the only column
+    with runs, or the only one of them with digits; `?` if there are several, or if a column that is
+    named like a part has no runs. Without runs nothing is proposed.
     """
-    named = [column for column in columns if PART_NAME.search(column.name)]
     runs = [column for column in columns if _has_runs(column)]
     numbered = [column for column in runs if re.search(r"\d", min(column.counts))]
-    certain = [column for column in named if column in runs]
+    certain = [column for column in runs if PART_NAME.search(column.name)]
+    named = [column for column in columns if PART_NAME.search(column.name)]
     best = certain or [*named, *(numbered or runs)]
     if runs:
         note = f"one of {listed(column.name for column in best)}" if len(best) > 1 else ""

@@ -17,7 +17,7 @@ from dengine import DataEngine, Dataset, TraceSpec, export_torchscript
 from dengine.export import import_journal, make_key
 from dengine.export.cell_journal import read_journal
 from dengine.records import Action
-from tests.support.exports import SAMPLES, WINDOWS, trained
+from tests.support.exports import FORCE_LIMITS, SAMPLES, trained
 from tests.support.programs import Program, asked, must_agree
 
 
@@ -31,7 +31,7 @@ class Learned(NamedTuple):
 
 
 POLICIES = {
-    "local": {"guarantee": "local", "stops": "some", "force_limits": WINDOWS},
+    "local": {"guarantee": "local", "stops": "some", "force_limits": FORCE_LIMITS},
     "pooled": {"guarantee": "pooled", "stops": "some", "audit_rate": 0.6},  # its only evidence
     "all": {"guarantee": "pooled", "stops": "all"},
 }
