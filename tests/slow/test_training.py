@@ -4,6 +4,8 @@ break them.
 
 import importlib
 import json
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -160,3 +162,68 @@ def test_a_training_replaces_its_section_of_a_card_and_no_other(run: Run, tmp_pa
     assert "Before." in text
     assert "After." in text
     assert "Old." not in text
+
+
+def test_every_figure_that_a_file_holds_is_as_in_the_file_and_a_changed_one_is_found(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figures = load("list_figures")
+    with pytest.raises(SystemExit, match="0"):
+        run("list_figures")
+    assert " 0 wrong" in capsys.readouterr().out
+
+    copy = tmp_path / "docs"
+    shutil.copytree(FOLDER.parent / "docs", copy)
+    shutil.copy(FOLDER.parent / "README.md", tmp_path)
+    monkeypatch.setattr(figures, "DOCS", copy)
+    monkeypatch.setattr(figures, "RESULTS", copy / "results")
+    monkeypatch.setattr(figures, "EXPLANATION", copy / "explanation")
+    for page, text, other in (
+        (tmp_path / "README.md", "| 992 |", "| 993 |"),
+        (copy / "explanation" / "faults.md", "| 24,369 |", "| 24,396 |"),
+        (copy / "results" / "index.md", "| insertion | 1503 | 992 |", "| insertion | 1503 | 929 |"),
+    ):
+        content = page.read_text("utf-8")
+        assert text in content, f"{page.name} does not show {text}"
+        page.write_text(content.replace(text, other, 1), "utf-8")
+        with pytest.raises(SystemExit, match="1"):
+            figures.main()
+        assert f"{page.name}:" in capsys.readouterr().out
+        page.write_text(content, "utf-8")
+
+
+def test_a_part_of_the_evidence_is_played_at_its_commit_once_and_its_files_are_in_the_manifest(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evidence = load("make_evidence")
+    writes = "-c open('{out}/table.csv','a').write('x\\n')"
+    part = evidence.Part(writes, {"table.csv": "docs/table.csv"})
+    monkeypatch.setattr(evidence, "PARTS", {"one": part, "two": evidence.Part("-c 1/0", {})})
+    monkeypatch.setattr(evidence, "REPO", tmp_path / "repository")
+    repository = tmp_path / "repository"
+    (repository / "dengine").mkdir(parents=True)
+    (repository / "dengine" / "code.py").touch()
+    for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -qm first"):
+        subprocess.run(["git", *words.split()], cwd=repository, check=True)
+    out = tmp_path / "out"
+    (out / "one").mkdir(parents=True)
+    for _ in range(2):
+        assert "one                  finished" in run(
+            "make_evidence", "--out", out, "--only", "one"
+        )
+    assert (out / "one" / "table.csv").read_text() == "x\n"
+    with pytest.raises(SystemExit, match="'two' failed"):
+        run("make_evidence", "--out", out)
+
+    (repository / "docs" / "results").mkdir(parents=True)
+    run("make_evidence", "--out", out, "--publish")
+    manifest = json.loads((repository / "docs/results/manifest.json").read_text())
+    assert list(manifest["parts"]) == ["one"]
+    digest = manifest["parts"]["one"]["files"]["docs/table.csv"]
+    assert digest == evidence.digest(repository / "docs" / "table.csv")
+
+    (repository / "dengine" / "code.py").write_text("changed = 1\n")
+    command = "git -c user.name=a -c user.email=a@b commit -qam second"
+    subprocess.run(command.split(), cwd=repository, check=True)
+    with pytest.raises(SystemExit, match="give another --out"):
+        run("make_evidence", "--out", out)
