@@ -91,12 +91,12 @@ proof: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.slow.proof --out $(OUT)/proof --repeats $(REPEATS) --jobs 2
 	cp $(OUT)/proof/proof.csv docs/explanation/
 
-# Hours: it says how many before it begins, and goes on where it was killed. SCREW names the screw-driving set, an .npz file.
-RESULTS = index.md replays.csv differences.csv guarantees.csv curves.png net_seconds.png
+# All figures of the documentation, at one commit: some fourteen hours, in parts that continue where they were killed. SCREW names the
+# screw-driving set, an .npz file; . .ci/postgres.sh starts the server that the faults need.
 evidence: $(VENV)/.dev
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python training/evidence_guarantees.py --out $(OUT) $(if $(SCREW),--screw $(SCREW))
-	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(VENV)/bin/python training/evidence.py --out $(OUT) $(if $(SCREW),--screw $(SCREW))
-	cp $(addprefix $(OUT)/evidence/,$(RESULTS)) docs/results/
+	$(VENV)/bin/python training/make_evidence.py --out $(OUT)/all_evidence $(if $(SCREW),--screw $(SCREW))
+	$(VENV)/bin/python training/make_evidence.py --out $(OUT)/all_evidence --publish
+	$(VENV)/bin/python training/list_figures.py
 
 # pip-audit may skip every package and still end well, so what it audited is counted. It gets names and plain versions: one
 # that is installed in editable form, or a build like 2.9.0+cpu, is not on PyPI, and --strict fails at what is not there.

@@ -1,6 +1,6 @@
 """Play the replays behind the results: every reducer and baseline on eight sets of parts.
 
-    make evidence SCREW=screw_driving.npz     # SCREW: as training/make_screw_driving.py writes it
+    python training/evidence.py --screw screw_driving.npz  # a file of make_screw_driving.py
     python training/evidence.py --only conv --n-jobs 2     # methods left out keep their rows
     python training/evidence.py --cluster tcp://host:8786  # on the workers of a dask cluster
     python training/evidence.py --tables-only --out out    # only write the page again

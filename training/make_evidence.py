@@ -32,6 +32,7 @@ from typing import Any
 
 REPO = Path(__file__).resolve().parents[1]
 MANIFEST = Path("docs/results/manifest.json")
+POSTGRES = "DENGINE_TEST_POSTGRES"
 INPUTS = {"insertion": REPO / "dengine/data/insertion.npz"}
 
 
@@ -174,7 +175,7 @@ class Run:
             out=self.folder(name),
             screw=f" --screw {screw.resolve()}" if screw else "",
             jobs=jobs,
-            postgres=os.environ.get("DENGINE_TEST_POSTGRES", ""),
+            postgres=os.environ.get(POSTGRES, ""),
         ).split()
         threads = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
         environment = os.environ | threads | {"PYTHONPATH": str(self.source)}
@@ -254,7 +255,9 @@ def main() -> None:
         run.publish()
     elif not arguments.list:
         for name in names:
-            if not run.is_finished(name):
+            if "{postgres}" in PARTS[name].command and not os.environ.get(POSTGRES):
+                print(f"{name}: left out, since {POSTGRES} names no server.", flush=True)
+            elif not run.is_finished(name):
                 print(f"{datetime.now(UTC):%H:%M} {name}", flush=True)
                 run.play(name, arguments.screw, arguments.jobs)
     for name in PARTS:
