@@ -112,9 +112,10 @@ MEASURES = {
     "net_s": Measure(
         "Net seconds saved",
         0,
-        f"{VERIFY_SECONDS:g} s for each check that was left out, less {STOP_SECONDS:g} s for each "
-        f"bad part that was accepted and {CYCLE_SECONDS:g} s for each good part that was rejected, "
-        "per replay. More is better; below zero the method cost more than it saved.",
+        f"Each check that was left out saves {VERIFY_SECONDS:g} s. Each bad part that was accepted "
+        f"costs {STOP_SECONDS:g} s, and each good part that was rejected costs {CYCLE_SECONDS:g} "
+        "s. The entry is the sum per replay. More is better; below zero the method cost more than "
+        "it saved.",
         True,
     ),
 }
@@ -340,9 +341,9 @@ def introduction_lines() -> list[str]:
         "accepted.",
         "",
         "**An entry** is a mean over the replays. Below the mean is its difference from "
-        f"`{REFERENCE}` on the same parts in the same order (the same seed), with the 95 % "
-        "interval of this difference (Student's t over the seeds). The difference is **bold** if "
-        "the interval does not contain zero. Each interval holds by itself: of 100 methods that "
+        f"`{REFERENCE}` on the same parts in the same order (the same seed). In brackets is the "
+        "95 % interval of this difference (Student's t over the seeds). The difference is **bold** "
+        "if the interval does not contain zero. Each interval holds by itself: of 100 methods that "
         f"are exactly as good as `{REFERENCE}`, about five would be bold. A method with fewer "
         f"seeds is compared only with the replays of `{REFERENCE}` that have these seeds. So this "
         "difference may not be the difference of the two means in the table.",
