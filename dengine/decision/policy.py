@@ -66,9 +66,9 @@ class Policy:
     shadow : bool, default False
         Shadow mode: every part is verified, and the model only says what it would have done.
     label_within : int, default 1000
-        Number of decisions within which a verification or an audit must be reported. If it is not,
-        it counts as a wrong decision, in the certificate and in the rule, until it is reported.
-        The unit is decisions, not seconds: a cell may stand still, and a replay gives the same.
+        Number of decisions within which a verification or an audit must be reported. Until it is
+        reported, an overdue one counts as a wrong decision, in the certificate and in the rule. The
+        unit is decisions, not seconds: a cell may stand still, and a replay gives the same result.
     force_limits : tuple of ForceLimits or str, default ()
         The operator's limits beside the model. A trace that leaves one of them is verified or
         rejected, whatever the model says (`Reason.OUTSIDE`). No claim counts this trace.
