@@ -119,16 +119,17 @@ class TraceSpec:
     channels : int, default 1
         Number of channels. A trace of one channel may have the shape `(samples,)`.
     unit : str or tuple of str, optional
-        Unit of the samples, shown to people and used by `limit`: one for all channels, or one for
-        each, as ("kN", "mm") or "kN, mm"; "" for a channel of an unknown unit. None: unknown.
+        Unit of the samples, shown to people and used by `limit`: one unit for all channels, or one
+        for each, for example ("kN", "mm") or "kN, mm"; "" for a channel of an unknown unit. None:
+        unknown.
     limit : float, optional
         Range of the sensor, in `unit`: a sample at or beyond ±limit is saturated. None: not
         checked.
     fit : {"strict", "cut", "pad", "resample"}, default "strict"
         What happens to a trace of another length, see `traces.fit_length`. strict: TraceError. cut:
-        a longer one loses its end. pad: like cut, and a shorter one repeats its last sample.
-        resample: linear interpolation. Half to twice the length can be padded or resampled; any
-        other length is a TraceError.
+        a longer trace loses its end. pad: like cut, and a shorter trace repeats its last sample.
+        resample: linear interpolation. A trace of half to twice the length can be padded or
+        resampled; any other length is a TraceError.
     columns : tuple of str, default ()
         Names of the channels, by which the columns of a DataFrame are selected.
 
@@ -181,7 +182,7 @@ class TraceSpec:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The name of each channel: of its column if that is known, else "channel 0" and so on."""
+        """The name of each channel: the name of its column if known, else "channel 0" and so on."""
         return self.columns or tuple(f"channel {i}" for i in range(self.channels))
 
     def time_text(self, sample: int) -> str:
@@ -193,8 +194,9 @@ class TraceSpec:
         return f"{value:g} {self.units[channel]}".rstrip()
 
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
-        """Return a copy with the rate, units and columns of another contract of the same shape,
-        each where this contract has none. For none, or another shape, return it unchanged.
+        """Return a copy that takes the rate, units and columns that it lacks from another contract.
+
+        Returns this contract unchanged if `other` is None or has another shape.
         """
         if other is None or (self.samples, self.channels) != (other.samples, other.channels):
             return self
@@ -232,16 +234,16 @@ class Decision:
     action : Action
         What the cell does next.
     predicted : Action
-        What the model alone would have done. Differs from `action` in an audit; VERIFY where the
+        What the model alone would have done. Differs from `action` in an audit; VERIFY if the
         operator's `ForceLimits` reject.
     lower, upper : float
-        Bounds of the success probability in the neighbourhood of the trace. Under the pooled
-        guarantee the score by which traces are sorted: for conv and rocket the mean probability
-        of their heads, twice, else an interval at alpha 0.5.
+        Bounds of the success probability in the neighbourhood of the trace. Under the guarantees
+        "pooled" and "cost" they are the score by which parts are sorted. With conv and rocket both
+        are the mean probability of their heads; otherwise they are an interval at alpha 0.5.
     n_success, n_failure : int
         Labels of each kind in that neighbourhood.
     embedding : tuple of tuple of float, shape (K, d), or None
-        The scaled embedding of the trace in each space. None where no model embedded it.
+        The scaled embedding of the trace in each space. None if no model embedded it.
     model_version : int
         Version of the model that decided; 0 before the first retrain.
     reason : Reason
@@ -249,7 +251,7 @@ class Decision:
     audit : bool
         Whether the part is verified although the model was certain.
     propensity : float
-        Probability with which the part is verified: the audit rate if the model is certain, 0 where
+        Probability with which the part is verified: the audit rate if the model is certain, 0 if
         the operator's limits reject, else 1.
     part : str, optional
         Number of the part, if the caller gave it.
@@ -343,7 +345,7 @@ class Cycle:
     retrain : RetrainReport or None
         Retrain that this cycle started or saw finish.
     safe_mode : str, default ""
-        Why everything is verified after this cycle; "" where it is not.
+        Why everything is verified after this cycle; "" if it is not.
     """
 
     index: int

@@ -59,7 +59,7 @@ GUARANTEES: dict[str, dict[str, Any]] = {
 HINDSIGHT = ("hindsight, scores of each moment", "hindsight, final scores")
 # Variants of conv, each with something that the paper's rule does not promise or need.
 VARIANTS = {
-    "conv, no novelty": "without the novelty gate: also a trace unlike all others is decided",
+    "conv, no novelty": "without the novelty gate, so it also decides on a trace unlike all others",
     "conv, every stop known": (
         'with `stops="all"`: the engine counts an accepted part as good if the line did not stop'
     ),
@@ -112,9 +112,10 @@ MEASURES = {
     "net_s": Measure(
         "Net seconds saved",
         0,
-        f"{VERIFY_SECONDS:g} s for each check that was left out, less {STOP_SECONDS:g} s for each "
-        f"bad part that was accepted and {CYCLE_SECONDS:g} s for each good part that was rejected, "
-        "per replay. More is better; below zero the method cost more than it saved.",
+        f"Each check that was left out saves {VERIFY_SECONDS:g} s. Each bad part that was accepted "
+        f"costs {STOP_SECONDS:g} s, and each good part that was rejected costs {CYCLE_SECONDS:g} "
+        "s. The entry is the sum per replay. More is better; below zero the method cost more than "
+        "it saved.",
         True,
     ),
 }
@@ -326,25 +327,26 @@ def introduction_lines() -> list[str]:
         "",
         "**A replay** sends the parts of one set through an engine, one after the other. The "
         "engine starts without a label. It either decides a part itself, which is a *certain* "
-        "decision, or has it checked and learns from the result. Of the parts that it accepted it "
-        "learns only those that stopped the line. The seed sets the order of the parts of a "
-        "recorded set, and generates the parts of the others.",
+        "decision, or has it checked and learns from the result. From an accepted part it learns "
+        "only if the part stopped the line. The seed sets the order of the parts of a recorded "
+        "set. For a generated set, the seed generates the parts.",
         "",
         "**The methods.** " + ", ".join(f"`{method}`" for method in REDUCERS) + " are reducers of "
-        f"dengine; the others are published methods in the same loop: {baselines}. They have rules "
-        "of their own, and `knn` has no bound at all: alpha and LB do not change its decisions.",
+        f"dengine. The others are published methods in the same loop: {baselines}. The published "
+        "methods have rules of their own. `knn` has no bound at all: alpha and LB do not change "
+        "its decisions.",
         "",
         "**The policies.** alpha is the error level of the interval around the success rate of "
         "similar parts. LB is the success rate that its lower end must reach before a part is "
         "accepted.",
         "",
-        "**An entry** is a mean over the replays. Below it stands how much more this is than "
-        f"`{REFERENCE}` has on the same parts in the same order (the same seed), with the 95 % "
-        "interval of this difference (Student's t over the seeds). The difference is **bold** if "
-        "the interval does not contain zero. Each interval holds by itself: of 100 methods that "
+        "**An entry** is a mean over the replays. Below the mean is its difference from "
+        f"`{REFERENCE}` on the same parts in the same order (the same seed). In brackets is the "
+        "95 % interval of this difference (Student's t over the seeds). The difference is **bold** "
+        "if the interval does not contain zero. Each interval holds by itself: of 100 methods that "
         f"are exactly as good as `{REFERENCE}`, about five would be bold. A method with fewer "
-        f"seeds is compared with the replays of `{REFERENCE}` that have these seeds, so the two "
-        "means may differ by another amount.",
+        f"seeds is compared only with the replays of `{REFERENCE}` that have these seeds. So this "
+        "difference may not be the difference of the two means in the table.",
         "",
     ]
 
@@ -369,7 +371,7 @@ def verdict_lines(rows: pd.DataFrame) -> list[str]:
     if not table:
         return [TOO_FEW, ""]
     return [
-        f"On how many sets `{REFERENCE}` is ahead / not different beyond chance / behind.",
+        f"Number of sets on which `{REFERENCE}` is ahead / not different beyond chance / behind.",
         "",
         *table_lines(["method", "sets", "certain decisions", "net seconds"], table),
     ]
@@ -452,16 +454,17 @@ def figure_lines() -> list[str]:
         "",
         "![Learning curves of each method on each set](curves.png)",
         "",
-        f"Certain share of the parts, at {policy}, from one number of labels to the next, "
-        f"{LABELS_PER_POINT} later. A curve that ends further left needed fewer labels for all "
-        "parts of the set.",
+        f"Each point is the certain share of the parts, at {policy}, between one number of labels "
+        f"and {LABELS_PER_POINT} labels more. If a curve ends further left, the method needed "
+        "fewer labels for all parts of the set.",
         "",
         f"### Net seconds beside {REFERENCE}",
         "",
         f"![Net seconds of each method beyond those of {REFERENCE}](net_seconds.png)",
         "",
-        f"Differences of the third table, at {policy}. The dotted line is `{REFERENCE}`; a method "
-        "whose bar crosses it saves as much, as far as these replays can tell.",
+        f"The figure shows the differences of the third table, at {policy}. The dotted line is "
+        f"`{REFERENCE}`. If the bar of a method crosses this line, these replays show no "
+        f"difference from `{REFERENCE}`.",
         "",
     ]
 
@@ -498,9 +501,9 @@ def paper_lines(replays: pd.DataFrame) -> list[str]:
     lines = [
         "## The paper's table",
         "",
-        "The paper's 18 combinations of interval, alpha and LB on `insertion`. An entry is: bad "
-        "parts accepted / certain decisions, each a mean ± the standard deviation over the seeds "
-        "[as the paper published them, for its own parts].",
+        "The tables have the paper's 18 combinations of interval, alpha and LB on `insertion`. An "
+        "entry is: bad parts accepted / certain decisions, each a mean ± the standard deviation "
+        "over the seeds. In brackets are the numbers that the paper published for its own parts.",
         "",
     ]
     for reducer, interval in product(PAPER_REDUCERS, INTERVALS):
@@ -508,7 +511,7 @@ def paper_lines(replays: pd.DataFrame) -> list[str]:
         if len(played):
             lines += [f"**{reducer}, {interval} interval**", ""]
             lines += [paper_table(played, reducer, interval), ""]
-    lines += ["Which of the paper's findings these replays confirm:", ""]
+    lines += ["The replays check the paper's findings:", ""]
     return [*lines, *(f"- {line}" for line in findings(rows)), ""]
 
 
@@ -529,7 +532,7 @@ def variant_lines(differences: pd.DataFrame) -> list[str]:
     return [
         f"## What each promise costs, at {policy_name(*POLICIES[0])}",
         "",
-        f"`{REFERENCE}` with the paper's rule, and variants of it:",
+        f"The table compares `{REFERENCE}` under the paper's rule with variants of it:",
         "",
         *(f"- *{name}*: {text}." for name, text in VARIANTS.items()),
         "",
@@ -550,15 +553,16 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
     return [
         "## What each guarantee saves",
         "",
-        '`conv` where every bad accepted part stops the line and is known (`stops="all"`), by '
-        f"`python training/evidence_guarantees.py` at commit {commits}: means over "
+        "The table shows `conv` if every bad accepted part stops the line and is known "
+        '(`stops="all"`). `python training/evidence_guarantees.py` played it at commit '
+        f"{commits}. The numbers are means over "
         f"{counted(played['seed'].nunique(), 'shuffle')}. An entry is: **net seconds** / certain "
         "decisions / share of the accepted parts that were bad. The two columns on the right are "
-        "limits: with "
-        "all labels known, the best two thresholds on the scores that the parts had when they were "
-        "decided, and on scores of a model that was trained beforehand on all labels of the set. "
-        "No engine can know these thresholds. [guarantees.csv](guarantees.csv) has a row for each "
-        "replay.",
+        "limits. They use the best two thresholds, which no engine can know, because they follow "
+        "from all labels. In the first of the two columns, the thresholds are on the scores that "
+        "the parts had when they were decided. In the second column, they are on the scores of a "
+        "model that was trained beforehand on all labels of the set. "
+        "[guarantees.csv](guarantees.csv) has a row for each replay.",
         "",
         *table_lines(["set", "parts", *names], table),
     ]

@@ -35,7 +35,7 @@ PUBLISHED = {
     for row, cells in _ROWS.items()
     for bound, cell in zip(LOWER_BOUNDS, cells, strict=True)
 }
-# The certain predictions answer to alpha and LB if they vary by more than this share of their mean.
+# The certain predictions react to alpha and LB if they vary by more than this share of their mean.
 ANSWERS = 0.1
 
 
@@ -126,15 +126,15 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
     n_cells = len(means)
     if is_ours and n_cells > 1 and interval in INTERVALS and certain.any():
         answers = bool(certain.max() - certain.min() > ANSWERS * certain.mean())
-        claim = "Wilson answers" if interval == "wilson" else "Binomial does not answer"
-        measured = f"certain from {certain.min():.1f} to {certain.max():.1f} over the cells"
+        claim = "Wilson reacts" if interval == "wilson" else "Binomial does not react"
+        measured = f"{certain.min():.1f} to {certain.max():.1f} certain decisions over the cells"
         holds = answers == (interval == "wilson")
         yield _finding(holds, f"{claim} to alpha and LB; {condition}", measured)
     shares = (means["false_positive"] / certain).fillna(0.0)
     n_kept = int((shares < 1.0 - means.index.get_level_values("lower_bound")).sum())
-    worst = f"in {n_kept} of {n_cells} cells, at most {100 * shares.max():.1f} % of the certain"
+    most = f"at most {100 * shares.max():.1f} % of the certain decisions"
     claim = f"the mean share of false positives stays below 1 - LB; {condition}"
-    yield _finding(n_kept == n_cells, claim, worst)
+    yield _finding(n_kept == n_cells, claim, f"in {n_kept} of {n_cells} cells, {most}")
     if not is_ours or interval != "wilson":
         return
     for bound, column in rows.groupby("lower_bound", sort=False):

@@ -81,7 +81,7 @@ def wilson_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0
     Returns
     -------
     lower, upper : float64 array of that shape, or float for scalar counts
-        (0, 1) where nothing was counted.
+        (0, 1) if nothing was counted.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def wald_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.0
     Returns
     -------
     lower, upper : float64 array of that shape, or float for scalar counts
-        (0, 1) where nothing was counted.
+        (0, 1) if nothing was counted.
 
     References
     ----------
@@ -145,7 +145,7 @@ def clopper_pearson_interval(
     Returns
     -------
     lower, upper : float64 array of that shape, or float for scalar counts
-        (0, 1) where nothing was counted.
+        (0, 1) if nothing was counted.
 
     References
     ----------
@@ -169,7 +169,7 @@ def jeffreys_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float =
     Returns
     -------
     lower, upper : float64 array of that shape, or float for scalar counts
-        (0, 1) where nothing was counted.
+        (0, 1) if nothing was counted.
 
     References
     ----------
@@ -201,7 +201,7 @@ def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[An
     Returns
     -------
     lower, upper : float64 array or tensor of that shape
-        (0, 1) where nothing was counted.
+        (0, 1) if nothing was counted.
     """
     n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
     centre = (n_success + z * z / 2.0) / (n + z * z)

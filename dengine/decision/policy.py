@@ -46,36 +46,38 @@ class Policy:
     alpha : float, default 0.05
         Two-sided error level of the interval, between 0 and 1.
     lower_bound : float, default 0.95
-        The paper's LB, between 0.5 and 1: accept where lower >= LB, reject where upper <= 1 - LB.
+        The paper's LB, between 0.5 and 1: accept if lower >= LB, reject if upper <= 1 - LB.
     interval : str, default "wilson"
         A name in `INTERVALS`.
     audit_rate : float, optional
         Share of certain decisions that are verified all the same, from 0 to 1. A guarantee on
-        rejects needs it, and so do "pooled" and "cost" where not all line stops are known. None: 0,
+        rejects needs it, and so do "pooled" and "cost" if not all line stops are known. None: 0,
         or 0.05 if `prices` are given without a guarantee.
     guarantee : str, optional
         The rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a
-        subclass of `DecisionRule`. "local", the paper's, is about the neighbourhood of one trace;
-        "pooled" about all parts together; "cost" about what they cost by `prices`: then
-        `lower_bound` has no effect, and `alpha` only on the safe mode. None: "local", or "cost" if
-        `prices` are given.
+        subclass of `DecisionRule`. "local", the paper's rule, is about the neighbourhood of one
+        trace. "pooled" is about all parts together. "cost" is about what all parts cost by
+        `prices`; `lower_bound` has no effect then, and `alpha` has one only on the safe mode. None:
+        "local", or "cost" if `prices` are given.
     stops : {"some", "all"}, default "some"
-        "all": every bad accepted part stops the line and is reported before the next decision, so
-        that silence until then confirms the part. "some": silence says nothing.
+        "all": every bad accepted part stops the line and is reported before the next decision. If
+        nothing is reported until then, the part is confirmed. "some": a missing report says
+        nothing.
     shadow : bool, default False
         Shadow mode: every part is verified, and the model only says what it would have done.
     label_within : int, default 1000
-        Number of decisions within which a verification or an audit must be reported. A later one
-        counts as a wrong decision, in the certificate and in the rule, until it is reported. The
-        unit is decisions, not seconds, so that a cell may stand still and a replay repeats.
+        Number of decisions within which a verification or an audit must be reported. Until it is
+        reported, an overdue one counts as a wrong decision, in the certificate and in the rule. The
+        unit is decisions, not seconds: a cell may stand still, and a replay gives the same result.
     force_limits : tuple of ForceLimits or str, default ()
-        The operator's limits beside the model. A trace that leaves one is verified or rejected
-        whatever the model says (`Reason.OUTSIDE`), and no claim counts it.
+        The operator's limits beside the model. A trace that leaves one of them is verified or
+        rejected, whatever the model says (`Reason.OUTSIDE`). No claim counts this trace.
     prices : three floats, optional
-        Of a check, of a bad part that is accepted, and of a good part that is rejected, in one
-        unit; "cost" decides by them. It accepts what fails with a probability below check / escape,
-        and rejects what succeeds with one below check / false reject. An error costs more than two
-        checks. None: `PRICES`, 5, 120 and 47.5.
+        The prices of a check, of a bad part that is accepted (an escape), and of a good part that
+        is rejected, in one unit. "cost" decides by them. It accepts a part that fails with a
+        probability below check / escape, and rejects a part that succeeds with a probability below
+        check / false reject. An error must cost more than two checks. None: `PRICES`, 5, 120 and
+        47.5.
 
     Raises
     ------
@@ -192,8 +194,8 @@ class Policy:
     def changed(self, **settings: Any) -> Self:
         """Return a copy with these settings changed.
 
-        Prices without a guarantee imply what they imply in a new policy: "cost" in the place of
-        "local" and "pooled", which have no prices, and an audit rate of 0.05 in the place of 0.
+        Prices without a guarantee change the same settings as in a new policy: "cost" replaces
+        "local" and "pooled", which have no prices, and an audit rate of 0.05 replaces 0.
         """
         implied: dict[str, Any] = {}
         if "prices" in settings and self.guarantee in ("local", "pooled"):
@@ -305,9 +307,9 @@ class Policy:
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """Return (lower, upper) of the success probability by the policy's interval.
 
-        The counts are integers or arrays of one shape, the ends floats or arrays of that shape. The
-        error level is alpha, or under the guarantees "pooled" and "cost", where the interval only
-        sorts parts, 0.5.
+        The counts are integers or arrays of one shape. The ends are floats or arrays of that
+        shape. The error level is alpha. Under the guarantees "pooled" and "cost", where the
+        interval only sorts parts, it is 0.5.
         """
         error_level = interval_error_level(self.alpha, self.guarantee)
         return INTERVALS[self.interval](n_success, n_failure, error_level)
@@ -315,7 +317,7 @@ class Policy:
     def action(self, lower: float, upper: float) -> Action:
         """Return the action that one bound allows by the paper's rule, whatever the guarantee is.
 
-        ACCEPT where lower >= LB, REJECT where upper <= 1 - LB, otherwise VERIFY.
+        ACCEPT if lower >= LB, REJECT if upper <= 1 - LB, otherwise VERIFY.
         """
         from .rule import action_of
 

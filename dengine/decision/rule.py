@@ -28,7 +28,7 @@ def action_of(lower: float, upper: float, accept_threshold: float, reject_thresh
     lower, upper : float
         Bound on the success probability.
     accept_threshold, reject_threshold : float
-        Accept where lower >= accept_threshold, reject where upper <= reject_threshold.
+        Accept if lower >= accept_threshold, reject if upper <= reject_threshold.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def action_of(lower: float, upper: float, accept_threshold: float, reject_thresh
 
 
 class DecisionRule(nn.Module):
-    """The paper's rule: accept where lower >= LB, reject where upper <= 1 - LB.
+    """The paper's rule: accept if lower >= LB, reject if upper <= 1 - LB.
 
     A rule that learns from outcomes is a subclass. It overrides `update` and `action`, perhaps
     `observe`, and keeps what it learned in buffers of fixed shape: a store keeps these with each

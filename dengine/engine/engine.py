@@ -130,10 +130,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         A file or a URL (SQLite, PostgreSQL); None remembers in memory. A store that is not empty is
         opened by `DataEngine.open`.
     seed : int
-        Of the reducer, and of the coin that draws audits.
+        The seed of the reducer and of the coin that draws audits.
     recipe : Recipe, str or path, optional
-        A recipe, its name or a TOML file, for all settings that are not given beside it; it names
-        its own reducer.
+        A recipe, its name or a TOML file, for all settings that are not given as arguments. It
+        names its own reducer.
     model : Model, optional
         A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
         force_limits and shadow count then.
@@ -322,17 +322,17 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         url : str, path or SqlStore
         reducer, model : object, optional
-            The same object again, where the engine had one of yours that the store cannot name.
+            The same object again, if the engine had one of yours that the store cannot name.
         trace : TraceSpec, optional
-            The stored contract of traces, to state its rate, units or columns where they are
+            The stored contract of traces, to state its rate, units or columns if they are
             unknown.
         wait : float, optional
             Seconds that a call waits for the database, as `SqlStore` takes it.
         allow_import : bool or collection of str
-            Whether a `module:Class` that the store names is imported, or which of them. A class
-            that `reducer` names is allowed.
+            Whether a `module:Class` that the store names is imported, or which of these classes
+            are. A class that `reducer` names is allowed.
         reading : bool
-            Neither decide nor learn; another engine may own the store. To export from it, for one.
+            Neither decide nor learn, for example to export. Another engine may own the store.
         **options
             executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With an
             executor the ids of all decisions are read before this returns (a second for a million),
@@ -345,12 +345,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         StoreError
-            Where the store does not exist or is not used, or another engine owns the cell.
+            If the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            Where an object is missing or another than before, a model is not needed, or `trace`
-            contradicts the stored contract.
+            If an object is missing or differs from the one before, if a model is given but not
+            needed, or if `trace` contradicts the stored contract.
         ImportRefusedError
-            A SettingError, where a class would have to be imported that is not allowed.
+            A SettingError, if a class would have to be imported that is not allowed.
         """
         engine = cls.__new__(cls)
         with opening(url, must_exist=True, wait=wait) as store:
@@ -387,17 +387,17 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         store : str, path, SqlStore or None
             None: a new one in memory.
         seed : int, optional
-            None: that of the used store, of a peer, or 0.
+            None: the seed of the used store or of a peer, or 0.
         wait : float, optional
             Seconds that a call waits for the database; not used for an open store.
         allow_import : bool
-            Whether any `module:Class` that the store names is imported. One that the settings name
-            is imported in any case.
+            Whether any `module:Class` that the store names is imported. A class that the settings
+            name is imported in any case.
         **settings
-            As `DataEngine` takes them. For a used store those that are given must be those in
-            force: the settings of a running cell do not change in silence. `model` is as for
-            `open`; `executor`, `clock`, `replaying` and `on_safe_mode` are not stored and taken as
-            they are. A new cell of a product takes what is left open from its peers.
+            As `DataEngine` takes them. For a used store, the given settings must be the settings
+            in force, so that a running cell does not change unnoticed. `model` is as for `open`;
+            `executor`, `clock`, `replaying` and `on_safe_mode` are not stored, so any may be
+            given. A new cell of a product takes the settings that are not given from its peers.
 
         Returns
         -------
@@ -407,11 +407,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            Where a given setting is not the used store's.
+            If a given setting differs from the used store's.
         StoreError
-            Where another engine owns the cell, or the store cannot be used.
+            If another engine owns the cell, or the store cannot be used.
         ImportRefusedError
-            Where a class would have to be imported that is not allowed.
+            If a class would have to be imported that is not allowed.
         """
         with opening(store, wait=wait) as opened:
             allowed = allow_import or named_classes(**settings)
@@ -433,8 +433,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. A second call does nothing. What the disk does not
-        take is given up, and an error is logged; no report on it was acknowledged. Raises
+        A retrain that takes longer is dropped. A second call does nothing. Records that the disk
+        does not take are given up, and an error is logged; none of them was acknowledged. Raises
         StoreError while another thread uses the engine.
         """
         with self._exclusive:
@@ -495,12 +495,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         part : str or int, optional
             The part's number. A part that comes again has one vote, and none on itself.
         decision_id : str, optional
-            An id of the caller's. The same id and trace have the same decision for ever, and an
-            ACCEPT or REJECT is on disk when this returns.
+            An id that the caller chooses. The same id and trace always have the same decision, and
+            an ACCEPT or REJECT is on disk when this returns.
         timed_out : bool, default False
-            Whoever asked, with an id, has given up waiting and verifies the part. Record that,
-            VERIFY with `Reason.LATE`, without asking the model; a fault of the trace, or of the
-            store, is the reason instead.
+            The caller, who gave an id, does not wait any more and verifies the part. Record this
+            as VERIFY with `Reason.LATE`, without asking the model. If the trace or the store has a
+            fault, this fault is the reason instead.
         wait : bool, default True
             False is for a server that answers by a deadline: the call waits neither for another
             call of the engine nor for the disk. Any thread may make it while no other thread uses
@@ -524,11 +524,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ------
         TraceError
             For a wrong shape, a first trace of less than 10 samples, an id that belongs to another
-            trace, and a part's number that is none.
+            trace, and an invalid part number.
         SettingError
             For a first trace that the policy's force limits do not fit.
         ReportError
-            For an id that is no id.
+            For an invalid id.
         StoreError
             For an engine that is closed, was opened for reading, or is in use by another thread.
         """
@@ -596,11 +596,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
 
-        It sets off what follows from the label: safe mode may begin or end, and a retrain that is
-        due is done in this thread, or begun in the executor. The label of a trace with a fault is
-        stored, and sets off no retrain. If a part was confirmed wrongly before, the call also waits
-        for the store, so that the rule is put right now; where the store does not answer, that
-        happens later.
+        After the label, safe mode may begin or end, and a retrain that is due runs in this thread
+        or begins in the executor. The label of a trace with a fault is stored, but no retrain
+        follows. If the part was confirmed wrongly before, the call also waits for the store, so
+        that the rule is corrected now; if the store does not answer, this happens later.
 
         Parameters
         ----------
@@ -608,26 +607,26 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         success : bool
             The result of the verification; False for a line stop after an accept, True for a part
             known to be good. A line stop that comes after the part was confirmed, however late,
-            takes that back and counts as a correction. The label of a rejected part that somebody
-            looked at trains, and does not update the rule.
+            takes the confirmation back and counts as a correction. If somebody inspected a
+            rejected part, its label is used for training, but does not update the rule.
         trace, part : optional
             Only for a line stop whose decision was lost: it is then stored with this trace.
 
         Returns
         -------
         RetrainReport or None
-            The report of a retrain in this thread that the label set off, if any.
+            The report of a retrain that ran in this thread because of the label, if any.
 
         Raises
         ------
         ReportError
-            For an unknown id, a second report, or what is no label.
+            For an unknown id, a second report on the decision, or an invalid label.
         TraceError
-            For a wrong trace or part's number of a lost decision.
+            For an invalid trace or part number of a lost decision.
         StoreError
-            Where the label is not known to be on disk: it is learned all the same, and the same
-            report may come again. Also for an engine that is closed, was opened for reading, or is
-            in use by another thread.
+            If it is not certain that the label is on disk: it is learned all the same, and the
+            same report may come again. Also for an engine that is closed, was opened for reading,
+            or is in use by another thread.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -674,11 +673,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Drive a cell, and yield a record of each cycle as it happens.
 
         In each cycle the cell inserts a part, the engine decides, and the cell verifies it, lets it
-        go on or rejects it; a known outcome is reported, and retrains happen between cycles. When
-        the iteration ends, also by an error of the cell, everything known is written. What the
-        engine does not know of its traces is taken from a `TraceSpec` in the cell's attribute
-        `spec`, if there is one. Python's garbage collector works between decisions, and only on
-        objects that are newer than the first cycle (`gc.freeze`).
+        go on or rejects it. A known outcome is reported, and retrains happen between cycles. When
+        the iteration ends, also by an error of the cell, everything known is written. If the cell
+        has a `TraceSpec` as its attribute `spec`, the engine takes from it what it does not know of
+        its traces. Python's garbage collector works between decisions, and only on objects that are
+        newer than the first cycle (`gc.freeze`).
 
         Parameters
         ----------
@@ -689,7 +688,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         iterator of Cycle
-            The first part is inserted with its first `next`, once a retrain can begin at once.
+            The first part is inserted with its first `next`, after a wait until a retrain could
+            begin at once.
 
         Raises
         ------
@@ -764,7 +764,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def retrain(self, wait: bool = True) -> RetrainReport | None:
         """Retrain now, in this thread, and return the report.
 
-        A pinned version is released first, as by `release`. A version that fails, or cannot be
+        A pinned version is released first, like by `release`. A version that fails, or cannot be
         stored, is dropped: the report has `accepted` False then. Raises StoreError if the labels
         that came before cannot be stored.
 
@@ -795,8 +795,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def poll(self, brief: bool = False) -> RetrainReport | None:
         """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
 
-        `run` does so after each part. In a loop of your own, `decide` and `report` do the same,
-        except that each call brings a version that the executor has trained only one step further.
+        `run` does so after each part. In a loop of your own, `decide` and `report` do the same. But
+        each of their calls takes a version that the executor has trained only one step further.
         Without an executor a retrain that is due runs here, also with `brief`.
 
         Parameters
@@ -861,8 +861,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def certificate(self) -> Certificate:
         """Flush, and return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
 
-        Decisions since the last change of policy count. Raises NotTakenError where not everything
-        is on disk in time, and StoreError where the store cannot be read.
+        Decisions since the last change of policy count. Raises NotTakenError if not everything is
+        on disk in time, and StoreError if the store cannot be read.
         """
         self.flush()
         policy = self.policy
@@ -897,14 +897,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def safe_mode(self) -> str:
-        """Why every part is verified until fresh evidence keeps the tolerance; "" if none is."""
+        """Why the engine is in safe mode, in which it verifies every part; "" if it is not."""
         return self._live.newest.safe_mode
 
     def find(self, decision_id: str) -> StoredDecision | None:
-        """Return a decision with its trace, and with its label where it has one; None for an
+        """Return a decision with its trace, and with its label if it has one; None for an
         unknown id.
 
-        Raises StoreError where the id cannot be looked up, and ReportError for what is no id.
+        Raises StoreError if the id cannot be looked up, and ReportError for an invalid id.
         """
         return self._outbox.find_decision(as_id(decision_id))
 
@@ -912,7 +912,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Flush, and return how the engine is doing; arguments and errors as of
         `history.status.status`.
 
-        Where the disk does not take everything, `store_fault` says why, and the counts lack it.
+        If the disk does not take everything, `store_fault` says why, and the counts lack the rest.
         """
         with suppress(NotTakenError):
             self.flush()

@@ -65,8 +65,8 @@ def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
 def test_the_papers_own_figures_bear_its_findings_out() -> None:
     lines = findings(pd.concat([frame(), frame("binomial")]))
     claims = (
-        "Wilson answers",
-        "Binomial does not answer",
+        "Wilson reacts",
+        "Binomial does not react",
         "share of false positives",
         "delays the first",
     )
@@ -86,10 +86,10 @@ def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_not
     lines = findings(
         pd.concat([frame(certain=900), frame("binomial", certain=500, false_positive=60)])
     )
-    assert by_claim(lines, "Wilson answers") == [False]
+    assert by_claim(lines, "Wilson reacts") == [False]
     assert by_claim(lines, "share of false positives") == [True, False]
     assert any("in 3 of 9 cells, at most 12.0 %" in line for line in lines)  # not at LB 90 and 95 %
     assert by_claim(findings(frame(first_certain=50.0)), "delays the first") == [False] * 3
     lines = findings(frame(certain=0, false_positive=0, first_certain=float("nan")))
-    claims = ("share of false positives", "delays the first", "answer")
+    claims = ("share of false positives", "delays the first", "react")
     assert [by_claim(lines, claim) for claim in claims] == [[True], [], []]

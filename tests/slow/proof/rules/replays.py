@@ -11,7 +11,7 @@ What is judged at each moment at which the rule would accept a part:
 - **cost**, audited: the rule's account is an estimate. With A the estimate and B the account of
   all outcomes, exp(s (B - A)) divided by the product of its conditional means is a martingale for
   every fixed s. By Ville's inequality it reaches 1 / alpha with a probability of at most alpha,
-  which is what is judged, with s = `SLOPE`. Where it stays below, B is at most 3 plus the margin
+  which is what is judged, with s = `SLOPE`. Where it stays below, B is at most 2 plus the margin
   (log(1 / alpha) + the sum of the logarithms of these means) / s.
 - **local** promises nothing about many parts. Its rows show safe modes only.
 
