@@ -40,6 +40,7 @@ from functools import partial
 
 from ..errors import counted, expect, percent
 
+OVERDRAFT = 2.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
 BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capital would stay 0
 
 
@@ -337,8 +338,8 @@ class Certificate:
             )
         return (
             f"{claim} Accepting pauses whenever the parts that the model would accept have, by "
-            f"what is known of them, cost {self.prices[1]:,g}, the price of one bad "
-            f"part, more than their checks."
+            f"what is known of them, cost {OVERDRAFT * self.prices[1]:,g}, {OVERDRAFT:g} times the "
+            f"price of a bad part, more than their checks."
         )
 
     @property

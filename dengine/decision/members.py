@@ -31,7 +31,7 @@ import torch
 from torch import Tensor, nn
 
 from ..records import ActionCode
-from .certificate import cusum
+from .certificate import OVERDRAFT, cusum
 
 SAFE_MODES = (  # why every part is verified, by `SafeMode`
     "",
@@ -43,7 +43,6 @@ BET = 0.55  # share of the largest stake; best for failure rates of nearly half 
 N_RECENT = 50  # newest outcomes of a level that are tested by themselves
 TAIL_PROBABILITY = 0.2  # at most, of the allowed number of errors among them at the tolerance
 CLOSED = 2.0  # a threshold that no score reaches
-OVERDRAFT = 2.0  # false accepts that the priced rule may be behind: the first parts may be unlucky
 FALSE_ALARMS = 100.0  # at the tolerance itself one alarm in 100 / alpha parts on average, or fewer
 NOVEL_SHARE = 0.2  # of the traces of a stream that may be novel
 FEWEST_SINCE_ALARM = 25.0  # members: an account over fewer says little

@@ -167,7 +167,8 @@ def test_by_prices_it_says_what_was_saved_at_least_and_nothing_where_that_is_not
         f"{math.ceil(120 * 1203 * upper):,} on average: at least {int(result.saved):,} was saved."
     ) in result.sentence
     assert result.sentence.endswith(
-        "have, by what is known of them, cost 120, the price of one bad part, more than their checks."
+        "have, by what is known of them, cost 240, 2 times the price of a bad part, "
+        "more than their checks."
     )
     lost = policy.certificate(Outcomes(accepted=60, confirmed=58, false_accepts=2))
     most = math.ceil(-lost.saved)
