@@ -221,9 +221,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> None:
         """Make the engine's objects on an opened store, each from those that it knows.
 
-        From now on the store is closed when the engine is garbage-collected. Modules that a retrain
-        imports are loaded, in a thread if there is an executor. Limits this thread to one torch
-        thread. Raises SettingError for force limits in seconds at an unknown rate.
+        From now on the store is closed when the engine is garbage-collected. The modules that a
+        retrain imports are loaded, with an executor in a thread of their own, and else, unless
+        `reading`, before this returns. Limits this thread to one torch thread. Raises SettingError
+        for force limits in seconds at an unknown rate, and StoreError where another engine owns the
+        cell.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -267,7 +269,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         The engine then decides bit for bit as before it was closed. In a new cell it decides as the
         other cells of its product do. It is called once, before the first decision, and waits for
         the store without a time limit. Where retrains run in the calling thread, it also waits
-        until the first one can begin at once.
+        until the first one can begin at once. Raises StoreError where the store cannot be read.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -318,11 +320,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Self:
         """Open a used store, and go on with the same version and the same decisions, bit for bit.
 
+        The engine owns the cell until `close`, unless it only reads, and limits this thread to one
+        torch thread. Without an executor, unless it only reads, the call also waits until a retrain
+        can begin at once. If it raises, a store that it opened is closed.
+
         Parameters
         ----------
         url : str, path or SqlStore
         reducer, model : object, optional
-            The same object again, where the engine had one of yours that the store cannot name.
+            The same object again, where the engine had one of yours that the store cannot name;
+            else None.
         trace : TraceSpec, optional
             The stored contract of traces, to state its rate, units or columns where they are
             unknown.
@@ -332,7 +339,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             Whether a `module:Class` that the store names is imported, or which of them. A class
             that `reducer` names is allowed.
         reading : bool
-            Neither decide nor learn; another engine may own the store. To export from it, for one.
+            Neither decide nor learn: such calls raise StoreError. Another engine may own the cell.
+            To export from it, for one.
         **options
             executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With an
             executor the ids of all decisions are read before this returns (a second for a million),
@@ -347,8 +355,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             Where the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            Where an object is missing or another than before, a model is not needed, or `trace`
-            contradicts the stored contract.
+            Where an object is missing or another than before, a `model` is passed to an engine that
+            has its own, or `trace` contradicts the stored contract.
         ImportRefusedError
             A SettingError, where a class would have to be imported that is not allowed.
         """
@@ -407,7 +415,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            Where a given setting is not the used store's.
+            Where a given setting is not the used store's, is unknown, or is out of range.
         StoreError
             Where another engine owns the cell, or the store cannot be used.
         ImportRefusedError
@@ -433,9 +441,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. A second call does nothing. What the disk does not
-        take is given up, and an error is logged; no report on it was acknowledged. Raises
-        StoreError while another thread uses the engine.
+        A retrain that takes longer is dropped. Labels of parts that the next decision confirmed are
+        stored, too. A second call does nothing. What the disk does not take is given up, and an
+        error is logged; no report on it was acknowledged. Raises StoreError while another thread
+        uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -447,7 +456,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
         Labels of parts that the next decision confirmed, which wait in memory, are recorded first,
-        so that they are in the training window afterwards. Raises NotTakenError after `wait`
+        so that they are among the traces of the next training. A rule that a wrong confirmation
+        updated is put right, too, if the store has answered. Raises NotTakenError after `wait`
         seconds; None: the store's own limit.
         """
         self._feedback.store_confirmations()
@@ -552,12 +562,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _decide(
         self, trace: ArrayLike, part: str | None, decision_id: str | None, reason: Reason | None
     ) -> Decision:
-        """Decide on one trace by the model, or verify for a reason, and record that.
+        """Decide on one trace by the model, or verify for a reason; record and return that.
 
         The steps are in this order because each needs the one before: a wrong trace must confirm
         nothing; a rule that lacks a correction must not decide; this trace is the next one after
         parts that nobody reported, which may change the rule; with an id the decision must be on
-        disk before the caller acts on it; and what the disk did not take is another decision.
+        disk before the caller acts on it; and what the disk did not take is another decision:
+        VERIFY. Raises TraceError for a wrong trace, and SettingError for a first one that the force
+        limits do not fit.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -573,7 +585,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Decision | None:
         """Decide if nothing has to be waited for, in any thread; else return None.
 
-        While it decides it holds the outbox's lock, so that nothing that it records waits.
+        It returns None, and changes nothing, with an id, before the first trace, while settings or
+        a correction wait for the store or another call holds the outbox's lock, and if the model is
+        a baseline, uses classes of the user's or is not compiled. While it decides it holds that
+        lock, so that nothing that it records waits. It sets the present thread to one torch thread.
+        Raises StoreError if another thread uses the engine or it is closed, and TraceError for a
+        wrong trace or part's number.
         """
         self._outbox.check_usable()
         with self._outbox.try_lock() as is_free, self._exclusive:
@@ -696,6 +713,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         SettingError
             Before the first part, for a cell that lacks one of its four methods, or whose `spec`
             cannot hold the force limits.
+        ReportError
+            Where `verify` returns no label, or `proceed` no `Outcome`.
+        NotTakenError
+            At the end, where the disk does not take everything within 10 seconds.
         """
         check_cell(cell)
         return self._run(cell, cycles)
@@ -723,7 +744,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Have the cell insert one part, decide, do what the decision says, and report its outcome.
 
         An ACCEPT of which the cell learns nothing is not reported, nor is a REJECT. A label that
-        cannot be written is logged and waits. A retrain that is due is begun or done. Returns the
+        cannot be written is logged and waits. A retrain that is due is begun or done. What the cell
+        raises passes, and ReportError is raised where it returns no label or outcome. Returns the
         record of the cycle; `seconds` is the duration of the decision alone.
         """
         trace = cell.insert()
@@ -963,8 +985,10 @@ def _new_settings(
 ) -> tuple[EngineSettings, EngineModel]:
     """Return the settings of a new engine, and the untrained model that they describe.
 
-    `given` are the settings that stand beside the recipe, by name. Raises SettingError for settings
-    that are out of range or contradict each other.
+    `given` are the settings that stand beside the recipe, by name. For a handed-in `model` without
+    a recipe they are those of the default recipe, but for `retrain_every`. Raises SettingError for
+    settings that are out of range, contradict each other or have no effect on the model, and for a
+    window below the model's `min_traces`.
     """
     if model is not None:
         check_model_settings(reducer, given)

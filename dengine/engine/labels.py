@@ -38,7 +38,7 @@ class CellLabels:
         self.new_labels = 0
 
     def resume(self, counts_from: int) -> None:
-        """Set the count to the number of the window's labels after this number."""
+        """Set the count to how many labels of the training window have a number above this one."""
         self.new_labels = len(self._window.newer(counts_from))
 
     def recount(self, counts_from: int) -> None:
@@ -109,7 +109,7 @@ class ProductLabels:
         return bool(self._waiting)
 
     def resume(self, counts_from: int) -> None:
-        """Count the window's labels after this number as new, when an engine goes on from a store.
+        """Count the labels of the training window above this number as new, on opening a store.
 
         They count as labels of peers, so that they alone do not make a retrain this cell's turn.
         """
@@ -136,7 +136,8 @@ class ProductLabels:
     def add(self, stored: StoredDecision, label: NewLabel) -> None:
         """Keep a recorded label of this cell, which is a reference already, until it is numbered.
 
-        Until then its reference has the label's provisional number.
+        Until then its reference has the label's provisional number, and the label is not in the
+        training window.
         """
         self._unnumbered[label.decision_id] = stored, label
 
@@ -144,7 +145,8 @@ class ProductLabels:
         """Give a label of this cell, and its reference, the number that the store gave it.
 
         It enters the window at once if its number is the next one, else when the peers' labels
-        before it have come. Nothing happens for a label that taught nothing.
+        before it have come. Nothing happens for a label that was not added, as of a trace with a
+        fault.
         """
         if decision_id not in self._unnumbered:
             return
@@ -158,10 +160,11 @@ class ProductLabels:
             self.admit(*row, number)
 
     def admit(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
-        """Add the product's next label to the window.
+        """Add the product's next label, of this cell or another, to the training window.
 
         It counts as new unless the newest retrain was trained on it. A peer's label also becomes a
-        reference of the answering model, unless that has it already.
+        reference of the answering model, unless that has it already. One that the model cannot take
+        is logged and skipped.
         """
         is_own = self._waiting.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)
@@ -213,5 +216,5 @@ class ProductLabels:
                 guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq)
 
     def get_state(self) -> State:
-        """Return, for a stored version, the number of the newest label that updated the rule."""
+        """Return the number of this cell's newest label, for a version's rule that learned it."""
         return {"rule_last_seq": np.array(self._updated_to)}

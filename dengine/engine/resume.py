@@ -30,7 +30,7 @@ def restore_model(
     """Return a new model, made from the template, in the state of a stored version.
 
     A model that is stored by its traces is trained on them again. Returns None where one of these
-    traces is damaged or missing. The two models share one rule, so the template has the stored
+    traces is damaged or missing. The two models share one rule, so the template gets the stored
     rule, too. Raises StoreError for a state that this dengine cannot restore, for a damaged label,
     and where the store cannot be read.
     """
@@ -43,10 +43,10 @@ def restore_model(
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
-    Labels are first checked against the ledger, which may set the outbox's `integrity_error`; the
-    model is trained nevertheless. Returns False, with the model untrained, where a trace is damaged
-    or missing. A label that was forgotten by then is left out, and is not missing. Raises
-    StoreError for a damaged label, or if the store does not answer.
+    Labels are first checked against the ledger, the store's hash chain, which may set the outbox's
+    `integrity_error`; the model is trained nevertheless. Returns False, with the model untrained,
+    where a trace is damaged or missing. A label that was forgotten by then is left out, and is not
+    missing. Raises StoreError for a damaged label, or if the store does not answer.
     """
     store = outbox.store
     first = int(trained_on.seq[0])
@@ -76,8 +76,8 @@ def find_clean_start(
 
     That is `newest`, whose weights learned from `trained_on`, unless it saw one. Then it is the
     newest version that is stored and did not, without its rule, and else `template`, with initial
-    weights; the note says so. A model that begins anew with each training stays. Raises StoreError
-    where the store cannot be read.
+    weights; the note says so. A model that begins anew with each training stays. Versions that are
+    damaged or not kept are passed over. Raises StoreError where the store cannot be read.
     """
     corrections = {correction.seq: correction for correction in store.corrections.after()}
 

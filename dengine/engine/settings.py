@@ -219,10 +219,10 @@ class EngineSettings:
 
         `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. All
         settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
-        the program leaves out, because an operator sets both. Nor is a reducer that is an object,
-        with its parameters, nor a trace contract where none is set, nor what a trace contract
-        leaves unknown. Beside a baseline only `LOOP_SETTINGS`, which have an effect on any model,
-        are compared. An unknown name is an error, too.
+        the program leaves out, because an operator sets both while the cell runs. Nor is a reducer
+        that is an object, with its parameters, nor a trace contract where none is set, nor what a
+        trace contract leaves unknown. Beside a baseline only `LOOP_SETTINGS`, which have an effect
+        on any model, are compared. An unknown name is an error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -320,7 +320,7 @@ def choose_recipe(reducer: Any, recipe: Any, given: Settings) -> Recipe:
 
     `recipe` is a Recipe, a name or a TOML file; without one it is the default recipe of `reducer`,
     or of conv. A setting of None keeps the recipe's own. Raises SettingError where `recipe` names
-    another reducer than `reducer`, and for a setting out of range.
+    another reducer than `reducer`, for what is no recipe, and for a setting out of range.
     """
     source = recipe
     if source is None:
@@ -339,7 +339,8 @@ def named_classes(
 ) -> list[str]:
     """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them.
 
-    A name may stand in reducer, recipe or policy; other settings are ignored.
+    A name may stand in reducer, recipe (whose file is read) or policy; other settings are ignored.
+    Nothing is imported. Raises SettingError for what is no recipe.
     """
     recipes = [Recipe.load(source) for source in (reducer, recipe) if source is not None]
     recipes.append(Recipe(policy=policy or Policy()))
@@ -364,8 +365,9 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
 
 
 def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
-    """Return the trace contract of a product's other cells; None where there is none, or no
-    product.
+    """Return the trace contract of a product's other cells; None if there is none, or no product.
+
+    It is that of the first cell that has one. Raises StoreError where it is damaged.
     """
     specs = map(stored_trace_spec, store.settings.of_peers().values())
     return next(filter(None, specs), None)
@@ -374,7 +376,9 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
 def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec | None:
     """Return the trace contract of a store, completed by a stated one.
 
-    It is the store's own, else the peers', else the stated one.
+    It is the store's own, else that of the product's other cells, else the stated one. A stated one
+    adds rate, units and columns, and only to a contract of its shape. Raises StoreError where one
+    is damaged.
     """
     agreed = stored_trace_spec(store.settings.read()) or read_peers_trace_spec(store)
     return stated if agreed is None else agreed.completed(stated)
@@ -458,8 +462,9 @@ class SettingsInForce:
         self._outbox = outbox
 
     def change(self, settings: EngineSettings) -> None:
-        """Use other settings from now on, and compute what follows from them; the store is not
-        changed.
+        """Use other settings from now on, without saving them.
+
+        `audited_share` and `conditions` are computed from them.
         """
         policy = settings.recipe.policy
         self.now = settings
