@@ -89,7 +89,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return self
 
     def count(self, Z: ArrayLike) -> Counts:
-        """Count the labels within the radius of each row.
+        """Count the labels within the radius of each row; NotFittedError before `fit`.
 
         Parameters
         ----------

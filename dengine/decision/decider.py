@@ -164,7 +164,7 @@ class Decider(nn.Module):
         return self.gate.check(x, float(self.sensor_limit.item()))
 
     def is_audited(self, content: int, rate: float) -> bool:
-        """Return whether a trace with this content hash is audited.
+        """Return whether a trace with this content hash is audited: verified although certain.
 
         That is a fixed function of hash and seed, true for a share `rate` of all hashes.
         """

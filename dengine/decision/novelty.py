@@ -285,7 +285,8 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     Column j separates the traces from their j-th distortion. x (n, C, T) are the traces, plain (n,
     P) float64 their features, not standardised, as the discriminants take them. used (P,) bool
     marks the features that the discriminants read; the rows of the others are 0. Fewer than two
-    times `DISTORTED` of the traces, evenly spaced, are distorted.
+    times `DISTORTED` of the traces, evenly spaced, are distorted. The mean is taken over these, and
+    standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)

@@ -194,6 +194,7 @@ class Policy:
 
         Prices without a guarantee imply what they imply in a new policy: "cost" in the place of
         "local" and "pooled", which have no prices, and an audit rate of 0.05 in the place of 0.
+        Raises SettingError for a value out of its range.
         """
         implied: dict[str, Any] = {}
         if "prices" in settings and self.guarantee in ("local", "pooled"):
@@ -243,8 +244,9 @@ class Policy:
         """Make a decision rule that has learned nothing yet.
 
         It is the class that `RULES` names for `guarantee` and `stops`, or the user's
-        `module:Class`, made with alpha, lower_bound and interval. `PooledRule`, `PricedRule` and
-        their subclasses also get `inclusion_probability`, priced ones `tolerances` as well.
+        `module:Class`, which is imported, made with alpha, lower_bound and interval. `PooledRule`,
+        `PricedRule` and their subclasses also get `inclusion_probability`, priced ones `tolerances`
+        as well.
 
         Returns
         -------
@@ -305,9 +307,9 @@ class Policy:
     def bound(self, n_success: ArrayLike, n_failure: ArrayLike) -> Bounds:
         """Return (lower, upper) of the success probability by the policy's interval.
 
-        The counts are integers or arrays of one shape, the ends floats or arrays of that shape. The
-        error level is alpha, or under the guarantees "pooled" and "cost", where the interval only
-        sorts parts, 0.5.
+        The counts are integers or arrays of one shape, the ends floats or arrays of that shape;
+        ValueError for other shapes and negative counts. The error level is alpha, or under the
+        guarantees "pooled" and "cost", where the interval only sorts parts, 0.5.
         """
         error_level = interval_error_level(self.alpha, self.guarantee)
         return INTERVALS[self.interval](n_success, n_failure, error_level)

@@ -258,7 +258,8 @@ class RadiusIndex(nn.Module):
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
-            One query, embedded in every space.
+            One query, embedded in every space. A space is the embedding that never saw the labels
+            of one fold of the points, and these points lie in it.
         part : int, default 0
             Hash of the query's part, whose own points are infinitely far; 0 excludes none.
 
@@ -330,7 +331,7 @@ class RadiusIndex(nn.Module):
         self.put(point, label, space, part)
 
     def renumber(self, old: int, new: int) -> None:
-        """Change the number of a label; nothing happens if its point has left."""
+        """Change the sequence number of a label; nothing happens if its point has left."""
         self.numbers[self.numbers == old] = new
 
     def add(
@@ -384,7 +385,7 @@ class RadiusIndex(nn.Module):
             self._index_parts()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
-        """Change the label of the point with a number, or remove the point.
+        """Change the label of the point with a number, or remove the point; `agreement` stays.
 
         Parameters
         ----------
@@ -479,9 +480,9 @@ class RadiusIndex(nn.Module):
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
         """Return a new index with the points of a state; with the same capacity in the same slots.
 
-        `state` is what `get_state` returned. With a smaller `capacity` the newest points stay;
-        with a larger one the oldest is in the first slot, and `total` no longer counts points that
-        left.
+        `state` is what `get_state` returned, and is not changed. With a smaller `capacity` the
+        newest points stay; with a larger one the oldest is in the first slot, and `total` no longer
+        counts points that left.
         """
         n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)
