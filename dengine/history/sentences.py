@@ -100,7 +100,7 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """Return a decision's bounds with their thresholds and what more evidence it would have needed.
 
     Returns None if no bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and
-    SAFE_MODE, and for a decision that was lost.
+    SAFE_MODE, and for a decision that was lost, and recorded again from its line stop.
     """
     if decision.reason not in BOUNDED or _was_lost(decision):
         return None
@@ -206,7 +206,8 @@ def explain_in_words(
 def _explain_audit(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on an audit: what the model alone would have done, the coin.
 
-    The coin is computed again from the trace and the engine's seed.
+    The coin, a number that decides which certain parts are audited, is computed again from the
+    trace and the engine's seed.
     """
     (coin,) = toss(content_hash(trace[None]), audit_salt(circumstances.seed)).tolist()
     alone = f" as an audit: the model alone would have {DID[decision.predicted]} it"
@@ -235,7 +236,10 @@ def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Cir
 
 
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
+    """Return the rest of the sentence on a trace outside an operator's limits: which it leaves.
+
+    They are tried again one by one, by the policy of that time.
+    """
     x = torch.from_numpy(trace)
     left = [
         str(limits)
@@ -296,9 +300,9 @@ def _bound_sentences(
     """Yield the sentences on a decision's evidence, its bounds, and what it would have needed.
 
     The last is said of the action that the model alone would have done; if that is to verify, of
-    the action that needed fewer labels. If nothing could pass, or the thresholds are unknown, it
-    says so instead. For a model that decides by its own method there is one sentence, with its
-    counts and bounds.
+    the action that needed fewer labels. If no bound was good enough to accept or reject, or the
+    thresholds are unknown, it says so instead. For a model that decides by its own method there is
+    one sentence, with its counts and bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
