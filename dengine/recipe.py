@@ -205,9 +205,10 @@ class Recipe:
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
         """Parse the text that `to_toml` writes, and return the recipe.
 
-        Settings that are missing get their defaults, and "none" is read as None. Raises
-        SettingError, which names `where`, for text that is not TOML, an unknown key or a
-        value out of range.
+        Settings that are missing get their defaults, "none" is read as None, and the policy's
+        "windows", its name in earlier versions, as "force_limits". No class is imported. Raises
+        SettingError, which names `where`, for text that is not TOML, an unknown key or a value out
+        of range.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
