@@ -220,7 +220,8 @@ class DecisionMaker:
     def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
         """Record VERIFY, `Reason.LATE`, beside another call of the engine, and return it.
 
-        Any thread may call it. An id that has a decision already gets that one. It returns once the
+        Any thread may call it. An id that has a decision already gets that one; one that cannot be
+        looked up gets VERIFY, `Reason.NO_STORE`, which is not recorded. It returns once the
         decision is on disk, or when the store's time limit is over. With a store in memory, and
         before the first trace, nothing is recorded: only the thread that uses the engine may do
         that. Raises TraceError for a wrong part's number, an id of another trace, and a trace that

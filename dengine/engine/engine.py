@@ -405,7 +405,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             As `DataEngine` takes them. For a used store those that are given must be those in
             force: the settings of a running cell do not change in silence. `model` is as for
             `open`; `executor`, `clock`, `replaying` and `on_safe_mode` are not stored and taken as
-            they are. A new cell of a product takes what is left open from its peers.
+            they are. A new cell of a product (cells that share labels and versions) takes what is
+            left open from its peers, the other cells.
 
         Returns
         -------
@@ -516,13 +517,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             call of the engine nor for the disk. Any thread may make it while no other thread uses
             the engine; it has one torch thread from then on. The call returns None, and changes
             nothing, if it cannot decide at once. That is so with an id, before the first trace,
-            while something must be stored or rebuilt first, and if the model is a baseline, uses
-            classes of the user's or is not compiled. Only a later `poll` lets a trained version
-            answer, and calls `on_safe_mode`.
-            With `timed_out` another thread may use the engine meanwhile. The VERIFY is recorded
-            beside that thread's call, and this call waits for the disk. With a store in memory,
-            and before the first trace, it is not recorded: call again with `wait`, in the engine's
-            thread.
+            while something must be stored or rebuilt first, and if the model is a baseline (handed
+            in as `model`), uses classes of the user's or is not compiled. Only a later `poll` lets
+            a trained version answer, and calls `on_safe_mode`. With `timed_out` another thread may
+            use the engine meanwhile. The VERIFY is recorded beside that thread's call, and this
+            call waits for the disk. With a store in memory, and before the first trace, it is not
+            recorded: call again with `wait`, in the engine's thread.
 
         Returns
         -------
@@ -724,9 +724,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle; at the end, also after an error, write everything to disk.
 
-        The first cycle waits for what would otherwise delay the first retrain.
-        From then on the garbage collector ignores the objects that exist, until the end. Raises
-        NotTakenError where the disk does not take everything in time.
+        The first cycle waits for what would otherwise delay the first retrain, and takes over what
+        the cell's `spec` states of the traces. From then on the garbage collector ignores the
+        objects that exist, until the end. Raises NotTakenError where the disk does not take
+        everything in time.
         """
         self._wait_until_warm()
         spec = getattr(cell, "spec", None)
@@ -746,7 +747,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         An ACCEPT of which the cell learns nothing is not reported, nor is a REJECT. A label that
         cannot be written is logged and waits. A retrain that is due is begun or done. What the cell
         raises passes, and ReportError is raised where it returns no label or outcome. Returns the
-        record of the cycle; `seconds` is the duration of the decision alone.
+        record of the cycle; its `decide_seconds` is the duration of the decision alone.
         """
         trace = cell.insert()
         with uncollected():
@@ -788,7 +789,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         A pinned version is released first, as by `release`. A version that fails, or cannot be
         stored, is dropped: the report has `accepted` False then. Raises StoreError if the labels
-        that came before cannot be stored.
+        that came before cannot be stored, and for an engine that is closed, was opened for reading,
+        or is in use by another thread.
 
         Parameters
         ----------
@@ -824,9 +826,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Parameters
         ----------
         brief : bool, default False
-            True: bring a version that the executor has trained only one step further, which takes
-            a few milliseconds. False: bring it to its end, so that it answers or is dropped. If
-            cells share a product, it is always brought to its end.
+            True: bring a version that the executor has trained only one step further, which takes a
+            few milliseconds. False: bring it to its end, so that it answers or is dropped. In a
+            cell of a product, whose cells share labels and versions, it is always brought to its
+            end.
 
         Returns
         -------

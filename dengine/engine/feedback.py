@@ -106,9 +106,10 @@ class Feedback:
         """Restore from the store which checks are pending, and which accepted parts have no
         outcome.
 
-        The live model must be restored before. With `stops="all"` the accepted parts are kept, so
-        that the next trace confirms them. With "some" they are only counted, as unreported since
-        the last label. Raises StoreError where the store cannot be read.
+        The live model must be restored before. A safe mode that it is in is not announced again.
+        With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
+        "some" they are only counted, as unreported since the last label. Raises StoreError where
+        the store cannot be read.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -152,8 +153,8 @@ class Feedback:
 
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each is a
         success: rule and references learn it at once, and its label, CONFIRMED, waits in memory;
-        when `MOST_CONFIRMED` labels wait, all are handed to the outbox. With "some" the parts are
-        only counted, and nothing is learned.
+        when `MOST_CONFIRMED` labels wait, all are handed to the outbox, the queue of records for
+        the store. With "some" the parts are only counted, and nothing is learned.
         """
         if not self._unreported:
             return
@@ -190,11 +191,12 @@ class Feedback:
     def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
         """Learn a label that is no repetition and hand it to the outbox, after labels that wait.
 
-        A confirmation by the next decision is taken back first. If its label went to the outbox
-        before, the new label goes there too, but is not learned yet: `remedy` is set to CORRECT.
-        Otherwise its reference is removed, and `remedy` is set to REBUILD_RULE. The latter is also
-        set for a check that the rule counted as overdue. Returns whether there was such a
-        confirmation, whatever the label is now. Raises ReportError for any other second label.
+        The outbox is the queue of records for the store. A confirmation by the next decision, as a
+        success, is taken back first. If its label was handed over before, the new label follows it,
+        but is not learned yet: `remedy` is set to CORRECT. Otherwise its reference is removed, and
+        `remedy` is set to REBUILD_RULE. The latter is also set for a check that the rule counted as
+        overdue. Returns whether there was such a confirmation, whatever the label is now. Raises
+        ReportError for any other second label.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -255,7 +257,7 @@ class Feedback:
         )
 
     def _record(self, labels: Collection[tuple[StoredDecision, NewLabel]]) -> None:
-        """Hand learned labels to the outbox, and add those of usable traces to the window."""
+        """Hand learned labels to the outbox; those of usable traces enter the training window."""
         self._outbox.record_labels(labels)
         for stored, label in labels:
             if not stored.quarantined:
@@ -316,7 +318,7 @@ class Feedback:
             self._live.mark_examined_to(overdue_to)
 
     def take_remedy(self) -> Remedy | None:
-        """Return what must be put right, once; None where there is nothing."""
+        """Return, once, what must be put right after a wrong label; None where nothing must be."""
         remedy = self.remedy
         self.remedy = None
         return remedy

@@ -106,9 +106,10 @@ class Peers:
         self._asked = self._clock()
 
     def take_in(self, news: ProductNews) -> None:
-        """Add the labels of the news to the window, in their order, and count them for the next
-        retrain; a peer's label becomes a reference of the answering model, unless it is one
-        already.
+        """Add labels that the product's cells stored to the training window, in their order.
+
+        They count for the next retrain. A label of another cell becomes a reference of the
+        answering model, unless it is one already.
         """
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)

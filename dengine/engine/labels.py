@@ -42,7 +42,7 @@ class CellLabels:
         self.new_labels = len(self._window.newer(counts_from))
 
     def recount(self, counts_from: int) -> None:
-        """Count again, after the window was filled anew because labels were corrected."""
+        """Count again, after the training window was filled anew because labels were corrected."""
         self.resume(counts_from)
 
     def count_learned(self, n: int) -> None:
@@ -120,7 +120,10 @@ class ProductLabels:
         self._updated_to = self._window.newest_seq
 
     def recount(self, counts_from: int) -> None:
-        """Count the new labels again, after the window was filled anew without forgotten labels."""
+        """Count the new labels again, after the training window was filled without forgotten ones.
+
+        They are those above the number that the newest retrain went to; `counts_from` is not used.
+        """
         own_numbers = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
         self._since = [(number, number in own_numbers) for number in newer]
@@ -144,9 +147,9 @@ class ProductLabels:
     def assign_number(self, decision_id: str, number: int) -> None:
         """Give a label of this cell, and its reference, the number that the store gave it.
 
-        It enters the window at once if its number is the next one, else when the peers' labels
-        before it have come. Nothing happens for a label that was not added, as of a trace with a
-        fault.
+        It enters the window at once if its number is the next one, else when the other cells'
+        labels before it have come. Nothing happens for a label that was not added, as of a trace
+        with a fault.
         """
         if decision_id not in self._unnumbered:
             return
@@ -177,8 +180,9 @@ class ProductLabels:
     def is_due(self, retrain_every: int) -> bool:
         """Return whether a retrain is due and this cell is the one to do it.
 
-        That is so where the label that completes `retrain_every` is this cell's own, or where a
-        peer missed its turn and twice as many labels have come.
+        That is so where the label that completes `retrain_every` is this cell's own, or where
+        another cell missed its turn, and this cell's is the label that completes twice as many, or
+        a later one.
         """
         due = self._since[retrain_every - 1 : retrain_every]
         missed = self._since[2 * retrain_every - 1 :]
@@ -190,14 +194,16 @@ class ProductLabels:
         self._since = []
 
     def add_missing_references(self, model: EngineModel) -> None:
-        """Add this cell's labels that wait for peers' labels to a version that it trained, as
-        references.
+        """Make this cell's waiting labels references of a version that it trained.
+
+        They wait for labels of other cells that come before them in the store, so the training
+        lacked them. One that the model cannot take is logged and skipped.
         """
         self._references_to = 0
         self._add_waiting(model)
 
     def take_over(self, model: EngineModel, references_to: int, counts_from: int) -> None:
-        """Prepare a peer's version to answer: add this cell's waiting labels to it as references.
+        """Prepare another cell's version to answer: add this cell's waiting labels as references.
 
         Its references hold every label up to the number `references_to` already; later labels of
         peers are added when they come. Labels after `counts_from` go on counting as new.

@@ -232,11 +232,13 @@ class Learner:
 
         There must be as many labels as the model's `min_traces`, unless a retrain was asked for and
         could not begin then. News of peers (what other cells of the product stored) is taken in
-        first, so another version may answer even if none is trained here. A pinned version, which
-        somebody rolled back to, stays. With `once` a version that lacks steps is not trained on
-        until the report of its last retrain was taken. Returns the report of a retrain in this
-        thread; else None: none is due, the store is unavailable, a training or its preparation is
-        under way, or it was begun in the executor.
+        first, so another version may answer even if none is trained here. A version lacks steps if
+        its training ended by the budget; that counts only in a cell that shares no product, and
+        after a retrain that was accepted. A pinned version, which somebody rolled back to, stays.
+        With `once` a version that lacks steps is not trained on until the report of its last
+        retrain was taken. Returns the report of a retrain in this thread; else None: none is due,
+        the store is unavailable, a training or its preparation is under way, or it was begun in the
+        executor.
         """
         is_due = self._is_due_after_news(retrain_every)
         if self.live.pinned:
@@ -317,8 +319,10 @@ class Learner:
         self._advance(candidate, to_the_end)
 
     def _make_candidate(self, trained: Trained) -> Candidate:
-        """Make the outcome of a training the candidate, which takes over the answering model's
-        rule.
+        """Make the outcome of a training the candidate, the version on its way to answer.
+
+        It will take over the answering model's rule. Its reason says what the training started
+        from, where that was not the answering model.
         """
         note = self._start[2] if self._start is not None else ""
         if note:
@@ -449,11 +453,11 @@ class Learner:
         return state if self._peers is None else state | self._peers.labels.get_state()
 
     def _swap(self, candidate: Candidate) -> None:
-        """Let a stored candidate answer, with the present rule, and keep its report for
-        `take_report`.
+        """Let a stored candidate answer with the present rule; keep its report for `take_report`.
 
-        Without a model, when the training was dropped, the old version goes on answering; the
-        report is kept, and its reason added to `dropped`.
+        In a product, labels of this cell that still wait for those of other cells become its
+        references. Without a model, when the training was dropped, the old version goes on
+        answering; the report is kept, and its reason added to `dropped`.
         """
         self._candidate = None
         self._report = candidate.report
@@ -584,9 +588,9 @@ class Learner:
 
         A model that cannot change a reference is retrained, or a pinned one fitted again, if
         `may_retrain`: only the cell that corrected does so. Where labels were forgotten, what the
-        next training starts from is prepared in a thread. The store is checked against its ledger,
-        which may set the outbox's `integrity_error`. Raises StoreError where the store is
-        unavailable.
+        next training starts from is prepared in a thread, and without an executor waited for. The
+        store is checked against its ledger, which may set the outbox's `integrity_error`. Raises
+        StoreError where the store is unavailable.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         # In a product, labels after the window's newest come as news.
@@ -637,9 +641,10 @@ class Learner:
         it with `event`.
 
         Until the version is stored nothing changes, so all that can fail comes before: reading it,
-        restoring it, and adding the later labels, up to the window's capacity, as its references.
-        Once it answers, news of peers is taken in, which become its references as well, and only
-        then new labels count from zero: none that it knows is new.
+        restoring it, and adding the later labels, up to the training window's capacity, as its
+        references. Once it answers, news of peers is taken in, which become its references as well,
+        and only then new labels count from zero: none that it knows is new. A training that was
+        asked for is not begun.
 
         Raises StoreError for a version that is not kept, where a trace is damaged that the model
         must be fitted on again, and where it cannot be stored.

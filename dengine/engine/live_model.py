@@ -177,7 +177,7 @@ class LiveModel:
         without an outcome since the previous update; with None, or for a decision before the
         present rule began, the rule is not updated. Returns the reference point, float32 of shape
         (d,), to be stored with the label; None where there is none: no model yet, a failure, or a
-        baseline.
+        baseline (a model that the user handed in).
         """
         decision = stored.decision
         if n_unreported is not None and decision.model_version >= self.evidence.since:
@@ -247,13 +247,13 @@ class LiveModel:
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with all stored outcomes of decisions since it began.
 
-        It is the rule of the answering model, or of the template before the first retrain. It
-        begins in the safe mode that `evidence` names, `began_in`. Checks that are overdue (not
-        reported in time) are among the outcomes, as wrong decisions. Labels that are not in the
-        store yet are not, so the rule forgets them: store them before. A stale rule, which an
-        update failed for, stays so, and a failure here makes it stale and is logged: every part is
-        then verified. The store's ledger (its hash chain) is not checked here. Raises StoreError,
-        and changes nothing, where the store is unavailable.
+        It is the rule of the answering model, or of the untrained template before the first
+        retrain. It begins in the safe mode that `evidence` names, `began_in`. Checks that are
+        overdue (not reported in time) are among the outcomes, as wrong decisions. Labels that are
+        not in the store yet are not, so the rule forgets them: store them before. A stale rule,
+        which an update failed for, stays so, and a failure here makes it stale and is logged: every
+        part is then verified. The store's ledger (its hash chain) is not checked here. Raises
+        StoreError, and changes nothing, where the store is unavailable.
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
@@ -285,10 +285,11 @@ class LiveModel:
     def apply_corrections(self) -> bool:
         """Apply the store's newest corrections to the references of the answering model.
 
-        Returns False where the model must be trained again: always for a baseline, and where it
-        cannot change a reference. The caller must retrain then, because each correction is read
-        only once. Returns True before the first retrain; `corrected_to` is set in any case. The
-        rule is left to `rebuild_rule`. Raises StoreError where the store is unavailable.
+        Returns False where the model must be trained again: always for a baseline (a model that the
+        user handed in), and where it cannot change a reference. The caller must retrain then,
+        because each correction is read only once. Returns True before the first retrain;
+        `corrected_to` is set in any case. The rule is left to `rebuild_rule`. Raises StoreError
+        where the store is unavailable.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
@@ -301,10 +302,11 @@ class LiveModel:
     def with_policy(
         self, policy: Policy, evidence: EvidenceWindow
     ) -> tuple[EngineModel, EngineModel | None]:
-        """Return copies of template and answering model under another policy, with a new rule.
+        """Return copies of the untrained and the answering model with another policy's new rule.
 
         The second is None before the first retrain; it shares the references of the answering
-        model. Neither is in force yet. Raises SettingError for a rule that cannot be made.
+        model. That it cannot be made ready is logged. Neither is in force yet. Raises SettingError
+        for a rule that cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
@@ -326,6 +328,8 @@ class LiveModel:
         """Return the arrays by name with which the store can restore a model as a version.
 
         They hold the model, what it was trained on, and which corrections and overdue checks count.
+        If an overdue check (not reported in time) counts, an engine that opens the store rebuilds
+        the rule.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)

@@ -160,7 +160,7 @@ class EngineSettings:
             For an unused store, a damaged number, and a recipe that lacks settings.
         SettingError
             For a text that is no recipe; where an object is missing or another than the engine was
-            made with, or a model is not needed.
+            made with, or a `model` is passed to an engine that has its own.
         ImportRefusedError
             Where the recipe names a class that may not be imported.
         """
@@ -196,8 +196,9 @@ class EngineSettings:
         in.
 
         The settings are a copy that describes the object that was handed in, and whose recipe has
-        that model's own numbers in place of those without effect. Raises SettingError for an object
-        that lacks a method of `Model`.
+        that model's own numbers in place of those without effect. The recipe's reducer is made, and
+        a class of the user's imported for it. Raises SettingError where that fails, and for an
+        object that lacks a method of `Model`.
         """
         if model is None:
             reducer = self.recipe.reducer
@@ -221,8 +222,9 @@ class EngineSettings:
         settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
         the program leaves out, because an operator sets both while the cell runs. Nor is a reducer
         that is an object, with its parameters, nor a trace contract where none is set, nor what a
-        trace contract leaves unknown. Beside a baseline only `LOOP_SETTINGS`, which have an effect
-        on any model, are compared. An unknown name is an error, too.
+        trace contract leaves unknown. Beside a baseline, a model that was handed in, only
+        `LOOP_SETTINGS`, which have an effect on any model, are compared. An unknown name is an
+        error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -269,8 +271,8 @@ def _with_objects(
 
     `texts` are the store's settings, `name` is the store's, for errors. An object equal to the
     reducer that the recipe names is accepted and not used, as is any reducer beside a model. Raises
-    SettingError where an object is missing, a model is not needed, or an object is another than the
-    store was made with.
+    SettingError where an object is missing, a `model` is passed to an engine that has its own, or
+    an object is another than the store was made with.
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -431,7 +433,10 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
 
 
 def flat_settings(recipe: Recipe) -> dict[str, Any]:
-    """Return every setting of a recipe by its name, those of its policy among them."""
+    """Return every setting of a recipe by its name, those of its policy among them.
+
+    The reducer's class is imported if it gives one of them, as `default_radius`.
+    """
     settings = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     del settings["policy"]
     return settings | recipe.policy.to_values()
@@ -478,7 +483,8 @@ class SettingsInForce:
     def save(self) -> None:
         """Write the settings to the store, within its time limit.
 
-        Where that fails, the error is logged and `is_unsaved` is set; nothing is raised.
+        Where that fails, the error is logged and `is_unsaved` is set, which a later success clears;
+        nothing is raised.
         """
         texts = self.now.to_store()
         try:

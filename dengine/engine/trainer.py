@@ -104,8 +104,7 @@ class TrainingWindow:
         self._end = n
 
     def refill(self, labelled: LabelledTraces) -> None:
-        """Replace the whole window by the newest of these labelled traces, which are ordered by
-        number.
+        """Replace the whole window by the newest of these labelled traces, ordered by number.
 
         Their arrays become the window's block and are not copied.
         """
@@ -116,7 +115,7 @@ class TrainingWindow:
     def snapshot(self) -> LabelledTraces:
         """Return the labelled traces, oldest first.
 
-        The arrays never change, and are not to be written to.
+        The arrays are views that never change, and are not to be written to.
         """
         return LabelledTraces(*[column[self._first : self._end] for column in self._block])
 
@@ -312,8 +311,7 @@ class Retrainer:
         return replace(trained, begin=begin)
 
     def start(self, current: EngineModel) -> bool:
-        """Begin to train a successor of the current model in the executor, on the window as it is
-        now.
+        """Begin to train a successor of the current model in the executor, on the labels as of now.
 
         `collect` returns the outcome; no other training may be under way. Returns False, and begins
         nothing, without an executor that takes work, and while it still works on a training that
