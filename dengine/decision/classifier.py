@@ -156,6 +156,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     ) -> RadiusNeighbours:
         """Make the module that decides over the points of an index by these settings.
 
+        It shares the index and the rule, so later points and outcomes count. Raises SettingError if
+        a setting is out of range and no rule is given.
+
         Parameters
         ----------
         index : RadiusIndex

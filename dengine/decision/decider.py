@@ -218,6 +218,6 @@ def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Dec
 def trace_gate(channels: int, samples: int) -> TraceGate:
     """Return the gate that checks traces (C, T) of this shape for faults and hashes them.
 
-    It has no state, so all deciders share it.
+    It is cached: it has no state, so all deciders share it.
     """
     return TraceGate(TraceSpec(channels=channels, samples=samples))

@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 def interval_error_level(alpha: float, guarantee: str) -> float:
-    """Return the error level of the interval around one trace under a guarantee.
+    """Return the error level of the interval around one trace under a policy's guarantee.
 
     Parameters
     ----------

@@ -370,7 +370,7 @@ class MemberEvidence(nn.Module):
         return total
 
     def raise_alarm(self, detector: int) -> None:
-        """Start the safe mode for the reason of a detector, or start it anew during one.
+        """Start the safe mode (every part is verified) for a detector, or start it anew during one.
 
         During one the reason is that of the two which stands first in `SafeMode`: a side that has
         not shown its tolerance yet stays the reason when novel traces come on top.
@@ -394,14 +394,15 @@ class MemberEvidence(nn.Module):
         self.safe_mode.fill_(safe_mode)
 
     def choose_threshold(self, side: int) -> None:
-        """Set target level and threshold of one side from the counts.
+        """Set target level and threshold of one side, accept or reject, from the counts.
 
-        The target is the lowest level whose parts since the last alarm pass the bet (or, under the
-        priced rule, the account) and, under the pooled rule, whose newest parts have few errors; if
-        there is none, it is the strictest level. The threshold is the target's score if such a
-        level was found, the members of all time pass, and those since an alarm show recovery; else
-        it is `CLOSED`. The watched rule has no target: its threshold stays, and after an alarm is
-        the first level again once the members since then show recovery.
+        The target is the lowest level whose parts since the last alarm pass the bet (their log
+        capital is enough; under the priced rule the balance of their costs) and, under the pooled
+        rule, whose newest parts have few errors; if there is none, it is the strictest level. The
+        threshold is the target's score if such a level was found, the members of all time pass, and
+        those since an alarm show recovery; else it is `CLOSED`. The watched rule has no target: its
+        threshold stays, and after an alarm is the first level again once the members since then
+        show recovery.
         """
         is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it
@@ -437,9 +438,10 @@ class MemberEvidence(nn.Module):
     def members_to_recovery(self, side: int) -> float:
         """Return how many more members a side needs to recover, if they go on like since the alarm.
 
-        It is 0 or less once they show recovery, so that the side may open again. It is huge, about
-        1e12, while more evidence is needed and it does not grow. The priced rule needs at least
-        `FEWEST_SINCE_ALARM` members.
+        Members are the parts that the rule's claim is about; a side accepts or rejects, and is
+        closed by an alarm. It is 0 or less once they show recovery, so that the side may open
+        again. It is huge, about 1e12, while more evidence is needed and it does not grow. The
+        priced rule needs at least `FEWEST_SINCE_ALARM` members.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

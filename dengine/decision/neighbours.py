@@ -77,7 +77,7 @@ class RadiusNeighbours(nn.Module):
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
-            The scaled embedding.
+            The scaled embedding in each of the K spaces.
         part : int, default 0
             Hash of its part, whose own references do not count; 0 for an unknown part.
 

@@ -121,8 +121,9 @@ class NoveltyGate(nn.Module):
         """Return how far a trace (C, T) lies from its nearest reference, (4,) float32.
 
         Each is a squared distance over its limit, so above 1 is novel: by level, texture,
-        distortion and gaps. A score may be below 0 near a reference with a larger reach than
-        others, and it is NaN or infinite where features overflow.
+        distortion and gaps. References are traces of the training. A score may be below 0 near a
+        reference with a larger reach than others, and it is NaN or infinite where features
+        overflow.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])

@@ -54,7 +54,8 @@ def label_agreement(
     labels : array of int, shape (n,)
         1 is success, 0 is failure.
     spaces : array of int64, shape (n,)
-        Space of each point; all points of a part are in one.
+        Space of each point, the number of the encoder that embedded it; all points of a part are in
+        one.
     parts : array of int64, shape (n,)
         Hash of each point's part; 0 for an unknown part.
 
@@ -216,7 +217,8 @@ class RadiusIndex(nn.Module):
         label : float
             1.0 is success, 0.0 is failure.
         space : int
-            Space of the point, from 0 to K - 1.
+            Space of the point, from 0 to K - 1: which of a query's K embeddings it is compared
+            with.
         part : int, default 0
             Hash of its part; 0 for an unknown part.
         """
@@ -258,8 +260,8 @@ class RadiusIndex(nn.Module):
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
-            One query, embedded in every space. A space is the embedding that never saw the labels
-            of one fold of the points, and these points lie in it.
+            One query, embedded in every space: by K encoders, each of which never saw the labels of
+            the points in its space.
         part : int, default 0
             Hash of the query's part, whose own points are infinitely far; 0 excludes none.
 
