@@ -339,7 +339,8 @@ def _note_sentences(
 ) -> Iterator[str]:
     """Yield sentences on what was computed again, and where it differs from what was recorded.
 
-    If no neighbours are shown, a sentence says why.
+    If no neighbours are shown, a sentence says why. Counts are compared, and bounds by the present
+    policy if they follow from counts.
     """
     decision = item.decision
     policy = circumstances.recipe.policy

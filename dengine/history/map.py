@@ -100,7 +100,7 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
 
 
 def _newest_marks(items: list[StoredDecision], version: int) -> Iterator[Mark]:
-    """Yield the marks of decisions, in their order, each at its mean over the spaces.
+    """Yield the marks of decisions, in their order, each at the mean of its K embeddings.
 
     Decisions of another version, and those without an embedding, are left out.
     """

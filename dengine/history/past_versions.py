@@ -82,7 +82,7 @@ def load_past_version(
     -------
     PastVersion or None
         None if there is no such version, or its references are damaged or not kept, as of a
-        baseline.
+        baseline, a model that the user handed in.
     """
     try:
         stored = store.versions.load(version)
@@ -183,9 +183,9 @@ def _restore_thresholds(
     """Return the thresholds of a version's rule after it was updated with later labels.
 
     They are (accept, reject): a part was accepted where lower >= the first, rejected where 1 -
-    upper >= the second. Labels of quarantined traces and of inspected rejects do not update the
-    rule. The rule "local" with stops="some" learns nothing: both are the policy's lower bound.
-    Otherwise None if the state is not kept, or the rule has no such thresholds.
+    upper >= the second. Labels of quarantined traces (with a fault) and of inspected rejects do not
+    update the rule. The rule "local" with stops="some" learns nothing: both are the policy's lower
+    bound. Otherwise None if the state is not kept, or the rule has no such thresholds.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:

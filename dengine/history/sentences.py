@@ -131,8 +131,10 @@ def _was_lost(decision: Decision) -> bool:
 def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
     """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
 
-    A part was accepted where lower >= the first, rejected where upper <= the second. A threshold is
-    None if it is unknown, or if nothing could pass on that side.
+    A part was accepted where lower >= the first, rejected where upper <= the second. Under the
+    guarantee "local", outside of a safe mode, they are LB and 1 - LB; else those of the version's
+    rule at that time. A threshold is None if it is unknown, as of a handed-in model and a rule of
+    the user's, or if nothing could be accepted, or rejected.
     """
     policy = circumstances.recipe.policy
     if circumstances.baseline or policy.guarantee not in RULES:
@@ -150,10 +152,10 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
 
 
 def is_score(policy: Policy, decision: Decision) -> bool:
-    """Return whether a decision's `lower` and `upper` are one score of the heads, and no interval.
+    """Return whether a decision's `lower` and `upper` are one score, and no interval.
 
-    The heads are the reducer's classifiers; their score is a probability of success. It is so under
-    the guarantees "pooled" and "cost", where lower equals upper.
+    The score is the probability of success that the reducer's classifiers (its heads) give. It is
+    so under the guarantees "pooled" and "cost", where lower equals upper.
     """
     return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
 
@@ -185,7 +187,8 @@ def explain_in_words(
 ) -> Iterator[str]:
     """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
 
-    Without a bound the sentences on bounds are left out.
+    Without a bound the sentences on bounds are left out. The outcome is the label as corrected by
+    now.
     """
     decision = item.decision
     reason = (

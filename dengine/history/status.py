@@ -274,7 +274,8 @@ class Status:
 
         In this order: the store, lost data, safe mode, bad accepts, good rejects, dropped retrains,
         traces that nearly repeat another, shadow mode's errors, novel traces, parts outside limits,
-        errors of the model. Of the decisions only the newest count.
+        errors of the model. Of the decisions only the newest count; novel traces, and parts outside
+        limits, if they are more than half of these.
         """
         newest = self.newest
         accepts = newest.bad_accepts
