@@ -276,9 +276,9 @@ class Recipe:
     def make_reducer(self, seed: int) -> Any:
         """Return the reducer: the object that was given, uncopied, or a new one of the name.
 
-        A new one gets the seed as `random_state`, and `folds`, where it takes them, and then the
-        recipe's `params`, which win. Raises SettingError if there is no such reducer, or it does
-        not take these `params`.
+        Its class is imported. A new one gets the seed as `random_state`, and `folds`, where it
+        takes them, and then the recipe's `params`, which win. Raises SettingError if there is no
+        such reducer, or it does not take these `params`.
         """
         if not isinstance(self.reducer, str):
             return self.reducer

@@ -193,8 +193,10 @@ class TraceSpec:
         return f"{value:g} {self.units[channel]}".rstrip()
 
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
-        """Return a copy with the rate, units and columns of another contract of the same shape,
-        each where this contract has none. For none, or another shape, return it unchanged.
+        """Return a copy with what another `TraceSpec` of its shape states and this one does not.
+
+        That is the rate, the units and the columns. For None, or another shape, this one is
+        returned.
         """
         if other is None or (self.samples, self.channels) != (other.samples, other.channels):
             return self

@@ -110,7 +110,7 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
 
 
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
-    """Assert honest counting: the labels of fold k change no bit of space k.
+    """Assert honest counting: the labels of fold k change no bit of space k, its k-th embedding.
 
     For each k a clone is trained twice in a row with the labels of fold k flipped and shuffled; the
     embeddings of new traces in space k must equal those with the true labels. `reducer` may be

@@ -169,7 +169,7 @@ def _channels_of(table: Any, trace_spec: TraceSpec | None) -> Any:
 
 
 def _as_real(values: ArrayLike) -> TraceArray:
-    """Convert numbers to a float32 array; one that is float32 already is returned uncopied.
+    """Convert numbers or booleans to a float32 array; one that is float32 already is not copied.
 
     What float32 cannot hold becomes an infinity. Raises TraceError for values that are no real
     numbers and for rows of different lengths.
