@@ -186,7 +186,7 @@ def expect(
 def instead(
     error: type[DengineError], message: str, *caught: type[Exception], do: str = ""
 ) -> Iterator[None]:
-    """Context manager that raises `error` instead of the exceptions `caught`.
+    """Context manager that raises `error` from, and instead of, the exceptions `caught`.
 
     Parameters
     ----------

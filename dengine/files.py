@@ -88,7 +88,8 @@ def read_errors(
 ) -> AbstractContextManager[None]:
     """Return a context manager that raises DataError instead of what a library raises on bad files.
 
-    It catches OSError, ValueError, MemoryError and others that damaged files were seen to raise.
+    It catches OSError, ValueError, MemoryError and others that damaged files were seen to raise; a
+    DataError passes unchanged.
 
     Parameters
     ----------
@@ -172,7 +173,10 @@ def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
 
 
 def is_database(path: Path) -> bool:
-    """Return whether a regular file is a SQLite database, or its write-ahead log."""
+    """Return whether a file begins as a SQLite database or its write-ahead log does.
+
+    It must be a regular file. An OSError of opening or reading it passes.
+    """
     with path.open("rb") as file:
         return file.read(16).startswith(DATABASES)
 
@@ -287,7 +291,7 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
 
     Entries of other files stay, and the manifest is created if there is none. Write it last: it
     then lists only complete files. Raises OutputError if a file of that name is no manifest, unless
-    `force`.
+    `force`, and if it cannot be written.
     """
     target = folder / MANIFEST
     sums: dict[str, str] = {}

@@ -8,7 +8,7 @@ from .errors import SettingError, instead, shortened
 
 
 def import_class(path: str) -> type:
-    """Import the module in `module:Class` and return the class.
+    """Import the module in `module:Class`, which runs its code, and return the class.
 
     Raises
     ------

@@ -81,8 +81,9 @@ class ForceLimits:
     def parse(cls, text: str) -> ForceLimits:
         """Return the limits that a text as START:END:LOW:HIGH describes, as `str` writes it.
 
-        An empty LOW or HIGH is no limit. `:channel=1`, `:along=2` and `:reject` may follow. Raises
-        SettingError for any other text, and for values that are no limits.
+        An empty LOW or HIGH is no limit. `:channel=1`, `:along=2` and `:reject` may follow. Only
+        digits name a channel by its index. Raises SettingError for any other text, and for values
+        that are no limits.
         """
         fields = text.split(":")
         options: dict[str, Any] = {}

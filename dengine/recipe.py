@@ -205,9 +205,10 @@ class Recipe:
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
         """Parse the text that `to_toml` writes, and return the recipe.
 
-        Settings that are missing get their defaults, and "none" is read as None. Raises
-        SettingError, which names `where`, for text that is not TOML, an unknown key or a
-        value out of range.
+        Settings that are missing get their defaults, "none" is read as None, and the policy's
+        "windows", its name in earlier versions, as "force_limits". No class is imported. Raises
+        SettingError, which names `where`, for text that is not TOML, an unknown key or a value out
+        of range.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
@@ -275,9 +276,9 @@ class Recipe:
     def make_reducer(self, seed: int) -> Any:
         """Return the reducer: the object that was given, uncopied, or a new one of the name.
 
-        A new one gets the seed as `random_state`, and `folds`, where it takes them, and then the
-        recipe's `params`, which win. Raises SettingError if there is no such reducer, or it does
-        not take these `params`.
+        Its class is imported. A new one gets the seed as `random_state`, and `folds`, where it
+        takes them, and then the recipe's `params`, which win. Raises SettingError if there is no
+        such reducer, or it does not take these `params`.
         """
         if not isinstance(self.reducer, str):
             return self.reducer

@@ -209,7 +209,7 @@ class TraceSpec:
 
 
 def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
-    """Parse the `TraceSpec` among the settings of a store.
+    """Parse the `TraceSpec` among the settings of a store, which are texts by name.
 
     Returns None if the store has none, as before its first trace. Raises StoreError if it is
     damaged.

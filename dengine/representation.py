@@ -14,7 +14,8 @@ def to_jsonable(value: Any) -> Any:
 
     Dataclasses become objects, arrays lists, paths, keys and other objects text, NaN and infinities
     None. A dataclass field with "flat" in its metadata gives its own fields in its place; one with
-    "apart" is left out.
+    "apart" is left out, as large arrays are. Nothing is raised for an unknown type: it is written
+    as `str` gives it.
     """
     # Floats first: a server's responses consist mostly of them.
     if isinstance(value, float):

@@ -110,7 +110,7 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
 
 
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
-    """Assert honest counting: the labels of fold k change no bit of space k.
+    """Assert honest counting: the labels of fold k change no bit of space k, its k-th embedding.
 
     For each k a clone is trained twice in a row with the labels of fold k flipped and shuffled; the
     embeddings of new traces in space k must equal those with the true labels. `reducer` may be
@@ -231,8 +231,8 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
     """Assert what an engine requires of a version: restored and compiled, it embeds as it does.
 
     Two models are trained on test traces, the second with other labels. So the compiled module of
-    the second is a copy of the first, with other tensors. `reducer` may be unfitted and stays
-    unchanged.
+    the second is a copy of the first's, with other tensors, as in an engine. `reducer` may be
+    unfitted and stays unchanged.
     """
     X, y = toy_traces()
     for labels in (y, 1 - y):
@@ -261,7 +261,7 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     """Assert that an engine that is closed and opened again decides the same, bit for bit.
 
     It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
-    Its first retrain must be accepted.
+    Its first retrain must be accepted. `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
@@ -320,8 +320,8 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
     """Return a clone of a reducer, trained `times` times in a row on the toy traces.
 
     It is trained as in an engine, with folds by content, as many as it has spaces: 2 if it is
-    cross-fitted from outside. Each training takes at most 8 optimiser steps. `labels` (100,)
-    replace those of the toy traces; None keeps them.
+    cross-fitted from outside. Each training takes at most 8 optimiser steps. `reducer` stays
+    unchanged. `labels` (100,) replace those of the toy traces; None keeps them.
     """
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)

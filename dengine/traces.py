@@ -76,7 +76,8 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     X : array, shape (n, samples) or (n, channels, samples)
         Of any real dtype.
     trace_spec : TraceSpec, optional
-        What the traces must look like; another length is fitted as `trace_spec.fit` says.
+        What the traces must look like; another length is fitted as `trace_spec.fit` says. None: any
+        shape.
 
     Returns
     -------
@@ -168,7 +169,7 @@ def _channels_of(table: Any, trace_spec: TraceSpec | None) -> Any:
 
 
 def _as_real(values: ArrayLike) -> TraceArray:
-    """Convert numbers to a float32 array; one that is float32 already is returned uncopied.
+    """Convert numbers or booleans to a float32 array; one that is float32 already is not copied.
 
     What float32 cannot hold becomes an infinity. Raises TraceError for values that are no real
     numbers and for rows of different lengths.
@@ -334,7 +335,8 @@ class TraceGate(nn.Module):
 def check_rate(force_limits: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> None:
     """Raise SettingError if a force limit is in seconds and the rate of the traces is unknown.
 
-    It is unknown without a contract, too: the first trace does not tell its rate.
+    It is unknown without a contract (`trace_spec` None), too: the first trace does not tell its
+    rate. A limit along a channel needs no rate.
     """
     in_seconds = [limits for limits in force_limits if limits.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
@@ -443,7 +445,7 @@ def convert_trace(trace: Any, trace_spec: TraceSpec | None, may_start_over: bool
 
 
 def _spec_advice(trace: Any) -> str:
-    """Return the Python code that makes an engine for traces of this trace's shape."""
+    """Return the Python code, for a message, that makes an engine for traces of this shape."""
     *channels, samples = np.shape(trace)
     channel_count = channels[0] if channels else 1
     return f"DataEngine(trace=TraceSpec(samples={samples}, channels={channel_count}))"

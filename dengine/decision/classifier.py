@@ -89,7 +89,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return self
 
     def count(self, Z: ArrayLike) -> Counts:
-        """Count the labels within the radius of each row.
+        """Count the labels within the radius of each row; NotFittedError before `fit`.
 
         Parameters
         ----------
@@ -155,6 +155,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self, index: RadiusIndex, rule: DecisionRule | None = None, scored: bool = False
     ) -> RadiusNeighbours:
         """Make the module that decides over the points of an index by these settings.
+
+        It shares the index and the rule, so later points and outcomes count. Raises SettingError if
+        a setting is out of range and no rule is given.
 
         Parameters
         ----------

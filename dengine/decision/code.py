@@ -29,7 +29,8 @@ _COMPILED: WeakKeyDictionary[Any, list[Any]] = WeakKeyDictionary()
 def remember_code(module: nn.Module) -> None:
     """Note the present code of a module, and of all modules in it, as compiled.
 
-    Classes and functions that were noted before keep their first note.
+    It is kept for the process, in `_COMPILED`. Classes and functions that were noted before keep
+    their first note; those of `LIBRARIES` are not noted.
     """
     for unit in _user_code(module):
         _COMPILED.setdefault(unit, _code_of(unit))
@@ -62,9 +63,10 @@ def _is_of_library(value: Any) -> bool:
 
 
 def _code_of(unit: Any) -> list[Any]:
-    """Return the code of a function, or of all methods of a class, with what they name, to compare.
+    """Return what tells whether a function, or any method of a class, has changed.
 
-    Of a class also its plain attributes; those of bases of `LIBRARIES` are left out.
+    It is a list to be compared with `==`: of each function the byte code, the defaults and the
+    values that it names, of a class also its plain attributes. Bases of `LIBRARIES` are left out.
     """
     if isinstance(unit, FunctionType):
         return [_note(unit), *_named_values(unit)]
@@ -80,7 +82,11 @@ def _code_of(unit: Any) -> list[Any]:
 
 
 def _named_values(function: FunctionType) -> list[Any]:
-    """Return notes on the globals and the closure's variables that a function names."""
+    """Return the name of each global and closure variable that a function reads, with its `_note`.
+
+    They are compared later, to see whether one has changed. [] if a variable has no value, so that
+    nothing of this function's variables is compared.
+    """
     try:
         variables = getclosurevars(function)
     except ValueError:  # a variable has no value yet, or was deleted
@@ -90,9 +96,10 @@ def _named_values(function: FunctionType) -> list[Any]:
 
 
 def _note(value: Any, names: Collection[str] = ()) -> Any:
-    """Return what a value is compared by: a function's code, a constant's text, else nothing.
+    """Return what a value is compared by: a function's code, a constant's text, else None.
 
-    Of a module that is no library, those of its variables that are among `names`.
+    None also for a function of `LIBRARIES`: a change of such a value is not noticed. Of a module
+    that is no library, those of its variables that are among `names`.
     """
     if isinstance(value, FunctionType) and not _is_of_library(value):
         return value.__code__, repr(value.__defaults__)

@@ -164,7 +164,7 @@ class Decider(nn.Module):
         return self.gate.check(x, float(self.sensor_limit.item()))
 
     def is_audited(self, content: int, rate: float) -> bool:
-        """Return whether a trace with this content hash is audited.
+        """Return whether a trace with this content hash is audited: verified although certain.
 
         That is a fixed function of hash and seed, true for a share `rate` of all hashes.
         """
@@ -218,6 +218,6 @@ def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Dec
 def trace_gate(channels: int, samples: int) -> TraceGate:
     """Return the gate that checks traces (C, T) of this shape for faults and hashes them.
 
-    It has no state, so all deciders share it.
+    It is cached: it has no state, so all deciders share it.
     """
     return TraceGate(TraceSpec(channels=channels, samples=samples))

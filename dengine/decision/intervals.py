@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 
 
 def interval_error_level(alpha: float, guarantee: str) -> float:
-    """Return the error level of the interval around one trace under a guarantee.
+    """Return the error level of the interval around one trace under a policy's guarantee.
 
     Parameters
     ----------
@@ -103,7 +103,8 @@ def wald_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.0
     """Compute the Wald interval, the normal approximation; the paper's baseline, Eq. 1.
 
     A single neighbour already gives [1, 1], so it is not a bound to rely on. The paper calls it the
-    binomial interval; `binomial_interval` and the setting "binomial" are the same function.
+    binomial interval; `binomial_interval` and the setting "binomial" are the same function. Errors
+    as of `wilson_interval`.
 
     Parameters
     ----------
@@ -135,6 +136,8 @@ def clopper_pearson_interval(
 ) -> Bounds:
     """Compute the Clopper-Pearson interval, which never covers with less than 1 - alpha.
 
+    Errors as of `wilson_interval`.
+
     Parameters
     ----------
     n_success, n_failure : array of int, of one shape
@@ -157,7 +160,8 @@ def clopper_pearson_interval(
 def jeffreys_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
     """Compute the Jeffreys interval: equal-tailed credible interval under a Beta(1/2, 1/2) prior.
 
-    The lower end is 0 without a success, the upper end 1 without a failure.
+    The lower end is 0 without a success, the upper end 1 without a failure. Errors as of
+    `wilson_interval`.
 
     Parameters
     ----------

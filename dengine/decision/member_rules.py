@@ -42,7 +42,10 @@ class MemberRule(DecisionRule):
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
-        """Count the outcome of a part, which may move the thresholds; as `DecisionRule.update`."""
+        """Count the outcome of a part, which may move the thresholds, and begin or end a safe mode.
+
+        Parameters as of `DecisionRule.update`.
+        """
         self.evidence.update(lower, upper, success, predicted, inclusion_probability)
 
     @torch.jit.export
@@ -57,7 +60,7 @@ class MemberRule(DecisionRule):
 
     @torch.jit.unused
     def start_in_safe_mode(self, safe_mode: int) -> None:
-        """Verify everything from the start, as after an alarm.
+        """Verify everything from the start, as after an alarm, until outcomes show recovery.
 
         `safe_mode` is a `SafeMode`; NONE changes nothing.
         """

@@ -87,10 +87,11 @@ def max_recent_errors(tolerance: float) -> int:
 
 
 def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[float]:
-    """Return what each outcome adds to the log capital of the bet that the tolerance is kept.
+    """Return what each outcome adds to the log capital of a bet that the tolerance is kept.
 
-    A checked part's outcome was asked for with certainty, an audited part's with the probability
-    `inclusion_probability`.
+    The capital is the evidence: 1 / alpha or more refutes, at error level alpha, that the share of
+    wrong parts is above the tolerance. A checked part's outcome was asked for with certainty, an
+    audited part's with the probability `inclusion_probability`.
 
     Returns
     -------
@@ -247,9 +248,10 @@ class MemberEvidence(nn.Module):
     def observe(self, n_unreported: int, novel: bool) -> None:
         """Step the drift detectors with parts of unknown outcome and the novelty of one trace.
 
-        It is called just before `update`, for the same part. `n_unreported` accepted parts went on
-        since the last label. They count as not wrong, and outside of a safe mode as not novel, so
-        they lower the sums. `novel` says whether the trace of this part was novel. Outside of a
+        A detector is a sum of errors that raises an alarm, and so starts the safe mode, at a limit.
+        This is called just before `update`, for the same part. `n_unreported` accepted parts went
+        on since the last label. They count as not wrong, and outside of a safe mode as not novel,
+        so they lower the sums. `novel` says whether the trace of this part was novel. Outside of a
         safe mode it steps the detector of novel traces, which may start one. In a safe mode for
         novel traces the same sum counts how long few have been novel; `update` ends it. In any
         other safe mode `novel` has no effect.
@@ -278,12 +280,13 @@ class MemberEvidence(nn.Module):
         """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
         `lower` and `upper` are the bound that the part was decided by, `success` is its label, and
-        `predicted` (an `ActionCode`) what the model alone would have done. Where all outcomes
-        are known, every part counts as checked. Elsewhere `inclusion_probability`, with which the
+        `predicted` (an `ActionCode`) what the model alone would have done. Where all outcomes are
+        known, every part counts as checked. Elsewhere `inclusion_probability`, with which the
         outcome would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0
         only the drift detectors see it. A wrong outcome may raise an alarm, which starts the safe
-        mode. A safe mode ends only here: when the side that raised the alarm has an open level
-        again; after too many novel traces, when novel ones are few again and either side has one.
+        mode: every part is verified. A safe mode ends only here: when the side that raised the
+        alarm has an open level again; after too many novel traces, when novel ones are few again
+        and either side has one.
         """
         side = Detector.ACCEPTED_PARTS.value
         self.count_outcome(side, lower, not success, predicted, inclusion_probability)
@@ -312,7 +315,8 @@ class MemberEvidence(nn.Module):
         rejecting 1 - upper bound. `wrong` says whether the side's action would have been wrong. If
         the score reaches the threshold, the drift detector of the side takes a step first, which
         may start the safe mode. Then each level that the score reaches counts the part. It is a
-        member if it reaches the target level, after an alarm the strictest, or if `predicted` is
+        member (one of the parts that the claim is about) if it reaches the target level, the one
+        that `choose_threshold` found last and after an alarm the strictest, or if `predicted` is
         the side's action. It counts as one part, without a weight. If the rule knows all outcomes,
         it counts as checked; else this part's `inclusion_probability` says how: 1 as checked, above
         0 as audited, and 0 not at all. No threshold is chosen if the part is counted nowhere.
@@ -347,13 +351,14 @@ class MemberEvidence(nn.Module):
     def step_detector(self, detector: int, step: float, times: int) -> None:
         """Add `step` to a CUSUM `times` times; start the safe mode if the sum reaches its limit.
 
-        Nothing happens if `times` is 0. An alarm sets the sums of all detectors to 0.
+        Nothing happens if `times` is 0. A CUSUM is the running sum of a drift detector. An alarm
+        sets the sums of all detectors to 0.
         """
         if times > 0 and self.add_steps(detector, step, times) >= self.alarm_limits[detector]:
             self.raise_alarm(detector)
 
     def add_steps(self, detector: int, step: float, times: int) -> float:
-        """Add `step` to a CUSUM `times` times, once or more, and return the new sum.
+        """Add `step` to a detector's sum `times` times, once or more, and return the new sum.
 
         Before each step a sum below 0 is taken as 0, so the new sum may be one step below 0. More
         than one step must be negative: only then do the earlier ones need no look at the limit.
@@ -364,7 +369,7 @@ class MemberEvidence(nn.Module):
         return total
 
     def raise_alarm(self, detector: int) -> None:
-        """Start the safe mode for the reason of a detector, or start it anew during one.
+        """Start the safe mode (every part is verified) for a detector, or start it anew during one.
 
         During one the reason is that of the two which stands first in `SafeMode`: a side that has
         not shown its tolerance yet stays the reason when novel traces come on top.
@@ -374,7 +379,7 @@ class MemberEvidence(nn.Module):
         self.start_safe_mode(reason if safe_mode == SafeMode.NONE.value else min(safe_mode, reason))
 
     def start_safe_mode(self, safe_mode: int) -> None:
-        """Close both sides until the members from now on show recovery.
+        """Accept and reject nothing until the members from now on show recovery.
 
         `safe_mode` is a `SafeMode`, not NONE. The detectors and the counts since the last alarm
         restart at 0, and the target is the strictest level again. The counts over all time, and the
@@ -388,14 +393,15 @@ class MemberEvidence(nn.Module):
         self.safe_mode.fill_(safe_mode)
 
     def choose_threshold(self, side: int) -> None:
-        """Set target level and threshold of one side from the counts.
+        """Set target level and threshold of one side, accept or reject, from the counts.
 
-        The target is the lowest level whose parts since the last alarm pass the bet (or, under the
-        priced rule, the account) and, under the pooled rule, whose newest parts have few errors; if
-        there is none, it is the strictest level. The threshold is the target's score if such a
-        level was found, the members of all time pass, and those since an alarm show recovery; else
-        it is `CLOSED`. The watched rule has no target: its threshold stays, and after an alarm is
-        the first level again once the members since then show recovery.
+        The target is the lowest level whose parts since the last alarm pass the bet (their log
+        capital is enough; under the priced rule the balance of their costs) and, under the pooled
+        rule, whose newest parts have few errors; if there is none, it is the strictest level. The
+        threshold is the target's score if such a level was found, the members of all time pass, and
+        those since an alarm show recovery; else it is `CLOSED`. The watched rule has no target: its
+        threshold stays, and after an alarm is the first level again once the members since then
+        show recovery.
         """
         is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it
@@ -421,18 +427,20 @@ class MemberEvidence(nn.Module):
         self.thresholds[side].fill_(self.levels[side][target] if opens else self.closed)
 
     def allows_more(self, side: int, counts: list[int]) -> bool:
-        """Return whether counts allow more parts of their kind, by the bet or by the account.
+        """Return whether the evidence of these counts suffices to let more such parts pass.
 
-        `counts` holds checked parts, wrong ones of these, audited parts, wrong ones of these.
+        It is the log capital of a bet, or under the priced rule the balance of costs. `counts`
+        holds checked parts, wrong ones of these, audited parts, wrong ones of these.
         """
         return weighted_sum(counts, self.level_steps[side]) >= self.level_minimum[side]
 
     def members_to_recovery(self, side: int) -> float:
         """Return how many more members a side needs to recover, if they go on like since the alarm.
 
-        It is 0 or less once they show recovery, so that the side may open again. It is huge, about
-        1e12, while more evidence is needed and it does not grow. The priced rule needs at least
-        `FEWEST_SINCE_ALARM` members.
+        Members are the parts that the rule's claim is about; a side accepts or rejects, and is
+        closed by an alarm. It is 0 or less once they show recovery, so that the side may open
+        again. It is huge, about 1e12, while more evidence is needed and it does not grow. The
+        priced rule needs at least `FEWEST_SINCE_ALARM` members.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

@@ -62,7 +62,11 @@ class RadiusNeighbours(nn.Module):
 
     @torch.jit.export
     def reason(self, action: int) -> int:
-        """Return the position in `Reason` of why the rule chose this action."""
+        """Return the position in `Reason` of why the rule chose this action, an `ActionCode`.
+
+        CERTAIN for an accept or a reject, SAFE_MODE for a verify while the rule is in a safe mode,
+        else UNCERTAIN.
+        """
         if action != ActionCode.VERIFY.value:
             return self.certain
         return self.uncertain if self.rule.safe_mode() == 0 else self.safe_mode
@@ -73,7 +77,7 @@ class RadiusNeighbours(nn.Module):
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
-            The scaled embedding.
+            The scaled embedding in each of the K spaces.
         part : int, default 0
             Hash of its part, whose own references do not count; 0 for an unknown part.
 

@@ -121,8 +121,9 @@ class NoveltyGate(nn.Module):
         """Return how far a trace (C, T) lies from its nearest reference, (4,) float32.
 
         Each is a squared distance over its limit, so above 1 is novel: by level, texture,
-        distortion and gaps. A score may be below 0 near a reference with a larger reach than
-        others, and it is NaN or infinite where features overflow.
+        distortion and gaps. References are traces of the training. A score may be below 0 near a
+        reference with a larger reach than others, and it is NaN or infinite where features
+        overflow.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])
@@ -285,7 +286,8 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
     Column j separates the traces from their j-th distortion. x (n, C, T) are the traces, plain (n,
     P) float64 their features, not standardised, as the discriminants take them. used (P,) bool
     marks the features that the discriminants read; the rows of the others are 0. Fewer than two
-    times `DISTORTED` of the traces, evenly spaced, are distorted.
+    times `DISTORTED` of the traces, evenly spaced, are distorted. The mean is taken over these, and
+    standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)

@@ -196,6 +196,7 @@ class Policy:
 
         Prices without a guarantee change the same settings as in a new policy: "cost" replaces
         "local" and "pooled", which have no prices, and an audit rate of 0.05 replaces 0.
+        Raises SettingError for a value out of its range.
         """
         implied: dict[str, Any] = {}
         if "prices" in settings and self.guarantee in ("local", "pooled"):
@@ -245,8 +246,9 @@ class Policy:
         """Make a decision rule that has learned nothing yet.
 
         It is the class that `RULES` names for `guarantee` and `stops`, or the user's
-        `module:Class`, made with alpha, lower_bound and interval. `PooledRule`, `PricedRule` and
-        their subclasses also get `inclusion_probability`, priced ones `tolerances` as well.
+        `module:Class`, which is imported, made with alpha, lower_bound and interval. `PooledRule`,
+        `PricedRule` and their subclasses also get `inclusion_probability`, priced ones `tolerances`
+        as well.
 
         Returns
         -------
@@ -308,8 +310,8 @@ class Policy:
         """Return (lower, upper) of the success probability by the policy's interval.
 
         The counts are integers or arrays of one shape. The ends are floats or arrays of that
-        shape. The error level is alpha. Under the guarantees "pooled" and "cost", where the
-        interval only sorts parts, it is 0.5.
+        shape. ValueError for other shapes and negative counts. The error level is alpha. Under
+        the guarantees "pooled" and "cost", where the interval only sorts parts, it is 0.5.
         """
         error_level = interval_error_level(self.alpha, self.guarantee)
         return INTERVALS[self.interval](n_success, n_failure, error_level)

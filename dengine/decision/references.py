@@ -54,7 +54,8 @@ def label_agreement(
     labels : array of int, shape (n,)
         1 is success, 0 is failure.
     spaces : array of int64, shape (n,)
-        Space of each point; all points of a part are in one.
+        Space of each point, the number of the encoder that embedded it; all points of a part are in
+        one.
     parts : array of int64, shape (n,)
         Hash of each point's part; 0 for an unknown part.
 
@@ -216,7 +217,8 @@ class RadiusIndex(nn.Module):
         label : float
             1.0 is success, 0.0 is failure.
         space : int
-            Space of the point, from 0 to K - 1.
+            Space of the point, from 0 to K - 1: which of a query's K embeddings it is compared
+            with.
         part : int, default 0
             Hash of its part; 0 for an unknown part.
         """
@@ -258,7 +260,8 @@ class RadiusIndex(nn.Module):
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
-            One query, embedded in every space.
+            One query, embedded in every space: by K encoders, each of which never saw the labels of
+            the points in its space.
         part : int, default 0
             Hash of the query's part, whose own points are infinitely far; 0 excludes none.
 
@@ -330,7 +333,7 @@ class RadiusIndex(nn.Module):
         self.put(point, label, space, part)
 
     def renumber(self, old: int, new: int) -> None:
-        """Change the number of a label; nothing happens if its point has left."""
+        """Change the sequence number of a label; nothing happens if its point has left."""
         self.numbers[self.numbers == old] = new
 
     def add(
@@ -384,7 +387,7 @@ class RadiusIndex(nn.Module):
             self._index_parts()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
-        """Change the label of the point with a number, or remove the point.
+        """Change the label of the point with a number, or remove the point; `agreement` stays.
 
         Parameters
         ----------
@@ -479,9 +482,9 @@ class RadiusIndex(nn.Module):
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
         """Return a new index with the points of a state; with the same capacity in the same slots.
 
-        `state` is what `get_state` returned. With a smaller `capacity` the newest points stay;
-        with a larger one the oldest is in the first slot, and `total` no longer counts points that
-        left.
+        `state` is what `get_state` returned, and is not changed. With a smaller `capacity` the
+        newest points stay; with a larger one the oldest is in the first slot, and `total` no longer
+        counts points that left.
         """
         n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)

@@ -87,7 +87,7 @@ def register_tensors(module: nn.Module) -> None:
 
     These are attributes that hold a tensor, and buffers that are not persistent, of its submodules,
     too. A tensor whose numbers share their memory is copied, since it cannot be written to. Tensors
-    in a list, tuple or dict stay as they are.
+    in a list, tuple or dict stay as they are, and so does one whose name its class defines.
     """
     for submodule in module.modules():
         for name, value in attributes_of(submodule).items():
@@ -98,7 +98,7 @@ def register_tensors(module: nn.Module) -> None:
 
 
 def module_state(module: nn.Module, prefix: str) -> State:
-    """Return copies of a module's tensors as arrays, by their names behind the prefix."""
+    """Return copies of a module's parameters and buffers as arrays, by `prefix` and their name."""
     tensors = module.state_dict()
     return {f"{prefix}{name}": tensor.numpy().copy() for name, tensor in tensors.items()}
 

@@ -68,14 +68,16 @@ class Candidate:
         self._work_began = self._clock()
 
     def end_work(self) -> None:
-        """Count the time from now on as the cell's own."""
+        """Count the time from now on as the cell's own, which the retrain's report leaves out."""
         self._seconds += self._clock() - self._work_began
 
     def check(self) -> Iterator[None]:
         """Make the model ready to answer, and compare its answers with what was trained.
 
-        It yields before each comparison with one trace. A model that must not answer, or that
-        raises, is dropped: `model` is None then, and the report says why. Nothing is raised.
+        The model takes over the previous one's rule. Then this yields before each comparison, of
+        one trace. A model that answers otherwise than it was trained, or that raises, is dropped:
+        `model` is None then, and the report says why. An exception is logged; nothing is raised.
+        Without a model nothing is done.
         """
         if self.model is None:
             return
@@ -95,10 +97,11 @@ class Candidate:
             self.report = replace(self.report, reason=f"dropped: {defect}")
 
     def learn_next(self, window: TrainingWindow) -> bool:
-        """Make a reference of the oldest label of the window that came since the training.
+        """Make the oldest label that came since the training a reference, which decisions count.
 
-        A label that the model cannot take is logged and skipped. Returns False, and does nothing,
-        if there is none, and always where there is no model.
+        Each call takes the next label of `window`, in the order of their numbers. A label that the
+        model cannot take is logged and skipped, and the result is True all the same. Returns False,
+        and does nothing, if no label is left, and always where there is no model.
         """
         if self.model is None:
             return False
@@ -127,9 +130,10 @@ class Candidate:
         return self.report
 
     def end_storing(self, version: int) -> None:
-        """Note that the version is stored, under the number that the store gave it; 0: its own.
+        """Note that the version is stored, and put the number that it got there in the report.
 
-        The two differ where a peer's version was stored first.
+        It differs from the report's where another cell of the product stored a version first. 0
+        keeps the report's.
         """
         self.is_stored = True
         self.report = replace(self.report, version=version or self.report.version)

@@ -102,7 +102,9 @@ class Corrections:
 
         References, the next retrain, the rule and the certificate take the label as corrected; the
         fold of its trace stays. A baseline, which cannot take a label back, is retrained before
-        this returns. The label as it was reported stays in the store.
+        this returns. The label as it was reported stays in the store. A training under way in the
+        executor is discarded, and begins again. If a safe mode, in which every part is verified,
+        begins or ends by this, `on_safe_mode` is called.
 
         Parameters
         ----------
@@ -122,7 +124,8 @@ class Corrections:
         ReportError
             For an unknown decision, one without a label, and what is no label.
         StoreError
-            Where the store does not answer.
+            Where the store does not answer, and for an engine that is closed or was opened for
+            reading.
         """
         label = as_success(success)
         (stored,) = self._find_labelled([decision_id])
@@ -140,10 +143,12 @@ class Corrections:
 
         `correct` brings one back. Traces, and labels as they were reported, stay in the store, and
         so do the versions that were trained with them. The one that answers goes on until the next
-        retrain, which starts from weights that never saw these labels; it is released if it was
-        pinned. A baseline is retrained before this returns. A guarantee assumes that the choice of
-        what is forgotten does not depend on the label. The certificate counts a forgotten outcome
-        of a certain decision as wrong, so that forgetting earns nothing.
+        retrain, which starts from weights that never saw these labels; if a rollback pinned it, and
+        it saw one of these labels, it is released, so that retrains may replace it. A baseline is
+        retrained before this returns. A training under way in the executor is discarded, and begins
+        again. If a safe mode begins or ends by this, `on_safe_mode` is called. A guarantee assumes
+        that the choice of what is forgotten does not depend on the label. The certificate counts a
+        forgotten outcome of a certain decision as wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -163,7 +168,8 @@ class Corrections:
             For an unknown decision, for one without a label, and for no id at all; then none is
             forgotten.
         StoreError
-            Where the store does not answer.
+            Where the store does not answer, and for an engine that is closed or was opened for
+            reading.
         """
         if not decision_ids:
             raise ReportError(
@@ -190,7 +196,8 @@ class Corrections:
         """Let retrains replace a version again that `rollback` pinned.
 
         The same model goes on, stored as a new version. Labels that came meanwhile count for the
-        next retrain.
+        next retrain. A training under way in the executor is discarded, and begins again, also
+        where no version was pinned.
 
         Parameters
         ----------
@@ -205,7 +212,8 @@ class Corrections:
         Raises
         ------
         StoreError
-            Where the store does not answer.
+            Where the store does not answer, and for an engine that is closed or was opened for
+            reading.
         """
         self._bring_up_to_date()
         if not self._live.pinned:
@@ -220,14 +228,16 @@ class Corrections:
         corrections count, and the rule in force goes on. No automatic retrain replaces a pinned
         version, until `release`, a retrain that somebody asks for, or `forget` of a label that it
         was trained with. Labels are stored and counted, and become its references, meanwhile. A
-        retrain after that starts from this version. A reducer that is stored by its traces
-        (umap-learn), and a baseline, are fitted again: the first on the traces that it was fitted
-        on, the second on the same traces with the labels as they count now.
+        retrain after that starts from this version. A training under way in the executor is
+        discarded, and none begins. A reducer that is stored by its traces (umap-learn), and a
+        baseline, are fitted again: the first on the traces that it was fitted on, the second on the
+        same traces with the labels as they count now.
 
         Parameters
         ----------
         version : int
-            The version that answers now is pinned. One that is pinned already changes nothing.
+            The one that answers now is stored as a new version, too, and pinned. One that is pinned
+            already changes nothing.
         author : str
             For the record.
 
@@ -241,8 +251,8 @@ class Corrections:
         SettingError
             For what is no whole number.
         StoreError
-            For a version that is not kept (it names those that are), for damaged traces, and where
-            the store does not answer.
+            For a version that is not kept (it names those that are), for damaged traces, where the
+            store does not answer, and for an engine that is closed or was opened for reading.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
             raise SettingError(
@@ -264,18 +274,22 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on.
 
-        The policy is stored, and a trained model goes on under it as a new version. Every earlier
-        version keeps the bounds that it decided by.
+        The policy is stored, and a trained model goes on under it as a new version. Before the
+        first training no version is made. Every earlier version keeps the bounds that it decided
+        by. Labels on their way to the store are waited for; a training under way in the executor is
+        discarded, and begins again.
 
         Where alpha, lower_bound, interval, guarantee, stops or prices change, and under "pooled"
-        and "cost" with stops="some" where the audit rate does too, the rule starts anew. It is then
-        updated with decisions from now on only: alpha was not spent on a tolerance that was chosen
-        after the data was seen, and the old bounds are of another scale. `certificate` speaks of
-        decisions since any change of the policy; whoever may choose among the certificates of m
-        policies errs with probability up to m alpha.
+        and "cost" with stops="some" where the audit rate does too, the decision rule (which turns
+        bounds into actions, and may learn from outcomes) starts anew. It is then updated with
+        decisions from now on only: alpha was not spent on a tolerance that was chosen after the
+        data was seen, and the old bounds are of another scale. `certificate` speaks of decisions
+        since any change of the policy; whoever may choose among the certificates of m policies errs
+        with probability up to m alpha.
 
-        A safe mode goes on, where the new rule has one, until fresh evidence ends it. A part that
-        was accepted before, and was not reported, stays unreported. In the shadow mode,
+        A safe mode, in which every part is verified after an alarm, goes on until fresh evidence
+        ends it; where the new rule has none, it ends, and `on_safe_mode` is called. A part that was
+        accepted before, and was not reported, stays unreported. In the shadow mode,
         `Policy(shadow=True)`, each part that the model is certain of is an audit:
         `Decision.predicted` says what the model would have done, and all is learned from as always.
         It lasts over restarts.
@@ -300,7 +314,8 @@ class Corrections:
             that was handed in, for anything but audit_rate, stops, label_within, force_limits and
             shadow.
         StoreError
-            Where the store does not answer.
+            Where the store does not answer, and for an engine that is closed or was opened for
+            reading.
         """
         example = "for example Policy(alpha=0.05, lower_bound=0.95)"
         expect(isinstance(policy, Policy), "a Policy", policy, example)
@@ -343,10 +358,11 @@ class Corrections:
         return self._finish_change(event, "the rule of the new policy has no safe mode")
 
     def _bring_up_to_date(self) -> None:
-        """Finish what is under way: a retrain, labels on their way to the store, news of peers.
+        """Finish what is under way: a correction comes after everything that was known before it.
 
-        A correction comes after everything that was known before it. Raises StoreError where the
-        engine is closed or the store does not answer.
+        A trained version answers, a training that is not done is discarded and begins again later,
+        labels reach the store, and labels and versions of the product's other cells are taken in.
+        Raises StoreError where the engine is closed or the store does not answer.
         """
         self._outbox.check_usable()
         self._learner.bring_up_to_date()
@@ -354,9 +370,9 @@ class Corrections:
     def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
         """Finish what is under way, then return the decisions of these ids, in their order.
 
-        A decision whose label was forgotten has `success` None. Raises ReportError for an unknown
-        id, and for a decision that never had a label, and StoreError where the store does not
-        answer.
+        The first is done as `_bring_up_to_date` does. A decision whose label was forgotten has
+        `success` None. Raises ReportError for an unknown id, and for a decision that never had a
+        label, and StoreError where the store does not answer.
         """
         self._bring_up_to_date()
         decisions = []
@@ -372,9 +388,10 @@ class Corrections:
     def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, and apply it to references, training window and rule.
 
-        A model that cannot change its references is retrained. A safe mode that began or ended is
-        announced. Returns what was done, with the number of the change's event. Raises StoreError
-        where the store does not answer.
+        A model that cannot change its references is retrained, in this thread. A safe mode that
+        began or ended is recorded and announced to the user's `on_safe_mode`. Returns what was
+        done, with the number of the change's event. Raises StoreError where the store does not
+        answer.
         """
         self._store.corrections.apply(change)
         for id_ in change.decisions:
@@ -385,7 +402,7 @@ class Corrections:
     def _finish_change(
         self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
     ) -> Changed:
-        """Announce a safe mode that the change began or ended, and return what the change did.
+        """Announce a safe mode that a stored change began or ended, and return what the change did.
 
         `reason_ended` is recorded as the reason if a safe mode ended. The result names the newest
         event of the store as the event of the change.

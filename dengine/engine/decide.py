@@ -85,9 +85,9 @@ class DecisionMaker:
 
         One that is set already stays, completed by what `spec` states and it does not. Where the
         cell shares a product with others, a contract that these have set is taken in place of
-        `spec`, unless it cannot be read. `inferred` says that `spec` comes from a first trace. The
-        settings are saved in the store; where that fails, they are saved with a later trace. Raises
-        SettingError where the force limits do not fit the contract.
+        `spec`; if it cannot be read, that is logged. `inferred` says that `spec` comes from a first
+        trace. The settings are saved in the store; where that fails, they are saved with a later
+        trace. Raises SettingError where the force limits do not fit the contract.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -108,11 +108,12 @@ class DecisionMaker:
         """Return a trace as float32, shape (channels, samples), converted as the trace contract
         demands.
 
-        Where none is set, the first trace without a fault sets it, or a contract that peers have
-        set is taken. The first finite trace also has an untrained model compute in advance.
-        Settings that could not be saved before are saved. Raises TraceError for a wrong shape, or
-        too few samples of a first trace, and SettingError where the force limits do not fit the
-        contract that it sets; a trace with NaN, or another fault, is returned like any other.
+        Where none is set, the first trace without a fault sets it, or a contract that peers (other
+        cells of the product) have set is taken. Before the first training the first finite trace
+        also has the model prepare itself for such traces. Settings that could not be saved before
+        are saved. Raises TraceError for a wrong shape, or too few samples of a first trace, and
+        SettingError where the force limits do not fit the contract that it sets; a trace with NaN,
+        or another fault, is returned like any other.
         """
         settings = self._settings.now
         has_learned = self._live.version + self._labels.new_labels > 0
@@ -133,9 +134,10 @@ class DecisionMaker:
     def _infer_trace_spec(self, x: TraceArray, trace: Any) -> TraceSpec | None:
         """Infer the trace contract from a first trace; return None if the trace has a fault.
 
-        The contract is also kept, so that a trace with a fault, after which a later one must set
-        it, can be decided. `trace` is `x` as the caller passed it; a DataFrame names the channels.
-        Raises TraceError for a trace of fewer samples than a first trace must have.
+        The contract is also kept for the conditions of the decision, so that a trace with a fault
+        can be decided, too, although a later trace must set the contract. `trace` is `x` as the
+        caller passed it; a DataFrame names the channels. Raises TraceError for a trace of fewer
+        samples than a first trace must have.
         """
         spec, is_sound = infer_trace_spec(x, trace)
         self._first_conditions = DecisionConditions(spec)
@@ -200,8 +202,9 @@ class DecisionMaker:
     def sync(self, stored: StoredDecision) -> StoredDecision:
         """Wait until a decision is on disk, and return the record that counts.
 
-        Where the disk does not answer in time, an ACCEPT or REJECT is replaced in the outbox by
-        VERIFY, `Reason.NO_STORE`, unless it has reached the disk by then. A VERIFY stays as it is.
+        Where the disk does not answer in time, an ACCEPT or REJECT is replaced among the records
+        that wait for it by VERIFY, `Reason.NO_STORE`, unless it has reached the disk by then.
+        Nothing is raised. A VERIFY stays as it is.
         """
         decision = stored.decision
         try:
@@ -217,7 +220,8 @@ class DecisionMaker:
     def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
         """Record VERIFY, `Reason.LATE`, beside another call of the engine, and return it.
 
-        Any thread may call it. An id that has a decision already gets that one. It returns once the
+        Any thread may call it. An id that has a decision already gets that one; one that cannot be
+        looked up gets VERIFY, `Reason.NO_STORE`, which is not recorded. It returns once the
         decision is on disk, or when the store's time limit is over. With a store in memory, and
         before the first trace, nothing is recorded: only the thread that uses the engine may do
         that. Raises TraceError for a wrong part's number, an id of another trace, and a trace that
@@ -249,10 +253,10 @@ class DecisionMaker:
         """Decide on one trace by a model and return the record, which is not recorded yet.
 
         Without a model, and for a `verify_reason`, the decision is VERIFY. With a reason the force
-        limits do not count; a fault of the trace comes before it. The record is quarantined if the
-        trace has a fault. A model that raises, or returns impossible bounds, is logged, and the
-        decision is VERIFY with `Reason.MODEL_ERROR`, unless the trace has a fault or is outside a
-        force limit.
+        limits do not count; a fault of the trace comes before it. If the trace has a fault, the
+        record is quarantined: it is never trained on. A model that raises, or returns impossible
+        bounds, is logged, and the decision is VERIFY with `Reason.MODEL_ERROR`, unless the trace
+        has a fault or is outside a force limit.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         conditions = self._settings.conditions or self._first_conditions
@@ -301,8 +305,9 @@ class DecisionMaker:
     ) -> StoredDecision:
         """Record the ACCEPT behind a line stop whose decision was lost, and return the record.
 
-        The decision has this id, `Reason.CERTAIN`, and no evidence: no labels and the bound (0, 1).
-        Its propensity is the present audit rate, 1 in shadow mode.
+        The model is not asked: the decision has this id, `Reason.CERTAIN`, and no evidence, that is
+        no labels and the bound (0, 1). It does not wait for the disk. Its propensity is the present
+        audit rate, 1 in shadow mode.
         """
         stored = self._decide(x, part, None, decision_id=decision_id)
         decision = replace(

@@ -221,9 +221,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> None:
         """Make the engine's objects on an opened store, each from those that it knows.
 
-        From now on the store is closed when the engine is garbage-collected. Modules that a retrain
-        imports are loaded, in a thread if there is an executor. Limits this thread to one torch
-        thread. Raises SettingError for force limits in seconds at an unknown rate.
+        From now on the store is closed when the engine is garbage-collected. The modules that a
+        retrain imports are loaded, with an executor in a thread of their own, and else, unless
+        `reading`, before this returns. Limits this thread to one torch thread. Raises SettingError
+        for force limits in seconds at an unknown rate, and StoreError where another engine owns the
+        cell.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -267,7 +269,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         The engine then decides bit for bit as before it was closed. In a new cell it decides as the
         other cells of its product do. It is called once, before the first decision, and waits for
         the store without a time limit. Where retrains run in the calling thread, it also waits
-        until the first one can begin at once.
+        until the first one can begin at once. Raises StoreError where the store cannot be read.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -318,6 +320,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Self:
         """Open a used store, and go on with the same version and the same decisions, bit for bit.
 
+        The engine owns the cell until `close`, unless it only reads, and limits this thread to one
+        torch thread. Without an executor, unless it only reads, the call also waits until a retrain
+        can begin at once. If it raises, a store that it opened is closed.
+
         Parameters
         ----------
         url : str, path or SqlStore
@@ -332,7 +338,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             Whether a `module:Class` that the store names is imported, or which of these classes
             are. A class that `reducer` names is allowed.
         reading : bool
-            Neither decide nor learn, for example to export. Another engine may own the store.
+            Neither decide nor learn, for example to export: such calls raise StoreError. Another
+            engine may own the cell.
         **options
             executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With an
             executor the ids of all decisions are read before this returns (a second for a million),
@@ -347,8 +354,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             If the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            If an object is missing or differs from the one before, if a model is given but not
-            needed, or if `trace` contradicts the stored contract.
+            If an object is missing or differs from the one before, if a `model` is given to an
+            engine that has its own, or if `trace` contradicts the stored contract.
         ImportRefusedError
             A SettingError, if a class would have to be imported that is not allowed.
         """
@@ -397,7 +404,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             As `DataEngine` takes them. For a used store, the given settings must be the settings
             in force, so that a running cell does not change unnoticed. `model` is as for `open`;
             `executor`, `clock`, `replaying` and `on_safe_mode` are not stored, so any may be
-            given. A new cell of a product takes the settings that are not given from its peers.
+            given. A new cell of a product (cells that share labels and versions) takes the
+            settings that are not given from its peers, the other cells.
 
         Returns
         -------
@@ -407,7 +415,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            If a given setting differs from the used store's.
+            If a given setting differs from the used store's, is unknown, or is out of range.
         StoreError
             If another engine owns the cell, or the store cannot be used.
         ImportRefusedError
@@ -433,9 +441,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. A second call does nothing. Records that the disk
-        does not take are given up, and an error is logged; none of them was acknowledged. Raises
-        StoreError while another thread uses the engine.
+        A retrain that takes longer is dropped. Labels of parts that the next decision confirmed
+        are stored, too. A second call does nothing. Records that the disk does not take are given
+        up, and an error is logged; none of them was acknowledged. Raises StoreError while another
+        thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -447,7 +456,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
         Labels of parts that the next decision confirmed, which wait in memory, are recorded first,
-        so that they are in the training window afterwards. Raises NotTakenError after `wait`
+        so that they are among the traces of the next training. A rule that a wrong confirmation
+        updated is put right, too, if the store has answered. Raises NotTakenError after `wait`
         seconds; None: the store's own limit.
         """
         self._feedback.store_confirmations()
@@ -506,13 +516,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             call of the engine nor for the disk. Any thread may make it while no other thread uses
             the engine; it has one torch thread from then on. The call returns None, and changes
             nothing, if it cannot decide at once. That is so with an id, before the first trace,
-            while something must be stored or rebuilt first, and if the model is a baseline, uses
-            classes of the user's or is not compiled. Only a later `poll` lets a trained version
-            answer, and calls `on_safe_mode`.
-            With `timed_out` another thread may use the engine meanwhile. The VERIFY is recorded
-            beside that thread's call, and this call waits for the disk. With a store in memory,
-            and before the first trace, it is not recorded: call again with `wait`, in the engine's
-            thread.
+            while something must be stored or rebuilt first, and if the model is a baseline (handed
+            in as `model`), uses classes of the user's or is not compiled. Only a later `poll` lets
+            a trained version answer, and calls `on_safe_mode`. With `timed_out` another thread may
+            use the engine meanwhile. The VERIFY is recorded beside that thread's call, and this
+            call waits for the disk. With a store in memory, and before the first trace, it is not
+            recorded: call again with `wait`, in the engine's thread.
 
         Returns
         -------
@@ -552,12 +561,14 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _decide(
         self, trace: ArrayLike, part: str | None, decision_id: str | None, reason: Reason | None
     ) -> Decision:
-        """Decide on one trace by the model, or verify for a reason, and record that.
+        """Decide on one trace by the model, or verify for a reason; record and return that.
 
         The steps are in this order because each needs the one before: a wrong trace must confirm
         nothing; a rule that lacks a correction must not decide; this trace is the next one after
         parts that nobody reported, which may change the rule; with an id the decision must be on
-        disk before the caller acts on it; and what the disk did not take is another decision.
+        disk before the caller acts on it; and what the disk did not take is another decision:
+        VERIFY. Raises TraceError for a wrong trace, and SettingError for a first one that the force
+        limits do not fit.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -573,7 +584,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Decision | None:
         """Decide if nothing has to be waited for, in any thread; else return None.
 
-        While it decides it holds the outbox's lock, so that nothing that it records waits.
+        It returns None, and changes nothing, with an id, before the first trace, while settings or
+        a correction wait for the store or another call holds the outbox's lock, and if the model is
+        a baseline, uses classes of the user's or is not compiled. While it decides it holds that
+        lock, so that nothing that it records waits. It sets the present thread to one torch thread.
+        Raises StoreError if another thread uses the engine or it is closed, and TraceError for a
+        wrong trace or part's number.
         """
         self._outbox.check_usable()
         with self._outbox.try_lock() as is_free, self._exclusive:
@@ -696,6 +712,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         SettingError
             Before the first part, for a cell that lacks one of its four methods, or whose `spec`
             cannot hold the force limits.
+        ReportError
+            Where `verify` returns no label, or `proceed` no `Outcome`.
+        NotTakenError
+            At the end, where the disk does not take everything within 10 seconds.
         """
         check_cell(cell)
         return self._run(cell, cycles)
@@ -703,9 +723,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle; at the end, also after an error, write everything to disk.
 
-        The first cycle waits for what would otherwise delay the first retrain.
-        From then on the garbage collector ignores the objects that exist, until the end. Raises
-        NotTakenError where the disk does not take everything in time.
+        The first cycle waits for what would otherwise delay the first retrain, and takes over what
+        the cell's `spec` states of the traces. From then on the garbage collector ignores the
+        objects that exist, until the end. Raises NotTakenError where the disk does not take
+        everything in time.
         """
         self._wait_until_warm()
         spec = getattr(cell, "spec", None)
@@ -723,8 +744,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Have the cell insert one part, decide, do what the decision says, and report its outcome.
 
         An ACCEPT of which the cell learns nothing is not reported, nor is a REJECT. A label that
-        cannot be written is logged and waits. A retrain that is due is begun or done. Returns the
-        record of the cycle; `seconds` is the duration of the decision alone.
+        cannot be written is logged and waits. A retrain that is due is begun or done. What the cell
+        raises passes, and ReportError is raised where it returns no label or outcome. Returns the
+        record of the cycle; its `decide_seconds` is the duration of the decision alone.
         """
         trace = cell.insert()
         with uncollected():
@@ -766,7 +788,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         A pinned version is released first, like by `release`. A version that fails, or cannot be
         stored, is dropped: the report has `accepted` False then. Raises StoreError if the labels
-        that came before cannot be stored.
+        that came before cannot be stored, and for an engine that is closed, was opened for reading,
+        or is in use by another thread.
 
         Parameters
         ----------
@@ -802,9 +825,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Parameters
         ----------
         brief : bool, default False
-            True: bring a version that the executor has trained only one step further, which takes
-            a few milliseconds. False: bring it to its end, so that it answers or is dropped. If
-            cells share a product, it is always brought to its end.
+            True: bring a version that the executor has trained only one step further, which takes a
+            few milliseconds. False: bring it to its end, so that it answers or is dropped. In a
+            cell of a product, whose cells share labels and versions, it is always brought to its
+            end.
 
         Returns
         -------
@@ -963,8 +987,10 @@ def _new_settings(
 ) -> tuple[EngineSettings, EngineModel]:
     """Return the settings of a new engine, and the untrained model that they describe.
 
-    `given` are the settings that stand beside the recipe, by name. Raises SettingError for settings
-    that are out of range or contradict each other.
+    `given` are the settings that stand beside the recipe, by name. For a handed-in `model` without
+    a recipe they are those of the default recipe, but for `retrain_every`. Raises SettingError for
+    settings that are out of range, contradict each other or have no effect on the model, and for a
+    window below the model's `min_traces`.
     """
     if model is not None:
         check_model_settings(reducer, given)

@@ -99,16 +99,17 @@ class Feedback:
 
     @property
     def _stops_all(self) -> bool:
-        """Whether the next decision confirms an unreported part: each bad one stops the system."""
+        """Whether the next decision confirms an unreported part, by `Policy(stops="all")`."""
         return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
         """Restore from the store which checks are pending, and which accepted parts have no
         outcome.
 
-        The live model must be restored before. With `stops="all"` the accepted parts are kept, so
-        that the next trace confirms them. With "some" they are only counted, as unreported since
-        the last label. Raises StoreError where the store cannot be read.
+        The live model must be restored before. A safe mode that it is in is not announced again.
+        With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
+        "some" they are only counted, as unreported since the last label. Raises StoreError where
+        the store cannot be read.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -128,10 +129,10 @@ class Feedback:
     def record_decision(self, stored: StoredDecision) -> None:
         """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
 
-        A VERIFY of a trace with a fault, or that was not recorded, is not pending. The rule is
-        updated with checks that have become overdue. When nearly all recent decisions are
-        `Reason.NOVEL`, an event is recorded; the next one only after their share has fallen to one
-        half.
+        A VERIFY of a trace with a fault, or that was not recorded, is not pending. The rule counts
+        as wrong each check that has become overdue: not reported within `Policy.label_within`
+        decisions. When nearly all recent decisions are `Reason.NOVEL`, an event is recorded; the
+        next one only after their share has fallen to one half.
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -150,9 +151,10 @@ class Feedback:
     def confirm_unreported(self) -> None:
         """Settle accepted parts without an outcome, because the next trace has come.
 
-        With `stops="all"` each is a success: rule and references learn it at once, and its label,
-        CONFIRMED, waits in memory; when `MOST_CONFIRMED` labels wait, all are handed to the outbox.
-        With "some" the parts are only counted, and nothing is learned.
+        With `Policy(stops="all")`, under which a bad part would have stopped the line, each is a
+        success: rule and references learn it at once, and its label, CONFIRMED, waits in memory;
+        when `MOST_CONFIRMED` labels wait, all are handed to the outbox, the queue of records for
+        the store. With "some" the parts are only counted, and nothing is learned.
         """
         if not self._unreported:
             return
@@ -166,13 +168,14 @@ class Feedback:
             self.store_confirmations()
 
     def take_in(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a reported label and hand it to the outbox, without waiting for the disk.
+        """Learn a reported label and have it recorded, without waiting for the disk.
 
         The same report once more, before `note_synced`, does nothing and returns False. Returns
-        whether the next decision had confirmed the part before this report, whatever its label is
-        now. Raises ReportError if the decision has a label already, except that a line stop may
-        follow a confirmation. `remedy` is set where the rule must be rebuilt, which is not done
-        here.
+        whether the next decision had confirmed the part before this report (`Policy(stops="all")`),
+        whatever its label is now. Raises ReportError if the decision has a label already, except
+        that a line stop may follow a confirmation; one whose confirmation is recorded already is
+        learned later, as a correction. `remedy` is set where the rule must be rebuilt, which is not
+        done here.
         """
         id_ = stored.decision.id
         was_confirmed = False
@@ -182,19 +185,18 @@ class Feedback:
         return was_confirmed
 
     def note_synced(self, decision_id: str) -> None:
-        """Note that the reported label of this decision is on disk; the same report is no
-        repetition now.
-        """
+        """Note that the label of this decision is on disk: another report is now an error."""
         del self._unsynced[decision_id]
 
     def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
         """Learn a label that is no repetition and hand it to the outbox, after labels that wait.
 
-        A confirmation by the next decision is taken back first. If its label went to the outbox
-        before, the new label goes there too, but is not learned yet: `remedy` is set to CORRECT.
-        Otherwise its reference is removed, and `remedy` is set to REBUILD_RULE. The latter is also
-        set for a check that the rule counted as overdue. Returns whether there was such a
-        confirmation, whatever the label is now. Raises ReportError for any other second label.
+        The outbox is the queue of records for the store. A confirmation by the next decision, as a
+        success, is taken back first. If its label was handed over before, the new label follows it,
+        but is not learned yet: `remedy` is set to CORRECT. Otherwise its reference is removed, and
+        `remedy` is set to REBUILD_RULE. The latter is also set for a check that the rule counted as
+        overdue. Returns whether there was such a confirmation, whatever the label is now. Raises
+        ReportError for any other second label.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -227,8 +229,9 @@ class Feedback:
         A trace with a fault updates neither, but its label takes a number. A rejected part that was
         inspected becomes a reference and does not update the rule: which parts are inspected is
         somebody's choice, and no sample. Any other label takes over the count of unreported parts,
-        which begins again at 0, also if the decision is from before the present rule. If this part
-        was itself counted as unreported it is subtracted, so a late report may give -1.
+        which begins again at 0, also if the decision is from before the present rule. The label
+        uses up the next number of the outbox; nothing is recorded here. If this part was itself
+        counted as unreported it is subtracted, so a late report may give -1.
         """
         decision = stored.decision
         version = self._live.version
@@ -254,7 +257,7 @@ class Feedback:
         )
 
     def _record(self, labels: Collection[tuple[StoredDecision, NewLabel]]) -> None:
-        """Hand learned labels to the outbox, and add those of usable traces to the window."""
+        """Hand learned labels to the outbox; those of usable traces enter the training window."""
         self._outbox.record_labels(labels)
         for stored, label in labels:
             if not stored.quarantined:
@@ -275,7 +278,8 @@ class Feedback:
     def store_confirmations(self) -> bool:
         """Hand the labels of parts that the next decision confirmed to the outbox, without waiting.
 
-        Returns False, and does nothing, if there are none; else True.
+        They enter the training window, in a product once they are numbered. Returns False, and does
+        nothing, if there are none; else True.
         """
         if not self._confirmations:
             return False
@@ -287,7 +291,8 @@ class Feedback:
     def number_labels(self) -> None:
         """In a product, give learned labels the numbers that the store has newly assigned.
 
-        The rule is updated with checks that have become overdue.
+        A product is several cells whose labels have one sequence of numbers in the store. In any
+        cell the rule counts as wrong each check that has become overdue.
         """
         self._count_overdue()
         if isinstance(self._labels, ProductLabels) and self._labels.has_unnumbered:
@@ -313,7 +318,7 @@ class Feedback:
             self._live.mark_examined_to(overdue_to)
 
     def take_remedy(self) -> Remedy | None:
-        """Return what must be put right, once; None where there is nothing."""
+        """Return, once, what must be put right after a wrong label; None where nothing must be."""
         remedy = self.remedy
         self.remedy = None
         return remedy
@@ -331,8 +336,9 @@ class Feedback:
         """Record an event and call `on_safe_mode` if a safe mode began or ended since the last
         call.
 
-        `reason_ended` is recorded when one ended. It comes last in every cycle, because either step
-        may fail and must cost no label; a failure is logged and not tried again.
+        `reason_ended` is recorded when one ended. In a safe mode every part is verified after an
+        alarm of the rule. The announcement comes last in every cycle, because either step may fail
+        and must cost no label; a failure is logged and not tried again.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

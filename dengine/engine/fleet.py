@@ -66,22 +66,22 @@ class Peers:
         self._refused = 0  # a version that could not be taken over
 
     def resume(self) -> None:
-        """Count the time to the next question from now, because the store was just read."""
+        """Count the time to the next request for news from now, because the store was just read."""
         self._asked = self._clock()
 
     @property
     def is_news_due(self) -> bool:
-        """Whether news was not asked for lately."""
+        """Whether news was not asked for in the last `NEWS_SECONDS`."""
         return self._clock() - self._asked >= NEWS_SECONDS
 
     def fetch_news(self) -> tuple[ProductNews, bool]:
-        """Ask the store for what is new in the product.
+        """Ask the store for what is new in the product: labels, a version, corrections.
 
-        Returns the news, with at most `MOST` labels after the window's newest, this cell's among
-        them, and whether it names a newer version than the one that answers; one that could not be
-        taken over does not count. Where there is a new version or label, the store is checked,
-        which may set the outbox's `integrity_error`. Raises StoreError where the store gives no
-        answer in time.
+        Returns the news, with at most `MOST` labels after the training window's newest, this cell's
+        among them, and whether it names a newer version than the one that answers; one that could
+        not be taken over does not count. Where there is a new version or label, the store is
+        checked, which may set the outbox's `integrity_error`. Raises StoreError where the store
+        gives no answer in time.
         """
         store = self._outbox.store
         newest = self._window.newest_seq
@@ -94,7 +94,8 @@ class Peers:
     def note_loss(self, error: StoreError) -> None:
         """Note that news cannot be had: set `is_lost`, and ask again after `NEWS_SECONDS`.
 
-        Only the first of several losses is logged.
+        News is what the other cells of the product stored. Only the first of several losses is
+        logged.
         """
         if not self.is_lost:
             product = self._outbox.store.product
@@ -105,9 +106,10 @@ class Peers:
         self._asked = self._clock()
 
     def take_in(self, news: ProductNews) -> None:
-        """Add the labels of the news to the window, in their order, and count them for the next
-        retrain; a peer's label becomes a reference of the answering model, unless it is one
-        already.
+        """Add labels that the product's cells stored to the training window, in their order.
+
+        They count for the next retrain. A label of another cell becomes a reference of the
+        answering model, unless it is one already.
         """
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)
@@ -117,8 +119,8 @@ class Peers:
     def note_taken(self, n_labels: int) -> None:
         """Note that news was had and how many labels were taken in: clear `is_lost`.
 
-        It is logged if `is_lost` was set. Where more labels may be waiting, the next cycle asks
-        again at once.
+        It is logged if `is_lost` was set. It is due again after `NEWS_SECONDS`, or at once where as
+        many labels came as a request gives at most.
         """
         if self.is_lost:
             log.warning("news of product %s comes again", self._outbox.store.product)
@@ -126,13 +128,13 @@ class Peers:
         self._asked = self._clock() if n_labels < MOST else -np.inf
 
     def take_over(self, version: ModelVersion) -> None:
-        """Let a peer's version answer, with every label since.
+        """Let a version that another cell of the product trained answer, with the labels since.
 
         Its rule is the one that this cell's model has now, as it is: nothing is rebuilt, and the
         peer's rule is ignored.
 
         Where it cannot be restored, that is logged and the present version goes on answering. It is
-        tried again with later news only if the store was the reason.
+        tried again with later news only if the store was the reason. Nothing is raised.
         """
         store = self._outbox.store
         trained_on = TrainedOn.from_state(version.state)

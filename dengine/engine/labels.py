@@ -38,11 +38,11 @@ class CellLabels:
         self.new_labels = 0
 
     def resume(self, counts_from: int) -> None:
-        """Set the count to the number of the window's labels after this number."""
+        """Set the count to how many labels of the training window have a number above this one."""
         self.new_labels = len(self._window.newer(counts_from))
 
     def recount(self, counts_from: int) -> None:
-        """Count again, after the window was filled anew because labels were corrected."""
+        """Count again, after the training window was filled anew because labels were corrected."""
         self.resume(counts_from)
 
     def count_learned(self, n: int) -> None:
@@ -109,7 +109,7 @@ class ProductLabels:
         return bool(self._waiting)
 
     def resume(self, counts_from: int) -> None:
-        """Count the window's labels after this number as new, when an engine goes on from a store.
+        """Count the labels of the training window above this number as new, on opening a store.
 
         They count as labels of peers, so that they alone do not make a retrain this cell's turn.
         """
@@ -120,7 +120,10 @@ class ProductLabels:
         self._updated_to = self._window.newest_seq
 
     def recount(self, counts_from: int) -> None:
-        """Count the new labels again, after the window was filled anew without forgotten labels."""
+        """Count the new labels again, after the training window was filled without forgotten ones.
+
+        They are those above the number that the newest retrain went to; `counts_from` is not used.
+        """
         own_numbers = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
         self._since = [(number, number in own_numbers) for number in newer]
@@ -136,15 +139,17 @@ class ProductLabels:
     def add(self, stored: StoredDecision, label: NewLabel) -> None:
         """Keep a recorded label of this cell, which is a reference already, until it is numbered.
 
-        Until then its reference has the label's provisional number.
+        Until then its reference has the label's provisional number, and the label is not in the
+        training window.
         """
         self._unnumbered[label.decision_id] = stored, label
 
     def assign_number(self, decision_id: str, number: int) -> None:
         """Give a label of this cell, and its reference, the number that the store gave it.
 
-        It enters the window at once if its number is the next one, else when the peers' labels
-        before it have come. Nothing happens for a label that taught nothing.
+        It enters the window at once if its number is the next one, else when the other cells'
+        labels before it have come. Nothing happens for a label that was not added, as of a trace
+        with a fault.
         """
         if decision_id not in self._unnumbered:
             return
@@ -158,10 +163,11 @@ class ProductLabels:
             self.admit(*row, number)
 
     def admit(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
-        """Add the product's next label to the window.
+        """Add the product's next label, of this cell or another, to the training window.
 
         It counts as new unless the newest retrain was trained on it. A peer's label also becomes a
-        reference of the answering model, unless that has it already.
+        reference of the answering model, unless that has it already. One that the model cannot take
+        is logged and skipped.
         """
         is_own = self._waiting.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)
@@ -174,8 +180,9 @@ class ProductLabels:
     def is_due(self, retrain_every: int) -> bool:
         """Return whether a retrain is due and this cell is the one to do it.
 
-        That is so where the label that completes `retrain_every` is this cell's own, or where a
-        peer missed its turn and twice as many labels have come.
+        That is so where the label that completes `retrain_every` is this cell's own, or where
+        another cell missed its turn, and this cell's is the label that completes twice as many, or
+        a later one.
         """
         due = self._since[retrain_every - 1 : retrain_every]
         missed = self._since[2 * retrain_every - 1 :]
@@ -187,14 +194,16 @@ class ProductLabels:
         self._since = []
 
     def add_missing_references(self, model: EngineModel) -> None:
-        """Add this cell's labels that wait for peers' labels to a version that it trained, as
-        references.
+        """Make this cell's waiting labels references of a version that it trained.
+
+        They wait for labels of other cells that come before them in the store, so the training
+        lacked them. One that the model cannot take is logged and skipped.
         """
         self._references_to = 0
         self._add_waiting(model)
 
     def take_over(self, model: EngineModel, references_to: int, counts_from: int) -> None:
-        """Prepare a peer's version to answer: add this cell's waiting labels to it as references.
+        """Prepare another cell's version to answer: add this cell's waiting labels as references.
 
         Its references hold every label up to the number `references_to` already; later labels of
         peers are added when they come. Labels after `counts_from` go on counting as new.
@@ -213,5 +222,5 @@ class ProductLabels:
                 guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq)
 
     def get_state(self) -> State:
-        """Return, for a stored version, the number of the newest label that updated the rule."""
+        """Return the number of this cell's newest label, for a version's rule that learned it."""
         return {"rule_last_seq": np.array(self._updated_to)}

@@ -100,10 +100,10 @@ class Learner:
         """Restore window, version, rule and counts from the store, bit for bit, when an engine
         opens it.
 
-        A check is overdue after `label_within` later decisions; `policy_since` is the first version
-        under the policy in force. With a version, or with at least `IMPORTED` labels, it also
-        begins in a thread to compute what the next retrain starts with. Raises StoreError where the
-        store cannot be read.
+        A check that was not reported within `label_within` later decisions is overdue, and counts
+        as wrong; `policy_since` is the first version under the policy in force. With a version, or
+        with at least `IMPORTED` labels, it also begins in a thread to compute what the next retrain
+        starts with. Raises StoreError where the store cannot be read.
         """
         # The version is read before the labels: a peer may store both meanwhile.
         version = self._store.versions.newest()
@@ -123,8 +123,8 @@ class Learner:
     def precompute(self) -> None:
         """Start a thread that computes what the next retrain begins with; do not wait for it.
 
-        The result is kept in the model that the next training starts from. While an earlier one has
-        not been waited for, nothing is started. There must be labels.
+        The result is kept in the model that the next training starts from; a failure is logged.
+        While an earlier one has not been waited for, nothing is started. There must be labels.
         """
         if self._precomputed is not None:
             return
@@ -139,12 +139,14 @@ class Learner:
     # Labels
 
     def catch_up(self) -> None:
-        """Take in the numbers that a product gave its labels, and do what `Feedback.remedy` asks.
+        """Give labels the numbers that the store assigned, and do what `Feedback.remedy` asks.
 
-        The remedy, a rebuild of the rule and perhaps a correction, is left to a later call while
-        the store lacks records or has a fault. A correction first ends a retrain under way, as
-        `end_training` does, and retrains a model that cannot change its references. Where the store
-        fails meanwhile, that is logged, and a later call tries again.
+        The store assigns numbers only where cells share a product. The remedy, a rebuild of the
+        rule and perhaps a correction, follows a wrong label that was learned; it is left to a later
+        call while the store lacks records or has a fault. A correction first ends a retrain under
+        way, as `end_training` does, and retrains a model that cannot change its references. Where
+        the store fails meanwhile, that is logged, and a later call tries again. Checks that have
+        become overdue are counted, too.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -168,8 +170,8 @@ class Learner:
     def store_labels(self) -> None:
         """Wait until every label is in the store and has its number.
 
-        That includes labels of parts that the next decision confirmed. Raises StoreError where the
-        store is unavailable.
+        That includes labels of parts that the next decision confirmed. Then it catches up, as
+        `catch_up`. Raises StoreError where the store is unavailable or takes too long.
         """
         self._feedback.store_confirmations()
         self._drain_labels()
@@ -177,7 +179,7 @@ class Learner:
     def _drain_labels(self) -> None:
         """Wait until the store has the labels that are in the journal, then catch up.
 
-        Raises StoreError where it is unavailable.
+        Raises StoreError where it is unavailable or takes too long.
         """
         if self._outbox.request_label_drain():
             self._outbox.drain()
@@ -189,9 +191,9 @@ class Learner:
         """Train a version here, let it answer and return the report; or begin in the executor.
 
         The steps, in this order: every label is stored, since a version is trained on numbered
-        labels alone; what was computed in advance is waited for, and news of peers is taken in,
-        since either may change what the training starts from; then new labels count from zero, and
-        the training begins.
+        labels alone; what was computed in advance is waited for, and news of peers (what other
+        cells of the product stored) is taken in, since either may change what the training starts
+        from; then new labels count from zero, and the training begins.
 
         With `wait`, and without an executor that takes work, it is done in this thread. Else None
         is returned, and `advance` brings the version to its end. Nothing begins while a training is
@@ -228,12 +230,15 @@ class Learner:
     def retrain_if_due(self, retrain_every: int, once: bool = False) -> RetrainReport | None:
         """Retrain, or begin to, if enough new labels came or the version lacks training steps.
 
-        There must be as many labels as the model's `min_traces`, unless it was asked for and could
-        not begin then. News of peers is taken in first, so another version may answer even if none
-        is trained here. A pinned version stays. With `once` a version that lacks steps is not
-        trained on until the report of its last retrain was taken.
-        Returns the report of a retrain in this thread; else None: none is due, the store is
-        unavailable, a training or its preparation is under way, or it was begun in the executor.
+        There must be as many labels as the model's `min_traces`, unless a retrain was asked for and
+        could not begin then. News of peers (what other cells of the product stored) is taken in
+        first, so another version may answer even if none is trained here. A version lacks steps if
+        its training ended by the budget; that counts only in a cell that shares no product, and
+        after a retrain that was accepted. A pinned version, which somebody rolled back to, stays.
+        With `once` a version that lacks steps is not trained on until the report of its last
+        retrain was taken. Returns the report of a retrain in this thread; else None: none is due,
+        the store is unavailable, a training or its preparation is under way, or it was begun in the
+        executor.
         """
         is_due = self._is_due_after_news(retrain_every)
         if self.live.pinned:
@@ -273,8 +278,9 @@ class Learner:
     def end_training(self) -> None:
         """End what is under way without waiting for a training, before a change that it lacks.
 
-        A version that is trained answers, or is dropped. A training that is not done is discarded,
-        and another begins as soon as it can, after the change.
+        A version that is trained answers, or is dropped; for that it waits for the store. A
+        training that is not done is discarded, and another begins as soon as it can, after the
+        change.
         """
         self.advance(to_the_end=True)
         self._discard_training()
@@ -288,8 +294,11 @@ class Learner:
     def advance(self, to_the_end: bool = False, wait: float = 0.0) -> None:
         """Take a training's outcome from the executor, or bring its version a step further.
 
-        With `to_the_end`, and always where cells share a product, it does all steps of a training
-        that is done, and blocks for the store. `wait` is how many seconds to wait for a training
+        Taking the outcome is a step. With `to_the_end` it does all steps of a training that is
+        done, and blocks for the store. So it does always in a cell that shares labels and versions
+        with peers, the other cells of a product; there it first takes in what these have stored,
+        and a correction or a rollback among that discards the training. A version that cannot be
+        stored is dropped, and nothing is raised. `wait` is how many seconds to wait for a training
         that is not done; then it is given up, as is one that hangs. Nothing happens while one is
         not done, or where there is none.
         """
@@ -310,8 +319,10 @@ class Learner:
         self._advance(candidate, to_the_end)
 
     def _make_candidate(self, trained: Trained) -> Candidate:
-        """Make the outcome of a training the candidate, which takes over the answering model's
-        rule.
+        """Make the outcome of a training the candidate, the version on its way to answer.
+
+        It will take over the answering model's rule. Its reason says what the training started
+        from, where that was not the answering model.
         """
         note = self._start[2] if self._start is not None else ""
         if note:
@@ -321,10 +332,11 @@ class Learner:
         return self._candidate
 
     def _choose_start(self) -> EngineModel:
-        """Return the model that the next training starts from, as `find_clean_start` does.
+        """Return the model that the next training starts from: one that saw no forgotten label.
 
-        It is searched for once for an answering version and the corrections that it has. Where the
-        store fails meanwhile, that is logged, and the training starts from initial weights.
+        That is the present model, unless a correction has come; then `find_clean_start` searches
+        the store, once for an answering version and the corrections that it has. Where the store
+        fails meanwhile, that is logged, and the training starts from initial weights.
         """
         live = self.live
         if not live.corrected_to:  # nothing was ever forgotten, so the store need not be read
@@ -345,7 +357,8 @@ class Learner:
     def wait_until_precomputed(self) -> None:
         """Wait until what the next retrain needs of the stored labels' traces is computed.
 
-        This began when the store was opened. Without stored labels nothing is waited for.
+        `precompute` began it. Where nothing was begun, or it was waited for before, this returns at
+        once. There is no time limit.
         """
         if self._precomputed is not None:
             self._precomputed.result()
@@ -399,12 +412,12 @@ class Learner:
         self._swap(candidate)
 
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
-        """Make references of all labels that came, one with each step, and have them stored.
+        """Make all labels that came references of the candidate, one a step, and have them stored.
 
-        Confirmations are handed over, and overdue checks counted, before each look. Yields as
-        `_see_through` does. It ends when no label is missing or waits to be stored. In a cell that
-        never pauses some label always waits, so every `PATIENCE`-th time this call waits for the
-        store itself; a StoreError there is ignored.
+        Labels of parts that the next decision confirmed are recorded, and overdue checks counted,
+        before each look. Yields as `_see_through` does. It ends when no label is missing or waits
+        to be stored. In a cell that never pauses some label always waits, so every `PATIENCE`-th
+        time this call waits for the store itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
             self._feedback.store_confirmations()
@@ -423,9 +436,9 @@ class Learner:
         """Complete the candidate's report, and submit report and model to the thread that stores
         them.
 
-        Returns a future of the version's number: the report's, or a higher one if a peer of the
-        product stored a version first. Without a model only the report is stored, and the number is
-        the report's. Raises StoreError where the store is unavailable.
+        Returns a future of the version's number: the report's, or a higher one if another cell of
+        the product stored a version first. Without a model only the report is stored, and the
+        number is the report's. Raises StoreError where the store is unavailable.
         """
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
@@ -440,11 +453,11 @@ class Learner:
         return state if self._peers is None else state | self._peers.labels.get_state()
 
     def _swap(self, candidate: Candidate) -> None:
-        """Let a stored candidate answer, with the present rule, and keep its report for
-        `take_report`.
+        """Let a stored candidate answer with the present rule; keep its report for `take_report`.
 
-        Without a model, when the training was dropped, the old version goes on answering; the
-        report is kept, and its reason added to `dropped`.
+        In a product, labels of this cell that still wait for those of other cells become its
+        references. Without a model, when the training was dropped, the old version goes on
+        answering; the report is kept, and its reason added to `dropped`.
         """
         self._candidate = None
         self._report = candidate.report
@@ -462,7 +475,8 @@ class Learner:
         """Drop a candidate that could not be stored, and keep a report that says so, in memory
         only.
 
-        In a cell that learns alone its labels count as new again, so that the next retrain is soon.
+        It is logged, and the previous version goes on answering. In a cell that learns alone the
+        labels count as new again, so that the next retrain is soon.
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
@@ -492,9 +506,9 @@ class Learner:
     def _is_due_after_news(self, retrain_every: int) -> bool:
         """Return whether a retrain is due by the number of new labels, and this cell's to do.
 
-        Where cells share a product, news is taken in first, if none was asked for lately: a peer's
-        version may answer afterwards. If a retrain is due then, all news is taken in, and it is
-        counted again.
+        Where cells share a product, news (what the other cells stored) is taken in first, unless
+        that was done within a second: a peer's version may answer afterwards. If a retrain is due
+        then, all news is taken in, and it is counted again.
         """
         if self._peers is not None and self._peers.is_news_due:
             self._take_in_news(self._peers)
@@ -504,7 +518,7 @@ class Learner:
         return self.labels.is_due(retrain_every)
 
     def _take_in_all_news(self) -> None:
-        """Take in the peers' news until there is no more, but at most `ROUNDS` times.
+        """Take in all news, what the product's other cells stored, but at most `ROUNDS` times.
 
         Where the store is unavailable it stops, `Peers.is_lost` is set, and nothing is raised.
         Without peers it does nothing.
@@ -517,10 +531,11 @@ class Learner:
                 return
 
     def _take_in_news(self, peers: Peers) -> int:
-        """Take in the peers' newest version, at most `MOST` labels, and corrections.
+        """Take in the newest version, at most `MOST` labels, and corrections of the product.
 
         Before, it waits until this cell's recorded labels are in the store. Returns the number of
-        labels; 0 also where the store is unavailable, which is noted in `peers` and not raised.
+        labels; 0 also where the store is unavailable, which is noted in `peers` and not raised. A
+        pinned version or a correction among the news discards a training under way in the executor.
         Corrections that cannot be read come with the next news.
         """
         version = None
@@ -552,11 +567,12 @@ class Learner:
     # What people put right
 
     def bring_up_to_date(self) -> None:
-        """Finish what is under way before a person's change: labels and news of peers.
+        """Finish what is under way before a person's change: a training, labels, news of peers.
 
-        A training is ended, as `end_training` does; of the news at most `ROUNDS` times `MOST`
-        labels are taken in. Raises StoreError where the store is unavailable, or where labels
-        of peers before one of this cell's are missing.
+        A trained version answers, and a training that is not done is discarded and begins again
+        later (`end_training`). News is what the product's other cells stored; at most `ROUNDS`
+        times `MOST` labels of it are taken in. Raises StoreError where the store is unavailable, or
+        where labels of peers before one of this cell's are missing.
         """
         self.end_training()
         self.store_labels()
@@ -572,8 +588,9 @@ class Learner:
 
         A model that cannot change a reference is retrained, or a pinned one fitted again, if
         `may_retrain`: only the cell that corrected does so. Where labels were forgotten, what the
-        next training starts from is prepared in a thread. Raises StoreError where the store is
-        unavailable.
+        next training starts from is prepared in a thread, and without an executor waited for. The
+        store is checked against its ledger, which may set the outbox's `integrity_error`. Raises
+        StoreError where the store is unavailable.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         # In a product, labels after the window's newest come as news.
@@ -595,7 +612,8 @@ class Learner:
     def _prepare_start(self) -> None:
         """Compute in advance for the next training, where it does not start from what answers.
 
-        Where that is in this thread, wait for it now, so that the retrain keeps its budget.
+        It is computed in a thread. Without an executor it is waited for now, so that the retrain
+        keeps its budget. Nothing is done without labels.
         """
         if self._choose_start() is self.live.newest or not len(self._window):
             return
@@ -606,10 +624,10 @@ class Learner:
             self.wait_until_precomputed()
 
     def release(self, author: str) -> Change:
-        """Let retrains replace a pinned version again, store that as a new version, and return the
-        event.
+        """Let retrains replace a version again that a rollback pinned, and return the stored event.
 
-        Raises StoreError where it cannot be stored: then nothing changes.
+        The same model goes on as a new version. Raises StoreError where it cannot be stored: then
+        nothing changes.
         """
         live = self.live
         text = f"version {live.version} is pinned no more: the next retrain may replace it"
@@ -623,9 +641,10 @@ class Learner:
         it with `event`.
 
         Until the version is stored nothing changes, so all that can fail comes before: reading it,
-        restoring it, and adding the later labels, up to the window's capacity, as its references.
-        Once it answers, news of peers is taken in, which become its references as well, and only
-        then new labels count from zero: none that it knows is new.
+        restoring it, and adding the later labels, up to the training window's capacity, as its
+        references. Once it answers, news of peers is taken in, which become its references as well,
+        and only then new labels count from zero: none that it knows is new. A training that was
+        asked for is not begun.
 
         Raises StoreError for a version that is not kept, where a trace is damaged that the model
         must be fitted on again, and where it cannot be stored.
@@ -647,8 +666,9 @@ class Learner:
         """Return the model of a stored version with the rule in force, and what it was trained on.
 
         A model that is stored by its traces is fitted on them again, a baseline with the labels as
-        they count now, since it cannot take a label back. Raises StoreError where one of these
-        traces has changed.
+        they count now, since it cannot take a label back. Nothing answers by it yet. Raises
+        StoreError where one of these traces has changed, or this dengine cannot restore the
+        version.
         """
         state = without_rule(version.state)
         trained_on = TrainedOn.from_state(version.state)
@@ -669,10 +689,10 @@ class Learner:
         """Go on under another policy, as a new version of the same model, and store it with
         `event`.
 
-        With `policy` the rule starts anew and counts the decisions of `evidence`. With None only
-        settings outside the model have changed, and its rule goes on. Before the first retrain only
-        the event is stored. Raises SettingError for a rule that cannot be made, and StoreError
-        where the event cannot be stored: then nothing changes.
+        With `policy` the decision rule starts anew and counts the decisions that `evidence` names.
+        With None only settings outside the model have changed, and its rule goes on. Before the
+        first retrain only the event is stored. Raises SettingError for a rule that cannot be made,
+        and StoreError where the event cannot be stored: then nothing changes.
         """
         live = self.live
         template = live.template

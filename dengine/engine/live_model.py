@@ -108,8 +108,9 @@ class LiveModel:
 
         A model that is stored by its traces is trained on them again; any other is restored bit for
         bit, with its reference points. Without a version, or where one of those traces is damaged
-        or missing, the template stays, and its rule is updated with the stored outcomes since it
-        began.
+        or missing, the untrained template stays, and its rule is updated with the stored outcomes
+        since it began. The outcomes that update the rule are checked against the store's ledger,
+        which may set the outbox's `integrity_error`.
 
         Parameters
         ----------
@@ -171,10 +172,12 @@ class LiveModel:
     ) -> Point | None:
         """Update the rule with an outcome, and make the trace a reference of the answering model.
 
-        `number` is that of the label. `n_unreported` is the number of accepted parts without an
-        outcome since the previous update; with None, or for a decision before the present rule
-        began, the rule is not updated. Returns the reference point, float32 of shape (d,), to be
-        stored with the label; None where there is none: no model yet, a failure, or a baseline.
+        An exception of the rule or the model is logged; after one of the rule every part is
+        verified. `number` is that of the label. `n_unreported` is the number of accepted parts
+        without an outcome since the previous update; with None, or for a decision before the
+        present rule began, the rule is not updated. Returns the reference point, float32 of shape
+        (d,), to be stored with the label; None where there is none: no model yet, a failure, or a
+        baseline (a model that the user handed in).
         """
         decision = stored.decision
         if n_unreported is not None and decision.model_version >= self.evidence.since:
@@ -209,7 +212,8 @@ class LiveModel:
         """Remove the reference of a part that was confirmed wrongly, before the store has its
         label, which has this number.
 
-        The rule keeps the outcome: it must be rebuilt.
+        Nothing happens without a trained model. The rule keeps the outcome, so the caller must have
+        it rebuilt.
         """
         if self.answering is not None:
             self.answering.change_reference(number, stored.content_hash, None)
@@ -217,8 +221,8 @@ class LiveModel:
     def count_overdue(self, decision: Decision) -> None:
         """Update the rule as if a decision was wrong, because its check was not reported in time.
 
-        The decision's id is kept in `overdue`. A decision with the bound (0, 1), which says
-        nothing, or from before the present rule began, changes nothing.
+        The decision's id is kept in `overdue`. A failed update is logged. A decision with the bound
+        (0, 1), which says nothing, or from before the present rule began, changes nothing.
         """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
@@ -243,10 +247,13 @@ class LiveModel:
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with all stored outcomes of decisions since it began.
 
-        It is the rule of the answering model, or of the template before the first retrain. Overdue
-        checks are among the outcomes. Labels that are not in the store yet are not, so the rule
-        forgets them: store them before. The ledger is not checked here. Raises StoreError, and
-        changes nothing, where the store is unavailable.
+        It is the rule of the answering model, or of the untrained template before the first
+        retrain. It begins in the safe mode that `evidence` names, `began_in`. Checks that are
+        overdue (not reported in time) are among the outcomes, as wrong decisions. Labels that are
+        not in the store yet are not, so the rule forgets them: store them before. A stale rule,
+        which an update failed for, stays so, and a failure here makes it stale and is logged: every
+        part is then verified. The store's ledger (its hash chain) is not checked here. Raises
+        StoreError, and changes nothing, where the store is unavailable.
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
@@ -257,14 +264,20 @@ class LiveModel:
     def _rebuild_rule_of(
         self, model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]
     ) -> None:
-        """Reset a model's rule and update it with the outcomes that `read_outcomes` returns."""
+        """Reset a model's rule and update it with the outcomes that `read_outcomes` returns.
+
+        It starts in the safe mode of `evidence`. A failed update is logged, and the rule is stale
+        then. A rule that never learns is only reset.
+        """
         model.reset_rule(self.evidence.began_in)
         _update_rule(model, read_outcomes)
 
     def _read_outcomes(self, after: int = 0) -> list[OutcomeRecord]:
         """Return the stored outcomes of labels after this number, checked against the ledger.
 
-        A failed check sets the outbox's `integrity_error`.
+        The ledger is the store's hash chain. A failed check sets the outbox's `integrity_error`,
+        after which every part is verified; the outcomes are returned all the same. Overdue checks
+        are among them.
         """
         self.outbox.check_integrity(after)
         return self.outbox.store.labels.outcomes_since(after, self.evidence.since, self.overdue_to)
@@ -272,10 +285,11 @@ class LiveModel:
     def apply_corrections(self) -> bool:
         """Apply the store's newest corrections to the references of the answering model.
 
-        Returns False where the model must be trained again: always for a baseline, and where it
-        cannot change a reference. The caller must retrain then, because each correction is read
-        only once. Returns True before the first retrain. The rule is left to `rebuild_rule`. Raises
-        StoreError where the store is unavailable.
+        Returns False where the model must be trained again: always for a baseline (a model that the
+        user handed in), and where it cannot change a reference. The caller must retrain then,
+        because each correction is read only once. Returns True before the first retrain;
+        `corrected_to` is set in any case. The rule is left to `rebuild_rule`. Raises StoreError
+        where the store is unavailable.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
@@ -288,10 +302,11 @@ class LiveModel:
     def with_policy(
         self, policy: Policy, evidence: EvidenceWindow
     ) -> tuple[EngineModel, EngineModel | None]:
-        """Return copies of template and answering model under another policy, with a new rule.
+        """Return copies of the untrained and the answering model with another policy's new rule.
 
         The second is None before the first retrain; it shares the references of the answering
-        model. Neither is in force yet. Raises SettingError for a rule that cannot be made.
+        model. That it cannot be made ready is logged. Neither is in force yet. Raises SettingError
+        for a rule that cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
@@ -302,8 +317,9 @@ class LiveModel:
         return template, model
 
     def change_evidence(self, template: EngineModel, evidence: EvidenceWindow) -> None:
-        """Go on with another template, and with other decisions that a rebuilt rule is updated
-        with.
+        """Go on with another template, and other decisions that a rebuilt rule is updated with.
+
+        The template is the untrained model, from which the first version is trained.
         """
         self.template = template
         self.evidence = evidence
@@ -312,6 +328,8 @@ class LiveModel:
         """Return the arrays by name with which the store can restore a model as a version.
 
         They hold the model, what it was trained on, and which corrections and overdue checks count.
+        If an overdue check (not reported in time) counts, an engine that opens the store rebuilds
+        the rule.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)
@@ -326,7 +344,8 @@ class LiveModel:
 def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]) -> None:
     """Update a model's rule with outcomes in the order of their labels.
 
-    For a rule that never learns, `read_outcomes` is not called.
+    An update that fails is logged, and the rule is stale then: every part is verified. For a rule
+    that never learns, `read_outcomes` is not called.
     """
     if not model.rule_learns:
         return

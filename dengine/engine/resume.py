@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 def restore_model(
     outbox: Outbox, template: EngineModel, state: Mapping[str, NDArray[Any]]
 ) -> EngineModel | None:
-    """Return a new model, made from the template, in the state of a stored version.
+    """Return a new model, made from the untrained template, in the state of a stored version.
 
     A model that is stored by its traces is trained on them again. Returns None where one of these
-    traces is damaged or missing. The two models share one rule, so the template has the stored
+    traces is damaged or missing. The two models share one rule, so the template gets the stored
     rule, too. Raises StoreError for a state that this dengine cannot restore, for a damaged label,
     and where the store cannot be read.
     """
@@ -43,10 +43,10 @@ def restore_model(
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
-    Labels are first checked against the ledger, which may set the outbox's `integrity_error`; the
-    model is trained nevertheless. Returns False, with the model untrained, where a trace is damaged
-    or missing. A label that was forgotten by then is left out, and is not missing. Raises
-    StoreError for a damaged label, or if the store does not answer.
+    Labels are first checked against the ledger, the store's hash chain, which may set the outbox's
+    `integrity_error`; the model is trained nevertheless. Returns False, with the model untrained,
+    where a trace is damaged or missing. A label that was forgotten by then is left out, and is not
+    missing. Raises StoreError for a damaged label, or if the store does not answer.
     """
     store = outbox.store
     first = int(trained_on.seq[0])
@@ -75,9 +75,10 @@ def find_clean_start(
     """Return a model to train on from that never saw a label which is forgotten now, and a note.
 
     That is `newest`, whose weights learned from `trained_on`, unless it saw one. Then it is the
-    newest version that is stored and did not, without its rule, and else `template`, with initial
-    weights; the note says so. A model that begins anew with each training stays. Raises StoreError
-    where the store cannot be read.
+    newest version that is stored and did not, without its rule, and else `template`, the untrained
+    model, with initial weights; the note says so. A model that begins anew with each training
+    stays. Versions that are damaged or not kept are passed over. Raises StoreError where the store
+    cannot be read.
     """
     corrections = {correction.seq: correction for correction in store.corrections.after()}
 
@@ -108,7 +109,10 @@ def find_clean_start(
 
 
 def newest_reference(version: ModelVersion) -> int:
-    """Return the sequence number of the newest label among the references of a stored version."""
+    """Return the sequence number of the newest label among the references of a stored version.
+
+    Of a model whose references are not stored it is the newest label that it was trained on.
+    """
     # Stored references include the labels that came during the retrain. A baseline has no stored
     # references: it was trained again, without those labels.
     if "points" in version.state:
@@ -123,9 +127,10 @@ def add_labels_since(
 
     They are at most as many as `window` holds, and end with the window's newest label. Corrections
     that came meanwhile are applied between the labels, where they came, so that the model is the
-    same bit for bit. A baseline, which cannot be corrected, gets the labels as they count now. A
-    label that the model cannot take is logged and skipped. Returns the number of the newest
-    correction in the store. Raises StoreError where the store cannot be read.
+    same bit for bit. A baseline (a model that the user handed in), which cannot be corrected, gets
+    the labels as they count now. A label that the model cannot take is logged and skipped. Returns
+    the number of the newest correction in the store. Raises StoreError where the store cannot be
+    read.
     """
     corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
@@ -161,9 +166,10 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     """Change the reference of a corrected label: relabel it, remove it or add it again.
 
     Returns False, and changes nothing, where the model has references and cannot change that one:
-    it must be trained again. Otherwise True, also where nothing is changed: for a reference that
-    is not there, for a quarantined part, for a damaged trace that would have to be added again, and
-    for a baseline, which has no references. Raises StoreError where the store cannot be read.
+    it must be trained again. Otherwise True, also where nothing is changed: for a reference that is
+    not there, for a quarantined part, whose trace has a fault, for a damaged trace that would have
+    to be added again, and for a baseline, a model of the user's without references. One that the
+    model cannot take is logged. Raises StoreError where the store cannot be read.
     """
     if not model.keeps_references:
         return True

@@ -160,7 +160,7 @@ class EngineSettings:
             For an unused store, a damaged number, and a recipe that lacks settings.
         SettingError
             For a text that is no recipe; where an object is missing or another than the engine was
-            made with, or a model is not needed.
+            made with, or a `model` is passed to an engine that has its own.
         ImportRefusedError
             Where the recipe names a class that may not be imported.
         """
@@ -196,8 +196,9 @@ class EngineSettings:
         in.
 
         The settings are a copy that describes the object that was handed in, and whose recipe has
-        that model's own numbers in place of those without effect. Raises SettingError for an object
-        that lacks a method of `Model`.
+        that model's own numbers in place of those without effect. The recipe's reducer is made, and
+        a class of the user's imported for it. Raises SettingError where that fails, and for an
+        object that lacks a method of `Model`.
         """
         if model is None:
             reducer = self.recipe.reducer
@@ -219,10 +220,11 @@ class EngineSettings:
 
         `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. All
         settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
-        the program leaves out, because an operator sets both. Nor is a reducer that is an object,
-        with its parameters, nor a trace contract where none is set, nor what a trace contract
-        leaves unknown. Beside a baseline only `LOOP_SETTINGS`, which have an effect on any model,
-        are compared. An unknown name is an error, too.
+        the program leaves out, because an operator sets both while the cell runs. Nor is a reducer
+        that is an object, with its parameters, nor a trace contract where none is set, nor what a
+        trace contract leaves unknown. Beside a baseline, a model that was handed in, only
+        `LOOP_SETTINGS`, which have an effect on any model, are compared. An unknown name is an
+        error, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -269,8 +271,8 @@ def _with_objects(
 
     `texts` are the store's settings, `name` is the store's, for errors. An object equal to the
     reducer that the recipe names is accepted and not used, as is any reducer beside a model. Raises
-    SettingError where an object is missing, a model is not needed, or an object is another than the
-    store was made with.
+    SettingError where an object is missing, a `model` is passed to an engine that has its own, or
+    an object is another than the store was made with.
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -320,7 +322,7 @@ def choose_recipe(reducer: Any, recipe: Any, given: Settings) -> Recipe:
 
     `recipe` is a Recipe, a name or a TOML file; without one it is the default recipe of `reducer`,
     or of conv. A setting of None keeps the recipe's own. Raises SettingError where `recipe` names
-    another reducer than `reducer`, and for a setting out of range.
+    another reducer than `reducer`, for what is no recipe, and for a setting out of range.
     """
     source = recipe
     if source is None:
@@ -339,7 +341,8 @@ def named_classes(
 ) -> list[str]:
     """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them.
 
-    A name may stand in reducer, recipe or policy; other settings are ignored.
+    A name may stand in reducer, recipe (whose file is read) or policy; other settings are ignored.
+    Nothing is imported. Raises SettingError for what is no recipe.
     """
     recipes = [Recipe.load(source) for source in (reducer, recipe) if source is not None]
     recipes.append(Recipe(policy=policy or Policy()))
@@ -364,8 +367,9 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
 
 
 def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
-    """Return the trace contract of a product's other cells; None where there is none, or no
-    product.
+    """Return the trace contract of a product's other cells; None if there is none, or no product.
+
+    It is that of the first cell that has one. Raises StoreError where it is damaged.
     """
     specs = map(stored_trace_spec, store.settings.of_peers().values())
     return next(filter(None, specs), None)
@@ -374,7 +378,9 @@ def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
 def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec | None:
     """Return the trace contract of a store, completed by a stated one.
 
-    It is the store's own, else the peers', else the stated one.
+    It is the store's own, else that of the product's other cells, else the stated one. A stated one
+    adds rate, units and columns, and only to a contract of its shape. Raises StoreError where one
+    is damaged.
     """
     agreed = stored_trace_spec(store.settings.read()) or read_peers_trace_spec(store)
     return stated if agreed is None else agreed.completed(stated)
@@ -427,7 +433,10 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
 
 
 def flat_settings(recipe: Recipe) -> dict[str, Any]:
-    """Return every setting of a recipe by its name, those of its policy among them."""
+    """Return every setting of a recipe by its name, those of its policy among them.
+
+    The reducer's class is imported if it gives one of them, as `default_radius`.
+    """
     settings = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     del settings["policy"]
     return settings | recipe.policy.to_values()
@@ -458,8 +467,9 @@ class SettingsInForce:
         self._outbox = outbox
 
     def change(self, settings: EngineSettings) -> None:
-        """Use other settings from now on, and compute what follows from them; the store is not
-        changed.
+        """Use other settings from now on, without saving them.
+
+        `audited_share` and `conditions` are computed from them.
         """
         policy = settings.recipe.policy
         self.now = settings
@@ -473,7 +483,8 @@ class SettingsInForce:
     def save(self) -> None:
         """Write the settings to the store, within its time limit.
 
-        Where that fails, the error is logged and `is_unsaved` is set; nothing is raised.
+        Where that fails, the error is logged and `is_unsaved` is set, which a later success clears;
+        nothing is raised.
         """
         texts = self.now.to_store()
         try:

@@ -61,7 +61,10 @@ class EngineState:
         return self._outbox.lag
 
     def complete(self, status: Status) -> Status:
-        """Return a copy of a status read from the store, with what only the engine knows put in."""
+        """Return a copy of a status read from the store, with what only the engine knows put in.
+
+        That is version, safe mode, new labels, the store's fault and lag, and whether it retrains.
+        """
         return replace(
             status,
             version=self._live.version,

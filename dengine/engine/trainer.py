@@ -104,8 +104,7 @@ class TrainingWindow:
         self._end = n
 
     def refill(self, labelled: LabelledTraces) -> None:
-        """Replace the whole window by the newest of these labelled traces, which are ordered by
-        number.
+        """Replace the whole window by the newest of these labelled traces, ordered by number.
 
         Their arrays become the window's block and are not copied.
         """
@@ -116,7 +115,7 @@ class TrainingWindow:
     def snapshot(self) -> LabelledTraces:
         """Return the labelled traces, oldest first.
 
-        The arrays never change, and are not to be written to.
+        The arrays are views that never change, and are not to be written to.
         """
         return LabelledTraces(*[column[self._first : self._end] for column in self._block])
 
@@ -127,7 +126,10 @@ class TrainingWindow:
         return newer
 
     def row(self, seq: int) -> tuple[TraceArray, int, int]:
-        """Return the trace (channels, samples), the label and the hash of a label of the window."""
+        """Return trace (channels, samples), label and hash of the label of this number.
+
+        That it is in the window is not checked.
+        """
         i = int(np.searchsorted(self._block[0][: self._end], seq))
         return self._block[1][i], int(self._block[2][i]), int(self._block[3][i])
 
@@ -199,7 +201,11 @@ class Limits:
     reserve: float = 0.0
 
     def deadline(self, begin: float) -> float | None:
-        """Return when no step may begin any more, for a training that begins at `begin`."""
+        """Return after when a training begins no step, if it began at `begin`; None without budget.
+
+        That is after 70 % of the budget, or when `reserve` seconds of it are left if that is
+        earlier, but not before 30 %.
+        """
         if self.budget is None:
             return None
         seconds = min(STEPS * self.budget, self.budget - self.reserve)
@@ -305,11 +311,12 @@ class Retrainer:
         return replace(trained, begin=begin)
 
     def start(self, current: EngineModel) -> bool:
-        """Begin to train a successor of the current model in the executor, on the window as it is
-        now.
+        """Begin to train a successor of the current model in the executor, on the labels as of now.
 
         `collect` returns the outcome; no other training may be under way. Returns False, and begins
-        nothing, without an executor that takes work.
+        nothing, without an executor that takes work, and while it still works on a training that
+        was discarded. An executor that refuses work is started again or given up, and that is
+        logged.
         """
         executor = self.executor
         if executor is None or self._left is not None:
@@ -328,7 +335,11 @@ class Retrainer:
         return self.future is not None
 
     def discard(self) -> bool:
-        """Give up the training under way, without waiting; return whether there was one."""
+        """Give up the training under way, without waiting; return whether there was one.
+
+        Its outcome is lost. If the executor has begun with it, it goes on working and takes no
+        other training until it is done (`is_occupied`).
+        """
         future = self.future
         self.future = None
         if future is not None and not future.cancel():
@@ -344,7 +355,8 @@ class Retrainer:
     def is_occupied(self) -> bool:
         """Whether the executor still works on a training that was discarded.
 
-        One that hangs is given up, and does not count any more.
+        One that hangs, by `HUNG`, is given up and does not count any more; the executor is then
+        started again, or not used until it is done.
         """
         left = self._left
         if left is None or left.done():
@@ -358,7 +370,8 @@ class Retrainer:
     def _count_seconds_left(self) -> float:
         """Return how many seconds the executor's training has left, before it counts as hung.
 
-        They count from when the executor could begin; a process may import for a long time.
+        It has `HUNG` of them from when the executor could begin: while a process still imports, the
+        count starts anew.
         """
         now = time.monotonic()
         executor = self.executor
@@ -371,7 +384,8 @@ class Retrainer:
 
         Returns None where there is none or it is not done. With `wait` above 0 it blocks for at
         most so many seconds; a training that is not done then is given up, and so is one that
-        hangs, or whose executor died: the outcome has no model and says why.
+        hangs, or whose executor died: the outcome has no model and says why. An executor that died
+        or hangs is started again if it can be, or not used.
         """
         future = self.future
         left = self._count_seconds_left()
@@ -388,7 +402,9 @@ class Retrainer:
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
-        An executor that died, or in which a training hangs, is replaced.
+        A training that is not done, of an executor that lives, is discarded: the executor is
+        occupied by it until it is done. An executor that died, or in which a training hangs, is
+        started again if it can be, or not used.
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken
@@ -407,7 +423,9 @@ class Retrainer:
     def _replace_executor(self) -> None:
         """Start the executor again, or where that cannot be done do without it.
 
-        An executor that cannot be started again is used again once it is done with what it does.
+        A `RestartableExecutor` is restarted; where that fails, it is logged. Any other is set to
+        None, which is logged, but if it still works on a discarded training it is kept, and used
+        again once it is done.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):

@@ -72,7 +72,8 @@ class Envelope:
 def envelope_of(successes: TraceArray, trace: TraceArray) -> Envelope | None:
     """Compute the envelope of successes, and where a trace leaves it.
 
-    At each sample the envelope contains the middle 95 % of the successes.
+    At each sample the envelope contains the middle 95 % of the successes. A distance from it is
+    measured in its width there, or in a twentieth of the channel's median width if that is more.
 
     Parameters
     ----------

@@ -139,7 +139,7 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     """Return the id of the decision on a part.
 
     If a part was decided on again after rejects, the rejects do not count, unless all are rejects.
-    Only the newest 20 decisions on the part are looked at.
+    Only the newest 20 decisions on the part are looked at. Only this cell's count.
 
     Parameters
     ----------
@@ -179,8 +179,8 @@ def find_decision_id(store: SqlStore, part: str) -> str:
 def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
     """Explain one decision from what its store keeps; nothing is trained or embedded.
 
-    If a label or a trace of a success is damaged, it is left out, and an event is written to the
-    store.
+    The policy is the one that was in force at the decision. If a label or a trace of a success is
+    damaged, it is left out, and an event is written to the store; else the store does not change.
 
     Parameters
     ----------
@@ -251,7 +251,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
 def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     """Return why safe mode had begun when a decision was made in it; "" for any other decision.
 
-    It is the text of the last such event before the decision, "" if there is none.
+    Safe mode is when every part is verified, after an alarm. The result is the text of the last
+    event by which one began before the decision, "" if there is none.
     """
     if item.decision.reason is not Reason.SAFE_MODE:
         return ""
@@ -286,8 +287,8 @@ def _find_neighbours(
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    Nothing without a neighbourhood or version. What is not known of a reference is None. Raise
-    StoreError for a damaged trace.
+    Yields nothing without a neighbourhood or version. A neighbour may lie outside of the radius.
+    What is not known of a reference is None. Raise StoreError for a damaged trace.
     """
     if neighbourhood is None or version is None:
         return
@@ -316,9 +317,10 @@ def _find_envelope(
 ) -> Envelope | None:
     """Return the envelope of the successes among the newest labels that the version could know.
 
-    Labels are as corrected by now. Traces of the decision's own part or content are left out.
-    Without a version, or if these successes are too few, the newest labels known now are taken;
-    None if these are too few, too, or of another shape.
+    Labels are as corrected by now. Traces of the decision's own part or content are left out. At
+    most `MAX_ENVELOPE_LABELS` are read. Without a version, or if these successes are too few, the
+    newest labels known now are taken; None if these are too few, too, or of another shape. For a
+    damaged trace, which is left out, an event is written to the store.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labels.with_traces(MAX_ENVELOPE_LABELS, last=last)
@@ -337,7 +339,8 @@ def _note_sentences(
 ) -> Iterator[str]:
     """Yield sentences on what was computed again, and where it differs from what was recorded.
 
-    If no neighbours are shown, a sentence says why.
+    If no neighbours are shown, a sentence says why. Counts are compared, and bounds by the present
+    policy if they follow from counts.
     """
     decision = item.decision
     policy = circumstances.recipe.policy

@@ -100,7 +100,7 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
 
 
 def _newest_marks(items: list[StoredDecision], version: int) -> Iterator[Mark]:
-    """Yield the marks of decisions, in their order, each at its mean over the spaces.
+    """Yield the marks of decisions, in their order, each at the mean of its K embeddings.
 
     Decisions of another version, and those without an embedding, are left out.
     """
@@ -116,8 +116,8 @@ def _known_marks(
 ) -> list[Mark]:
     """Return the marks of the newest N_KNOWN references of a version, oldest first.
 
-    References whose label is unknown are left out; [] if the version's references are not kept.
-    `parts` has the parts' numbers by decision id.
+    References whose label is unknown, as those of other cells, are left out; [] if the version's
+    references are not kept. `parts` has the parts' numbers by decision id.
     """
     past = load_past_version(store, version, recipe, None)
     if past is None:

@@ -65,7 +65,8 @@ def load_past_version(
     """Load a model version from the store as it was when a decision was made.
 
     Its references and its rule include this cell's labels that had come by then, as they were
-    reported: later corrections are not applied.
+    reported: later corrections are not applied. At most `MAX_LABELS` after the version are read. A
+    damaged label is left out, and an event is written to the store.
 
     Parameters
     ----------
@@ -81,7 +82,7 @@ def load_past_version(
     -------
     PastVersion or None
         None if there is no such version, or its references are damaged or not kept, as of a
-        baseline.
+        baseline, a model that the user handed in.
     """
     try:
         stored = store.versions.load(version)
@@ -126,7 +127,8 @@ def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
     """Return the index of a stored version's references, with the labels `added` later.
 
-    A label without a point is left out; any other replaces the oldest reference of a full index.
+    A label without a point (the embedding of its trace) is left out; any other replaces the oldest
+    reference of a full index. Its fold follows from its hash.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
@@ -141,9 +143,9 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 
 
 def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
-    """Compute the novelty scores of a decision that was novel, with its version's gate.
+    """Compute how novel the trace of a decision was, by its version's gate.
 
-    None for any other decision, and if the gate cannot be restored.
+    None for a decision with another reason than `Reason.NOVEL`, and if the gate cannot be restored.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -161,8 +163,8 @@ def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     """Return the decision rule of a policy with the state that a version stored.
 
     None if the state lacks what the rule has learned, has another rule than the policy's, or was
-    stored while stale, and if the rule is a class of the user's that is not imported. A rule that
-    learns nothing needs no state.
+    stored while stale (it had missed an update), and if the rule is a class of the user's whose
+    module is not imported yet: nothing is imported here. A rule that learns nothing needs no state.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -181,9 +183,9 @@ def _restore_thresholds(
     """Return the thresholds of a version's rule after it was updated with later labels.
 
     They are (accept, reject): a part was accepted where lower >= the first, rejected where 1 -
-    upper >= the second. Labels of quarantined traces and of inspected rejects do not update the
-    rule. The rule "local" with stops="some" learns nothing: both are the policy's lower bound.
-    Otherwise None if the state is not kept, or the rule has no such thresholds.
+    upper >= the second. Labels of quarantined traces (with a fault) and of inspected rejects do not
+    update the rule. The rule "local" with stops="some" learns nothing: both are the policy's lower
+    bound. Otherwise None if the state is not kept, or the rule has no such thresholds.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -201,7 +203,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
 
     Where the stored rule cannot be continued (`RuleProgress.last_seq` is 0, for example after a
-    correction or by an overdue check), it is rebuilt from all outcomes. The store does not change.
+    correction or by an overdue check), it is rebuilt from all outcomes. A safe mode that has begun
+    since then is on in the result. The store does not change.
 
     Parameters
     ----------
@@ -212,7 +215,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     -------
     DecisionRule or None
         None before the first version, and if its rule cannot be restored from what is stored: its
-        state is not kept (a peer's never is) or is stale, or its class is not imported.
+        state is not kept (that of another cell of the product never is) or is stale (it had missed
+        an update), or its class is not imported.
     """
     stored = store.versions.newest()
     settings = store.settings.read()
@@ -231,7 +235,12 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
 
 
 def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
-    """Update a rule, in place, with one part's outcome and the unreported accepts before it."""
+    """Update a rule, in place, with one part's outcome and what came without one before it.
+
+    First `observe` gets the number of accepted parts that went on without a report since the last
+    label (`outcome.silent`), and whether the part was novel; then `update` gets the bounds, the
+    label and the probability that it was asked for. A safe mode may begin or end.
+    """
     rule.observe(outcome.silent, outcome.novel)
     rule.update(
         outcome.lower,

@@ -100,7 +100,7 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """Return a decision's bounds with their thresholds and what more evidence it would have needed.
 
     Returns None if no bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and
-    SAFE_MODE, and for a decision that was lost.
+    SAFE_MODE, and for a decision that was lost, and recorded again from its line stop.
     """
     if decision.reason not in BOUNDED or _was_lost(decision):
         return None
@@ -131,8 +131,10 @@ def _was_lost(decision: Decision) -> bool:
 def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
     """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
 
-    A part was accepted where lower >= the first, rejected where upper <= the second. A threshold is
-    None if it is unknown, or if nothing could pass on that side.
+    A part was accepted where lower >= the first, rejected where upper <= the second. Under the
+    guarantee "local", outside of a safe mode, they are LB and 1 - LB; else those of the version's
+    rule at that time. A threshold is None if it is unknown, as of a handed-in model and a rule of
+    the user's, or if nothing could be accepted, or rejected.
     """
     policy = circumstances.recipe.policy
     if circumstances.baseline or policy.guarantee not in RULES:
@@ -150,10 +152,10 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
 
 
 def is_score(policy: Policy, decision: Decision) -> bool:
-    """Return whether a decision's `lower` and `upper` are one score of the heads, and no interval.
+    """Return whether a decision's `lower` and `upper` are one score, and no interval.
 
-    The heads are the reducer's classifiers; their score is a probability of success. It is so under
-    the guarantees "pooled" and "cost", where lower equals upper.
+    The score is the probability of success that the reducer's classifiers (its heads) give. It is
+    so under the guarantees "pooled" and "cost", where lower equals upper.
     """
     return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
 
@@ -185,7 +187,8 @@ def explain_in_words(
 ) -> Iterator[str]:
     """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
 
-    Without a bound the sentences on bounds are left out.
+    Without a bound the sentences on bounds are left out. The outcome is the label as corrected by
+    now.
     """
     decision = item.decision
     reason = (
@@ -206,7 +209,8 @@ def explain_in_words(
 def _explain_audit(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
     """Return the rest of the sentence on an audit: what the model alone would have done, the coin.
 
-    The coin is computed again from the trace and the engine's seed.
+    The coin, a number that decides which certain parts are audited, is computed again from the
+    trace and the engine's seed.
     """
     (coin,) = toss(content_hash(trace[None]), audit_salt(circumstances.seed)).tolist()
     alone = f" as an audit: the model alone would have {DID[decision.predicted]} it"
@@ -235,7 +239,10 @@ def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Cir
 
 
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the rest of the sentence on a trace outside an operator's limits: which it leaves."""
+    """Return the rest of the sentence on a trace outside an operator's limits: which it leaves.
+
+    They are tried again one by one, by the policy of that time.
+    """
     x = torch.from_numpy(trace)
     left = [
         str(limits)
@@ -296,9 +303,9 @@ def _bound_sentences(
     """Yield the sentences on a decision's evidence, its bounds, and what it would have needed.
 
     The last is said of the action that the model alone would have done; if that is to verify, of
-    the action that needed fewer labels. If nothing could pass, or the thresholds are unknown, it
-    says so instead. For a model that decides by its own method there is one sentence, with its
-    counts and bounds.
+    the action that needed fewer labels. If no bound was good enough to accept or reject, or the
+    thresholds are unknown, it says so instead. For a model that decides by its own method there is
+    one sentence, with its counts and bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = f"{decision.lower:.3f} to {decision.upper:.3f}"

@@ -274,7 +274,8 @@ class Status:
 
         In this order: the store, lost data, safe mode, bad accepts, good rejects, dropped retrains,
         traces that nearly repeat another, shadow mode's errors, novel traces, parts outside limits,
-        errors of the model. Of the decisions only the newest count.
+        errors of the model. Of the decisions only the newest count; novel traces, and parts outside
+        limits, if they are more than half of these.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -329,7 +330,8 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
     Parameters
     ----------
     dropped : sequence of str
-        Reasons of the retrains that were dropped since the last one that was accepted.
+        Reasons of the retrains that were dropped since the last one that was accepted, oldest
+        first.
     version : int
         Of the model that answers; 0 before the first.
 
@@ -419,7 +421,10 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
 
 
 def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
-    """Return the number of the version that was rolled back to and answers; 0: none is pinned."""
+    """Return the number of the version that was rolled back to and answers; 0: none is pinned.
+
+    `accepted` holds the reports of the accepted versions, oldest first.
+    """
     if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
         return 0
     version = store.versions.newest()
@@ -431,7 +436,11 @@ COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
 def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
-    """Return the counts over a tally's decisions, and the retrains since the first of these."""
+    """Return the counts over a tally's decisions, and the retrains since the first of these.
+
+    A `Tally` holds numbers of decisions by their properties. Estimates on what the model would have
+    accepted or rejected are at 95 %, whatever the policy's alpha.
+    """
     outcomes = tally.outcomes
     first = tally.first
     n = tally.count()
@@ -554,10 +563,11 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
 def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | None:
     """Return how close the detectors of drift are to an alarm, by the rule as it is now.
 
-    In safe mode the result also says in words how far its end is. The rule is the stored one,
-    updated with all outcomes since. None before the first version, and if the rule has no
-    detectors, as "local" with stops="some", or cannot be restored. In a safe mode that novel traces
-    began, the three values are 0. `mode` is the newest event at which a safe mode began or ended.
+    In safe mode, which an alarm begins, the result also says in words how far its end is. The rule
+    is the stored one, updated with all outcomes since. None before the first version, and if the
+    rule has no detectors, as "local" with stops="some", or cannot be restored. In a safe mode that
+    novel traces began, the three values are 0. `mode` is the newest event at which a safe mode
+    began or ended.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule
@@ -633,7 +643,7 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     Returns
     -------
     Course
-        With the newest 120 stretches at most.
+        With the newest 120 stretches at most; retrains and safe modes of all time.
     """
     modes = [event for event in store.events.newest() if event.kind in MODES]
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
@@ -736,7 +746,8 @@ def read_retrains_and_events(
 ) -> dict[str, list[StoredVersion | Event]]:
     """Return the retrains and the events of a cell between two times, each oldest first.
 
-    Dropped retrains are included, those of the product's other cells are not.
+    Dropped retrains are included, those of the product's other cells are not. Rollbacks and new
+    policies, which make versions, are among the retrains.
 
     Parameters
     ----------
