@@ -305,7 +305,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             return self._rows.popleft() if self._rows else None
 
     def clear(self) -> int:
-        """Discard the buffered packages; return the number of connections that were lost so far."""
+        """Discard the buffered packages; return the number of reconnections so far."""
         with self._news:
             self._rows.clear()
             return self._session
