@@ -217,7 +217,7 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
     """Assert that its `module()` compiles to TorchScript and embeds as `embed` does, within 1e-4.
 
     A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged. Passes if
-    the clone has no module, None.
+    the clone has no module, None. If it does not compile, TorchScript's own error is raised.
     """
     trained = _train_clone(reducer)
     module = trained.module()
@@ -302,8 +302,9 @@ def check_reducer(reducer: Any) -> None:
     Raises
     ------
     AssertionError
-        For the first clause that is broken; the message names it. An error of the reducer's own
-        passes unchanged.
+        For the first clause that is broken; the message names it. It is raised as well if
+        TorchScript compiles the reducer's module and cannot run it. Any other error passes
+        unchanged.
     """
     for check in REDUCER_CHECKS:
         try:
@@ -319,8 +320,8 @@ def check_reducer(reducer: Any) -> None:
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:
     """Return a clone of a reducer, trained `times` times in a row on the toy traces.
 
-    It is trained as in an engine, with folds by content, as many as it has spaces: 2 if it is
-    cross-fitted from outside. Each training takes at most 8 optimiser steps. `reducer` stays
+    It is trained as in an engine, with folds by the traces' content, as many as it has spaces: 2 if
+    it is cross-fitted from outside. Each training takes at most 8 optimiser steps. `reducer` stays
     unchanged. `labels` (100,) replace those of the toy traces; None keeps them.
     """
     X, y = toy_traces()

@@ -23,7 +23,10 @@ class Cell(Protocol):
     """
 
     def insert(self) -> NDArray[np.floating]:
-        """Pick a part and insert it; return the recorded trace, (T,) or (channels, T)."""
+        """Pick a part and insert it; return the recorded trace, (T,) or (channels, T).
+
+        An exception of any of the four methods ends the engine's run and reaches its caller.
+        """
 
     def verify(self) -> bool:
         """Run the expensive verification of the inserted part; return whether it is good."""

@@ -174,7 +174,10 @@ class CostCurve:
 
     @property
     def policy(self) -> Policy | None:
-        """The policy that pays or may pay; None if none does. Try it in shadow mode first."""
+        """The policy that pays or may pay; None if none does.
+
+        Try it in shadow mode first, in which every part is verified.
+        """
         return None if self.verdict == "does not pay" else self.marked.policy
 
     @property
@@ -295,7 +298,7 @@ class CostCurve:
 
 
 def policy_name(policy: Policy) -> str:
-    """Return how a policy is named among others: its LB, and alpha or the guarantee."""
+    """Return a policy's name for people: its lower bound LB, and alpha or the guarantee."""
     if policy.guarantee == "cost":
         return "the cost guarantee"
     kind = f"alpha {policy.alpha:g}" if policy.guarantee == "local" else policy.guarantee
@@ -303,9 +306,10 @@ def policy_name(policy: Policy) -> str:
 
 
 def settings_of(policy: Policy) -> dict[str, Any]:
-    """Return the settings that make a policy, without its interval and windows.
+    """Return the settings by which `Policy` makes this one, except its interval and windows.
 
-    What has its default is left out, and what prices imply.
+    They are alpha, lower_bound and guarantee, or under the guarantee "cost" the prices, which imply
+    these; and audit_rate and stops if they are not the defaults.
     """
     names = ["alpha", "lower_bound", "guarantee"]
     if policy.guarantee == "cost":
@@ -381,7 +385,11 @@ class PolicySearch:
         self._fresh: set[int] = set()  # seeds of the shuffles that choose nothing
 
     def _add(self, contender: Contender, changes: dict[str, Any], n_good: float) -> None:
-        """Add a candidate, or a note on why it is not tried; `n_good` good parts are played."""
+        """Add a candidate to `remaining`, or to `out_of_reach` a note on why it is not tried.
+
+        It is not tried if its settings are refused, or if it needs more good parts to accept one
+        (`needed_parts`) than the `n_good` that a shuffle plays.
+        """
         try:
             candidate = contender.with_policy(**changes)
         except SettingError as error:
@@ -401,7 +409,8 @@ class PolicySearch:
     def run(self, play: Callable[[Sequence[Task]], Sequence[Replay]]) -> None:
         """Halve the candidates in rounds, and let the last ones play fresh shuffles.
 
-        It shortens `remaining` and keeps the replays, of which `curve` makes the result.
+        While more than two remain, they play two shuffles, and the dearer half is left behind. It
+        shortens `remaining` and keeps the replays, of which `curve` makes the result. Call it once.
 
         Parameters
         ----------
@@ -426,9 +435,11 @@ class PolicySearch:
         seeds: range,
         scores: Contender | None,
     ) -> bool:
-        """Play the remaining candidates over some seeds, if given on the scores of one engine.
+        """Play the remaining candidates over some seeds, and keep their replays.
 
-        Returns whether all was played.
+        With `scores`, one engine that checks every part is replayed for each seed, and each
+        candidate's rule decides on its predictions (`replay_policy`); without, each candidate has a
+        replay of its own. Returns whether all was played.
         """
         players = [scores] if scores else self.remaining
         tasks = [Task(player, seed, self._cycles) for seed in seeds for player in players]
@@ -441,7 +452,10 @@ class PolicySearch:
         return len(replays) == len(tasks)
 
     def _screening_key(self, contender: Contender) -> tuple[bool, float]:
-        """Return what candidates are sorted by: whether all was verified, and the expected cost."""
+        """Return what candidates are sorted by: those that verified all come last, then the cost.
+
+        The cost is the expected one, see `PolicyCost`.
+        """
         row = self._row(contender.recipe.policy)
         return row.accepted + row.rejected == 0.0, row.expected_cost
 
@@ -450,10 +464,12 @@ class PolicySearch:
         return _policy_cost(policy, list(self._replays[policy].values()), self.costs)
 
     def curve(self) -> CostCurve | None:
-        """Return the cost curve of what was played.
+        """Return the cost curve of what was played; nothing is played here.
 
-        It is of the shuffles that every policy that is left has finished: those that report, or
-        if there are fewer than two, those that chose; None if there are fewer of these, too.
+        Only shuffles count that every policy in `remaining` has finished. They are the fresh ones,
+        by which no policy was left behind, or if fewer than two of these are finished, as after an
+        interruption, those by which policies were left behind (`fresh` is False then). None if
+        there are fewer than two of these as well.
         """
         played = {c.recipe.policy: self._replays[c.recipe.policy] for c in self.remaining}
         behind = [self._row(policy) for policy in self._replays if policy not in played]
@@ -471,10 +487,12 @@ def candidates(
 ) -> Iterator[dict[str, Any]]:
     """Yield the settings of a contender's policy that are to be tried, as keyword arguments.
 
-    First come all pairs of an alpha and an LB, for the contender's own rule or else for the
-    guarantee "local". Then come "pooled" at a few LBs, and "cost" once; both are left out for an
-    own rule and for a baseline, and get audits where they need them. Without `alphas` there is one,
-    `ALPHA`, and without `lower_bounds` there are levels around break-even, 1 - check / escape.
+    First come all pairs of an alpha and a lower bound LB (the success probability that accepted
+    parts must have), for the contender's own rule or else for the guarantee "local". Then come
+    "pooled" at a few LBs, and "cost" once; both are left out for an own rule and for a baseline,
+    and if line stops alone tell of accepted parts and no audits are set, they get 5 %. Without
+    `alphas` there is one, `ALPHA`, and without `lower_bounds` there are levels around the LB at
+    which accepting breaks even, where 1 - LB is check / escape.
     """
     policy = contender.recipe.policy
 
@@ -504,8 +522,9 @@ def candidates(
 def needed_parts(policy: Policy) -> int:
     """Return how many good parts a policy needs before it can accept one.
 
-    For "local" they are neighbours, z^2 LB / (1 - LB) of them with Wilson's interval; for "pooled"
-    members whose capital reaches 1 / alpha. It is 0 for others.
+    For "local" they are labels near a trace, z^2 LB / (1 - LB) of them with Wilson's interval; for
+    "pooled" parts in a row that score high enough and are good, until the evidence for them
+    suffices at error level alpha. It is 0 for others.
     """
     if policy.guarantee == "local":
         counts = range(1, MOST_NEIGHBOURS)
@@ -531,6 +550,9 @@ def cost_curve(
 ) -> CostCurve:
     """Find the policy that pays by three prices, and what a part costs under it.
 
+    The candidate policies are replayed on shuffles of the recordings, in several rounds that each
+    leave some behind.
+
     Parameters
     ----------
     dataset : object
@@ -539,8 +561,10 @@ def cost_curve(
         What a check, a bad part that is accepted and a good part that is rejected cost, in one
         unit.
     recipe : object, default "conv"
-        Anything `Contender.load` takes. Guarantee, alpha, lower_bound and prices of its policy are
-        replaced; where "pooled" and "cost" need audits and it has none, they get 5 %.
+        Anything `Contender.load` takes. Guarantee (the rule by which a policy decides), alpha,
+        lower_bound and prices of its policy are replaced. The guarantees "pooled" and "cost" must
+        hear of accepted parts: if it has no audits (checks of parts that the model is certain of),
+        and `stops` is "some", they get 5 %.
     n_jobs : int, default 1
         Replays at a time, as joblib counts them.
     keep : path or None, default None
@@ -554,11 +578,14 @@ def cost_curve(
     Returns
     -------
     curve : CostCurve
+        Its `policy` is None if no policy pays.
 
     Raises
     ------
     SettingError
-        As `PolicySearch`.
+        As `PolicySearch`; with `keep` also for a reducer that cannot be hashed.
+    DataError
+        A data set that cannot be read.
     """
     data = load_dataset(dataset)
     search = PolicySearch(data, recipe, Costs(check, escape, false_reject), **settings)
@@ -575,7 +602,10 @@ def curve_of(
     out_of_reach: tuple[str, ...] = (),
     fresh: bool = True,
 ) -> CostCurve:
-    """Return the cost curve of each policy's replays of the same shuffles."""
+    """Return the cost curve of each policy's replays, all of the same shuffles.
+
+    The other parameters are the fields of `CostCurve` with these names.
+    """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
     changes = []
@@ -605,7 +635,8 @@ def curve_of(
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
     """Return the rows of a curve, the marked one and its verdict; see `CostCurve`.
 
-    A row can be marked as the safer one only if its expected cost is below the check's.
+    The marked one is the cheapest, or a safer one: a row that accepts fewer bad parts, is not
+    dearer than the cheapest beyond chance, and whose expected cost is below the check's.
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
@@ -670,7 +701,7 @@ def _expected_rate(error: ErrorRate) -> float:
 
 
 def _order_error(means: Floats) -> float:
-    """Return the standard error of a mean over shuffles, from the mean of each, (shuffles,)."""
+    """Return the standard error of a mean over shuffles, from the mean of each; 0 for one."""
     return float(means.std(ddof=1)) / math.sqrt(len(means)) if len(means) > 1 else 0.0
 
 

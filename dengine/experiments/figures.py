@@ -266,13 +266,14 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
 
 
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
-    """Draw the paper's curve, with a colour for each recipe, or of a live run.
+    """Draw the paper's curves, with a colour for each key: replays of a recipe, or a live run.
 
     From the top: the share of certain decisions, those without a check, and its spread over the
-    replays; the precision of the accepted ones, and LB; the errors, bad parts as a share of the
-    accepted ones (solid) and good parts as a share of the rejected ones (dashed), and the tolerance
-    100 - LB. The legend below has the counts. Shares of fewer than `FEWEST` parts are not drawn.
-    The window is `WINDOW` cycles, or a third of the longest replay.
+    replays; the precision of the accepted ones, and the policy's lower bound LB; the errors, bad
+    parts as a share of the accepted ones (solid) and good parts as a share of the rejected ones
+    (dashed), and the tolerance 100 - LB. The legend below has the counts. Shares of fewer than
+    `FEWEST` parts are not drawn. The window is `WINDOW` cycles, or a third of the longest replay if
+    that is less.
 
     Parameters
     ----------
@@ -400,9 +401,10 @@ def _times(spec: TraceSpec, samples: int) -> tuple[Floats, str]:
 def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
-    It has a panel for each channel, of at most four, those that leave the envelope farthest.
-    Stretches in which the trace clearly leaves the envelope are shaded. Without an envelope only
-    the traces are drawn.
+    It has a panel for each channel, of at most four, those that leave the envelope farthest. The
+    envelope is the band in which 95 % of the successes lie at each sample. Stretches in which the
+    trace leaves it by more than a tenth of its width are shaded. Without an envelope only the
+    traces are drawn.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -438,7 +440,7 @@ def explained_picture(explanation: Explanation) -> Figure:
 
 
 def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: int) -> None:
-    """Draw one channel of the traces of the nearest references."""
+    """Draw one channel of the traces of the nearest references, as far as these are stored."""
     for success, name, colour, line, _ in LABEL_STYLES:
         traces = [
             neighbour.trace[channel]

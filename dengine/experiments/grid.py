@@ -173,7 +173,7 @@ class KeptReplays:
 def _digest_of_source() -> str:
     """Return a hash of dengine's source and of the versions of Python and of the `LIBRARIES`.
 
-    It is computed once in a process.
+    It is computed once in a process. Libraries that are not installed are left out.
     """
     versions = {
         distribution.metadata["Name"]: distribution.version
@@ -278,6 +278,8 @@ def iterate_replays(
     SettingError
         A baseline's library is missing; raised before anything is played, but after the kept
         replays. With `keep` also for a reducer that cannot be hashed.
+    DataError
+        A data set that cannot be read.
     """
     from joblib import Parallel, delayed
 
@@ -354,6 +356,11 @@ def run_grid(
     frame : DataFrame
         A row for each replay, see `Replay.summary`.
 
+    Raises
+    ------
+    SettingError, DataError
+        As `grid_tasks` and `iterate_replays`.
+
     References
     ----------
     The paper's experiments: 30 shuffled repeats of a 3 x 3 grid.
@@ -417,7 +424,10 @@ def grid_tasks(
 def play_tasks(
     dataset: Any, tasks: Sequence[Task], *, n_jobs: int = 1, keep: FilePath | None = None
 ) -> list[Replay]:
-    """Play all tasks as `iterate_replays` does; return their replays in the order of the tasks."""
+    """Play all tasks as `iterate_replays` does; return their replays in the order of the tasks.
+
+    It raises what that raises.
+    """
     played = iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)
     replays = {position: replay for position, replay, _ in played}
     return [replays[i] for i in range(len(tasks))]

@@ -113,7 +113,10 @@ class Contender:
         return cls(Path(recipe).stem if is_named else loaded.name, loaded)
 
     def with_policy(self, **changes: Any) -> "Contender":
-        """Return a copy with another alpha, lower_bound, interval, guarantee or stops."""
+        """Return a copy with other settings of the policy, such as alpha, lower_bound or guarantee.
+
+        Raises SettingError for one that is out of range.
+        """
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
     def engine(self, seed: int, trace: TraceSpec | None = None) -> DataEngine:
@@ -403,8 +406,8 @@ def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Obse
     """Let the engine drive a cell, and yield each cycle as it ends.
 
     The truth is the cell's attribute `truth` if it has one, else the label that was reported, NaN
-    without any. The clock is its attribute `clock`, None without one. The cell may end before
-    `cycles`.
+    without any. The clock is its attribute `clock`, None without one. An exception of the cell goes
+    on to the caller, after the engine has written what it knows.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)
@@ -476,7 +479,8 @@ def watch(
     Returns
     -------
     run : Replay
-        Of fewer cycles if the cell ended before.
+        Of all `cycles`. An exception of the cell goes on to the caller, and then nothing is
+        returned: `on_cycle` was called with the cycles until there.
     """
     observed = []
     for item in observe_cycles(engine, cell, cycles):
@@ -531,6 +535,8 @@ def replay(
     SettingError
         A number of cycles that the data set does not have, alpha or lower_bound beside an engine,
         or a policy with windows in seconds for a data set of an unknown rate.
+    DataError
+        A data set that cannot be read.
     """
     changes = {"alpha": alpha, "lower_bound": lower_bound}
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -570,9 +576,10 @@ def replay(
 
 
 def replay_policy(scores: Replay, policy: Policy) -> Replay:
-    """Play a policy on the scores of a replay in shadow mode, without its model.
+    """Play a policy on the predictions of a replay in shadow mode, without its model.
 
-    What becomes known is as in a replay of its own: checks, audits and line stops, and with
+    In shadow mode every part was verified, and the model's bounds were recorded. What becomes known
+    to the policy's rule is as in a replay of its own: checks, audits and line stops, and with
     `stops="all"` that an accepted part was good. One difference stays: the scores come from a model
     that has learned all labels. Audits are drawn anew; what an operator's limits reject is
     verified.

@@ -125,9 +125,9 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
 def promise_lines(rows: Sequence[Row]) -> list[str]:
     """Return a sentence for each pooled row: whether at least LB of the accepted parts were good.
 
-    It ends in "kept", "broken", or that there are too few accepted parts to say; or it says that no
-    part was accepted. It names the recipe, the guarantee, and interval, alpha and confirmation only
-    if the rows differ in them.
+    LB is the policy's lower bound. A sentence ends in "kept", "broken", or that there are too few
+    accepted parts to say; or it says that no part was accepted. It names the recipe, the guarantee,
+    and interval, alpha and confirmation only if the rows differ in them.
     """
     varying = [
         name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1
@@ -261,7 +261,7 @@ def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Pat
     Raises
     ------
     OutputError
-        The file exists, and `force` is not set.
+        The file exists and `force` is not set, or it cannot be written.
     """
     text = frame.to_csv(index=False, lineterminator="\n")
     return write_output(path, text.encode("utf-8"), force, make_folder=True)

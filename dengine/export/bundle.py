@@ -171,7 +171,7 @@ def prepare_export(
 
 
 def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:
-    """Return the model that answers, with the engine's settings, as an exporter takes it.
+    """Return the model that decides at present, with the engine's settings, for an exporter.
 
     It is no copy: the model goes on learning. `trace` replaces the trace contract of the engine or
     the model. Raises ExportError before the first training, for a baseline, and where the engine's
@@ -362,7 +362,7 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
 
 
 def _first_word(content: bytes) -> str:
-    """Return the sum or the signature at the start of a line; the file's name follows it there."""
+    """Return the sum or the signature at the start of a line, "" of an empty one."""
     return (content.decode("utf-8", errors="replace").split() or [""])[0]
 
 

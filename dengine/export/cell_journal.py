@@ -221,9 +221,9 @@ def _parse_label(words: list[str], parts: Mapping[str, JournalLine], where: str)
 def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     """Return decision, trace and label of a part's line, whose first word is left out.
 
-    A rejected part's trace is empty, (1, 0). The line lacks embedding, model version and
-    propensity; None, 0 and 1 stand for these. Raises DataError, naming `where`, for impossible
-    values.
+    The trace of a part with the action REJECT is empty, (1, 0); the label is None if there is none.
+    The line lacks embedding, model version and propensity (the probability of this action); None, 0
+    and 1 stand for these. Raises DataError, naming `where`, for impossible values.
     """
     padded = [*words[:N_DECISION_WORDS], *[""] * (N_DECISION_WORDS - len(words))]
     id_, label, part, *decided = padded

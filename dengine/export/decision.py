@@ -97,7 +97,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
-        """Decide on one trace, and make this the pending decision.
+        """Decide on one trace, and make this the pending decision: its outcome is not known yet.
 
         Before that, a pending accept is settled, see `settle`: it is learned as good or counted as
         unreported; another pending decision is forgotten. After a faulty trace no decision is
@@ -106,7 +106,7 @@ class DecisionModule(nn.Module):
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
-            Another T is fitted as the contract's `fit` says.
+            Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         part : int, default 0
             Hash of its part's number (`folds.part_hash`); 0 for an unknown part.
 
@@ -150,7 +150,7 @@ class DecisionModule(nn.Module):
         upper: float,
         z: Tensor,
     ) -> None:
-        """Make this decision the pending one, whose outcome is learned later.
+        """Make this decision the pending one: the one whose outcome is not reported yet.
 
         An earlier one is forgotten. The fields are copied. `action` is `NONE_PENDING` for a faulty
         trace: then none is pending. `part` is 0 for an unknown part, for which the content hash
@@ -172,12 +172,12 @@ class DecisionModule(nn.Module):
         If the trace and its part are those of the pending decision, its bound is used and none is
         pending afterwards. Otherwise the trace is decided on first, because its bound must be one
         from before its label was known; the pending decision stays pending. A faulty trace is
-        ignored.
+        ignored. A full index drops its oldest reference.
 
         Parameters
         ----------
         trace : Tensor of any real dtype, shape (T,) or (C, T)
-            Another T is fitted as the contract's `fit` says.
+            Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         success : bool
             The label.
         part : int, default 0
@@ -216,16 +216,19 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def stop(self, trace: Tensor, part: int = 0) -> int:
-        """Learn that an accepted part was bad and stopped the line; as `learn`."""
+        """Learn that an accepted part was bad and stopped the line, as `learn` does.
+
+        Whether it was accepted is not checked.
+        """
         return self.learn(trace, False, part)
 
     @torch.jit.export
     def settle(self) -> bool:
         """Settle a pending accept: the next part comes, and nothing was reported.
 
-        With `stops_all` the part is learned as good and becomes a reference, else it counts as
-        unreported; none is pending then. Returns whether it was learned. Other pending decisions
-        stay.
+        A pending accept is a part that was decided last and accepted. With `stops_all` it is
+        learned as good and becomes a reference, else it counts as unreported; no decision is
+        pending then. Returns whether it was learned. Other pending decisions stay.
         """
         if self.pending_action != ActionCode.ACCEPT.value:
             return False
@@ -238,7 +241,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def drop(self) -> None:
-        """Forget the pending decision: its outcome will not be known, and it was not let go."""
+        """Forget the pending decision: its part was not passed on, its outcome stays unknown."""
         self.pending_action = self.none_pending
 
     @torch.jit.export
@@ -313,10 +316,12 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
 
-        `part` is the hash of the part, which also gives the space of the reference. The rule gets
-        as inclusion probability the audit rate if the part was audited, 1 if it was verified for
-        another reason, and 0 if it was accepted or rejected. It also gets the number of unreported
-        parts, whose count restarts at 0.
+        `lower`, `upper`, `novel`, `action` and `predicted` are those of the decision, from before
+        the label was known. `part` is the hash of the part, which also gives its fold, and so in
+        which of the K spaces the reference lies: the one that was trained without labels of this
+        fold. The rule gets as inclusion probability the audit rate if the part was audited, 1 if it
+        was verified for another reason, and 0 if it was accepted or rejected. It also gets
+        `n_unreported`, which restarts at 0. A full index drops its oldest reference.
         """
         inclusion_probability = 0.0
         if action == ActionCode.VERIFY.value:
@@ -330,10 +335,11 @@ class DecisionModule(nn.Module):
         self.n_unreported = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:
-        """Return the trace as (C, T) float32 with the number of samples of the contract.
+        """Return the trace as (C, T) float32 with the number of samples that the decider takes.
 
-        Another number of samples is fitted as the contract's `fit` says. Raises ValueError,
-        compiled torch.jit.Error, for one that cannot be fitted so, and for another shape.
+        Another number of samples is cut, padded or resampled, as `TraceSpec.fit` says. Raises
+        ValueError, compiled torch.jit.Error, for one that cannot be fitted so, and for another
+        shape.
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.numel() > 0 and can_fit_length(x.size(-1), self.samples, self.fit)

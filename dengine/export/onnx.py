@@ -91,9 +91,10 @@ def export_onnx(
     Raises
     ------
     ExportError
-        If the engine audits, has force limits or a rule other than the paper's, or a part is among
-        the references more than once; if nothing was trained yet; for a baseline; if the reducer or
-        the interval has no module; for code that was changed after it was compiled; if the rule is
+        If the engine audits (checks some parts that the model is certain of), has force limits, or
+        a rule other than that of the guarantee "local" with stops "some", or a part is among the
+        references more than once; if nothing was trained yet; for a baseline; if the reducer or the
+        interval has no module; for code that was changed after it was compiled; if the rule is
         stale, because an update of it failed; if the store was changed from outside; if the key
         cannot be read, or a package is missing; and if onnxruntime does not decide as the model
         does.
@@ -147,8 +148,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
 def _refuse_unsupported(source: Exportable) -> None:
     """Raise ExportError if the decision needs something that ONNX cannot carry.
 
-    That is an audit rate above 0, a rule other than the paper's, a part that is among the
-    references more than once, and force limits.
+    That is an audit rate above 0, a rule other than that of the guarantee "local" with stops
+    "some", a part that is among the references more than once, and force limits.
     """
     rule = type(source.model.rule)
     n_repeats = int(source.model.index.repeats)
@@ -194,7 +195,9 @@ class OnnxModel:
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
 
-        Another T is fitted as the contract's `fit` says. Raises TraceError for a wrong shape.
+        Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says. A faulty or a
+        novel trace (unlike all references) is verified, and its reason says so. Raises TraceError
+        for a wrong shape.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, lower, upper, n_success, n_failure, z = outputs
@@ -209,7 +212,7 @@ class OnnxModel:
         )
 
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
-        """Decide on each trace of (n, T) or (n, C, T); as `decide`."""
+        """Decide on each trace of (n, T) or (n, C, T), as `decide` does."""
         return [self.decide(x) for x in as_traces(X, self.trace)]
 
 
@@ -327,7 +330,7 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 
 
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
-    """Compare an ONNX model with the model that answers, on 64 traces of noise.
+    """Compare an ONNX model with the model that it was made from, on 64 traces of noise.
 
     Its amplitudes are from 0.01 to 100. Raises ExportError if embeddings differ by more than
     `TOLERANCE`, if counts differ by more than two references, which may lie at the radius, or if

@@ -156,7 +156,7 @@ def _content(module: Any, metadata: Metadata) -> bytes:
 def golden_trace(spec: TraceSpec) -> TraceArray:
     """Return the trace, float32 (C, T), on which a loader checks the embedding of its machine.
 
-    It is a sine, always the same for a contract, within half of the sensor's limit.
+    It is a sine, always the same for the same `spec`, within half of the sensor's limit.
     """
     n = spec.channels * spec.samples
     x = np.sin(np.arange(n, dtype=np.float32) / 7.0).reshape(spec.channels, spec.samples)
@@ -201,15 +201,16 @@ class ExportedModel:
         self.trace = TraceSpec(**metadata["trace"])
 
     def decide(self, trace: ArrayLike, part: PartNumber = None) -> ExportedDecision:
-        """Decide on one trace, which becomes the pending decision.
+        """Decide on one trace, which becomes the pending decision, whose outcome `learn` reports.
 
-        If the description says `stops` "all", this also learns, as good, a part that was accepted
-        before it and of which nothing was reported.
+        A part that was accepted before it, and of which nothing was reported, is settled first: if
+        the description says `stops` "all", it is learned as good and becomes a reference, if
+        "some", it is counted as unreported. After a faulty trace no decision is pending.
 
         Parameters
         ----------
         trace : array, shape (T,) or (C, T)
-            Another T is fitted as the contract's `fit` says.
+            Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         part : str or int, optional
             Number of the part, whose own references then do not count.
 
@@ -231,7 +232,11 @@ class ExportedModel:
         )
 
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
-        """Decide on each trace of (n, T) or (n, C, T), one after the other; as `decide`."""
+        """Decide on each trace of (n, T) or (n, C, T), one after the other, as `decide` does.
+
+        Each becomes the pending decision in turn, so that accepted ones before the last are
+        settled.
+        """
         return [self.decide(x) for x in as_traces(X, self.trace)]
 
     def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
@@ -244,7 +249,7 @@ class ExportedModel:
         Parameters
         ----------
         trace : array, shape (T,) or (C, T)
-            Another T is fitted as the contract's `fit` says.
+            Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says.
         success : bool
             The label.
         part : str or int, optional
@@ -269,7 +274,10 @@ class ExportedModel:
         return n_references
 
     def stop(self, trace: ArrayLike, part: PartNumber = None) -> int:
-        """Learn that an accepted part was bad and stopped the line; as `learn`."""
+        """Learn that an accepted part was bad and stopped the line, as `learn` does.
+
+        Whether it was accepted is not checked.
+        """
         return self.learn(trace, False, part)
 
     @property
@@ -280,7 +288,10 @@ class ExportedModel:
     def save(self, path: FilePath, *, key: FilePath | None = None, force: bool = False) -> Path:
         """Write the model with all that it learned, and the pending decision, to a file.
 
-        Parameters as of `export_torchscript`. Returns the file, which `load_exported` reads.
+        Parameters, checksum and signature are as in `export_torchscript`; no store records it.
+        Returns the file, which `load_exported` reads; its description lacks the sum of the
+        references. Raises OutputError if it cannot be written, ExportError if the key cannot be
+        read.
         """
         # The sum of the references is that of the first export.
         changes = {"references": self.module.n_references(), "references_sha256": None}
@@ -288,7 +299,7 @@ class ExportedModel:
 
 
 def _part_hash(part: Any) -> int:
-    """Return the hash of a part's number; 0 for None."""
+    """Return the hash of a part's number, 0 for None; TraceError as `ExportedModel.decide`."""
     number = as_part(part)
     return 0 if number is None else part_hash(number)
 
@@ -314,7 +325,7 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     ExportError
         Before anything is loaded, for a file that is missing, damaged, truncated, foreign or of
         another schema, or that was not signed with the key; after loading, if this machine does not
-        reproduce the golden embedding.
+        give the embedding that the file holds for a test trace.
     """
     target = Path(path)
     content = read_checked(target, key)
@@ -332,7 +343,7 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
 
 
 def _check_golden(model: ExportedModel, path: Path) -> None:
-    """Warm a model up on the golden trace in its file; raise ExportError for another embedding.
+    """Warm a model up on the test trace in its file; raise ExportError for another embedding.
 
     The model decides on the trace and learns it several times, so pass a copy.
     """

@@ -55,7 +55,7 @@ class Model(Protocol):
     """
 
     def fit(self, X: Any, y: Any) -> Any:
-        """Train from scratch on labelled traces."""
+        """Train from scratch on labelled traces. The return value is not read."""
 
     def add(self, x: Any, y: Any) -> Any:
         """Learn one labelled trace (channels, samples) between two trainings."""
@@ -156,21 +156,24 @@ class EngineModel(ABC):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:  # noqa: B027  # a default
         """Compute in advance, and keep, what a training on these traces (n, C, T) begins with.
 
-        `numbers` are the labels' sequence numbers. The default does nothing.
+        `numbers` are the labels' sequence numbers, by which `train` finds the results again. An
+        engine calls it in a thread, and logs what it raises. The default does nothing.
         """
 
     @abstractmethod
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """Predict one trace (channels, samples).
 
-        `hash_` is the hash of its part, whose references have no vote; 0 excludes none.
+        `hash_` is the hash of its part, whose references are not counted; 0 excludes none. What it
+        raises reaches the caller of `decide_one`; an engine verifies the part then.
         """
 
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one trace: check faults and limits, ask `predict_one`, toss the audit coin.
+        """Decide on one trace: check faults and limits, ask `predict_one`, and draw audits.
 
         `predict_one` is asked only if the trace has no fault and is within the limits; what it
-        raises is raised here.
+        raises is raised here. An audit verifies a part that the model was certain of; whether it is
+        drawn is a fixed function of the trace's content hash and the seed.
 
         Parameters
         ----------
@@ -205,7 +208,10 @@ class EngineModel(ABC):
         return self._decider
 
     def build_decider(self, conditions: Any) -> Decider:
-        """Build a decider of this model for these conditions, which asks `predict_one`."""
+        """Build a decider of this model for these conditions, which asks `predict_one`.
+
+        It is returned, not kept; `decider` keeps one.
+        """
         return Decider(PythonPredictor(self), conditions)
 
     @abstractmethod
@@ -229,7 +235,8 @@ class EngineModel(ABC):
         hash_ : int
             Hash of the trace's part, or of its content.
         number : int
-            Sequence number of the label; negative while the store of a product has given none.
+            Sequence number of the label; negative, and provisional, until a store that several
+            cells share has given one.
         embedding : tuple, shape (K, d), optional
             The trace's embedding by this version, where it was computed for the decision.
         point : array of float32, shape (d,), optional
@@ -243,9 +250,10 @@ class EngineModel(ABC):
         """
 
     def renumber_reference(self, old: int, new: int) -> None:  # noqa: B027  # a default
-        """Replace the provisional number of a reference by that which a product gave its label.
+        """Replace the provisional number of a reference by the one that the store gave its label.
 
-        The default does nothing.
+        Labels have provisional numbers only in a store that several cells share. The default does
+        nothing.
         """
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
@@ -278,7 +286,8 @@ class EngineModel(ABC):
         Parameters
         ----------
         lower, upper : float
-            The bounds that the part was decided by, before its label was known.
+            The bounds of the success probability by which the part was decided, before its label
+            was known.
         success : bool
             The label.
         novel : bool
@@ -294,7 +303,7 @@ class EngineModel(ABC):
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
         """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
 
-        NONE is no safe mode. The default does nothing.
+        In a safe mode every part is verified; NONE is no safe mode. The default does nothing.
         """
 
     @abstractmethod
@@ -302,7 +311,10 @@ class EngineModel(ABC):
         """Return a model to train next, starting from this one, which is not changed by that."""
 
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
-        """Take over the previous model's rule, stale or not, and be ready to predict at once.
+        """Take over the previous model's rule, and be ready to predict at once.
+
+        A rule that is stale, because an update of it failed, is taken over as well, and this model
+        is stale then. The default does nothing.
 
         The default does nothing.
         """
@@ -313,7 +325,7 @@ class EngineModel(ABC):
         return ""
 
     def defect(self) -> str:
-        """Return why the trained model must not answer; "" if it may. It must read no label.
+        """Return why the trained model must not be used; "" if it may. It must read no label.
 
         It is called right after the training, where the model was trained.
         """
@@ -322,26 +334,32 @@ class EngineModel(ABC):
     def check_answers(self) -> Iterator[str]:
         """Decide on some training traces, one with each step of the iterator.
 
-        Yield for each why the model must not answer, "" if it may. It is called in the process that
-        will answer, after `prepare`. The default yields nothing.
+        Yield for each why the model must not be used, "" if it may. It is called in the process
+        that will decide, after `prepare`. The default yields nothing.
         """
         return iter(())
 
     @property
     def report(self) -> FitReport:
-        """The report of the last training."""
+        """The report of the last training; by default an empty one."""
         return FitReport()
 
     def get_state(self) -> State:
-        """Return the model's state as arrays by name, for the store."""
+        """Return the model's state as arrays by name, for the store; by default none."""
         return {}
 
     def set_state(self, state: Arrays) -> Self:
-        """Restore the state that `get_state` returned; returns self."""
+        """Restore the state that `get_state` returned; returns self.
+
+        The default restores nothing.
+        """
         return self
 
     def needs_refit(self, state: Arrays) -> bool:
-        """Return whether `set_state` needs a model that was trained on the state's own traces."""
+        """Return whether `set_state` needs a model that was trained on the state's own traces.
+
+        True by default.
+        """
         return True
 
 
@@ -442,7 +460,8 @@ class BaselineAdapter(EngineModel):
     def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
         """Let the baseline take in the labelled trace.
 
-        Returns the trace, which serves as its reference point.
+        Returns the trace itself, which serves as its reference point. The baseline is changed in
+        place; number, hash and point have no effect.
         """
         self.model.add(x, y)
         return x
@@ -489,5 +508,5 @@ class Exportable:
     note: Callable[[str, str], object] | None = None
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """Return itself, or a copy with another contract: exporters call this on any source."""
+        """Return itself, or a copy with this trace contract; exporters call it on any source."""
         return self if trace is None else replace(self, trace=trace)

@@ -136,7 +136,7 @@ class Predictor(nn.Module):
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """Predict one trace (C, T) of float32.
 
-        `part` is the hash of its part, whose references have no vote; 0 excludes none. Returns
+        `part` is the hash of its part, whose references are not counted; 0 excludes none. Returns
         positions of action and reason, lower, upper, n_success, n_failure, and the scaled embedding
         (K, d). A novel trace is verified without counting: the bound is (0, 1), the counts are 0.
         """
@@ -229,8 +229,9 @@ def _as_key(value: object) -> object:
 def _is_code_unchanged(*modules: nn.Module) -> bool:
     """Return whether no module's code was changed since TorchScript compiled it; else warn.
 
-    TorchScript keeps what it compiled first, so a class whose code was changed must run in Python.
-    Code that was never compiled counts as unchanged. The warning is logged and names the classes.
+    TorchScript keeps what it compiled first, so a class whose code was changed, as in a notebook,
+    must run in Python. Code that was never compiled counts as unchanged. The warning is logged and
+    names the classes.
     """
     changed = [type(module).__name__ for module in modules if is_code_changed(module)]
     if changed:
@@ -245,8 +246,9 @@ def _is_code_unchanged(*modules: nn.Module) -> bool:
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return a compiled decider that shares the tensors of an eager one.
 
-    It is a copy of the template of its structure. Where there is none, one is compiled and warmed
-    up on a trace of `warm_up_shape` (C, T), see `template_of`.
+    It is a copy of a template, the compiled decider that the process keeps for all of this
+    structure. Where there is none, one is compiled and warmed up on a trace of `warm_up_shape` (C,
+    T), see `template_of`, which may raise RuntimeError.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
     submodules = dict(module.named_modules(remove_duplicate=False))
@@ -454,12 +456,12 @@ class ModelPrediction(EngineModel):
         """Train the reducer on traces (n, C, T), from its last training where it can; return self.
 
         All traces become references, or the last ones if they exceed the classifier's capacity.
-        `index`, `scale`, `gate` and `trace_shape` are replaced, the decider is dropped, and the
-        rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds;
-        `numbers` (n,), of the labels, go to the references; `stop` may end the reducer's training
-        early. Extreme samples are clipped first. Raises SettingError if the reducer cannot be
-        trained on these, and for 20 traces or more that are all of one part, on which no label
-        would have a vote.
+        `index`, `scale`, `gate` (the novelty gate), `examples` and `trace_shape` are replaced, the
+        decider is dropped, and the rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,),
+        of the parts, give the folds; `numbers` (n,), of the labels, go to the references; `stop`
+        may end the reducer's training early. Extreme samples are clipped first. Raises SettingError
+        if the reducer cannot be trained on these, and for 20 traces or more that are all of one
+        part, since no label would count for another part.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -492,9 +494,12 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        `numbers` are the labels' sequence numbers. Before the first training, if reducer and rule
-        can be compiled, a template of the decider is compiled meanwhile: the first retrain has no
-        time for that. The call returns when both are done, and raises what one of them raised.
+        `numbers` are the labels' sequence numbers, by which the reducer finds its results again.
+        Before the first training, if reducer and rule can be compiled, a decider is compiled
+        meanwhile, in the caller's thread, and kept in the process as the template from which later
+        ones are copied: the first retrain has no time for that. The call returns when both are
+        done, and raises what one of them raised. A warning is logged if code was changed after it
+        was compiled.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -509,7 +514,8 @@ class ModelPrediction(EngineModel):
     def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
         """Compile a decider for traces of this shape (C, T), with empty references, and drop it.
 
-        Its template stays in the process, for `compiled`. Nothing in the model changes.
+        Its template, from which `compiled` copies later deciders, stays in the process. Nothing in
+        the model changes.
         """
         channels, samples = trace_shape
         gate = NoveltyGate(channels, samples)
@@ -522,12 +528,13 @@ class ModelPrediction(EngineModel):
         template_of(decider.eval(), trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Share the rule of the previous model, stale or not, and build the decider.
+        """Share the rule object of the previous model, and build the decider.
 
-        It is built for the conditions under which the previous model decided, or if it never did,
-        for this one's. If this model has a decider with that rule for those conditions, it is kept.
-        Nothing happens if the previous model is no `ModelPrediction`. Raises ValueError if nothing
-        was fitted.
+        If either model is stale, because an update of its rule failed, this one is stale then. The
+        decider is built for the conditions (force limits, sensor limit, audits) under which the
+        previous model decided, or if it never did, for this one's. If this model has a decider with
+        that rule for those conditions, it is kept. Nothing happens if the previous model is no
+        `ModelPrediction`. Raises ValueError if nothing was fitted.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -561,6 +568,8 @@ class ModelPrediction(EngineModel):
         ------
         ValueError
             If nothing was fitted.
+        RuntimeError
+            If TorchScript cannot compile the reducer's module.
         """
         conditions = conditions or DecisionConditions(self.trace_spec)
         encoder = self.spaces.module()
@@ -625,7 +634,7 @@ class ModelPrediction(EngineModel):
 
         The hash of its part, `hash_`, gives the fold. The reference is `point` as it is, else the
         row of `embedding` for that space, else computed. A full index drops its oldest reference.
-        Returns the point, float32 (d,), scaled.
+        `number` is the label's sequence number. Returns the point, float32 (d,), scaled.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
@@ -690,8 +699,9 @@ class ModelPrediction(EngineModel):
     def with_policy(self, policy: Policy) -> Self:
         """Return a model under another policy, to be compiled anew around the same references.
 
-        Its rule has learned nothing and is not stale. This model does not change, but both share
-        the references and the reducer. Raises SettingError for a rule that cannot be made.
+        Its rule has learned nothing, and so has missed no outcome (`rule_is_stale` is False). This
+        model does not change, but both share the references and the reducer. Raises SettingError
+        for a rule that cannot be made.
         """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
@@ -708,9 +718,9 @@ class ModelPrediction(EngineModel):
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """Predict one trace (channels, samples) without force limits, fault checks and audits.
 
-        References of the part with this hash have no vote; 0 excludes none. The trace's shape is
-        not checked. Raises RuntimeError where the rule is stale, ValueError where nothing was
-        fitted.
+        References of the part with this hash are not counted; 0 excludes none. The trace's shape is
+        not checked. Raises RuntimeError if the rule is stale, because an update of it failed, and
+        ValueError if nothing was fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -724,10 +734,11 @@ class ModelPrediction(EngineModel):
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
         """Decide on one raw trace x (C, T) by `decider(conditions)`, which may have to be built.
 
-        References of the part with this hash have no vote; for an unknown part, 0, the content hash
-        stands. Returns a `Verdict`, the tuple that `Decider.forward` returns, with the scaled
-        embedding (K, d). Raises RuntimeError if the rule is stale and the trace has no fault,
-        ValueError if nothing was fitted.
+        References of the part with this hash are not counted; for an unknown part, 0, the content
+        hash stands. Returns a `Verdict`, the tuple that `Decider.forward` returns, with the scaled
+        embedding (K, d), a point in each of the K spaces. Raises ValueError if nothing was fitted,
+        and RuntimeError if the rule is stale, because an update of it failed; but a trace with a
+        fault is verified all the same.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -745,7 +756,8 @@ class ModelPrediction(EngineModel):
     def predict_many(self, X: ArrayLike) -> list[Prediction]:
         """Predict each trace of X, shape (n, samples) or (n, channels, samples).
 
-        Raises TraceError for traces of another shape than those it was trained on.
+        Raises TraceError for traces of another shape than those it was trained on, and what
+        `predict_one` raises. No part is excluded.
         """
         return [self.predict_one(x) for x in as_traces(X, self.trace_spec)]
 
@@ -754,8 +766,7 @@ class ModelPrediction(EngineModel):
 
         X has the shape (n, samples) or (n, channels, samples). Returns (n_success, n_failure), each
         an array of int64, shape (n,); 0 for a novel trace. No part is excluded, so a reference
-        counts itself. Raises TraceError for another shape, RuntimeError where the rule is stale,
-        and ValueError where nothing was fitted.
+        counts itself. Raises TraceError for another shape, and what `predict_one` raises.
         """
         counts = [(p.n_success, p.n_failure) for p in self.predict_many(X)]
         n_success, n_failure = np.array(counts, dtype=np.int64).reshape(-1, 2).T
@@ -765,22 +776,25 @@ class ModelPrediction(EngineModel):
         """Return (lower, upper), each float64 (n,): the bounds of each trace's success probability.
 
         X has the shape (n, samples) or (n, channels, samples). The bound is (0, 1) for a novel
-        trace. Raises TraceError for another shape, RuntimeError where the rule is stale, and
-        ValueError where nothing was fitted.
+        trace. Raises TraceError for another shape, and what `predict_one` raises.
         """
         bounds = [(p.lower, p.upper) for p in self.predict_many(X)]
         lower, upper = np.array(bounds, dtype=np.float64).reshape(-1, 2).T
         return lower, upper
 
     def decide(self, X: ArrayLike) -> NDArray[Any]:
-        """Return an array of `Action`, shape (n,): what the model would do with each trace."""
+        """Return an array of `Action`, shape (n,): what the model would do with each trace.
+
+        Force limits, fault checks and audits have no part in it. Raises as `count`.
+        """
         return np.array([prediction.action for prediction in self.predict_many(X)], dtype=object)
 
     def successor(self) -> "ModelPrediction":
         """Return a model to train next, with a copy of this one's reducer to start from.
 
-        Rule, references, scale and gate are this model's own objects. Training replaces the last
-        three in the successor only, so this model goes on deciding; `prepare` takes over the rule.
+        Rule, references, scale and novelty gate are this model's own objects. Training replaces the
+        last three in the successor only, so this model goes on deciding; `prepare` takes over the
+        rule.
         """
         model = copy.copy(self)
         model.spaces = copy.deepcopy(self.spaces)
@@ -793,7 +807,7 @@ class ModelPrediction(EngineModel):
 
         The references, and the points of some training traces, must be finite, and a reducer that
         is restored from this one's state must give these points, twice. A reducer without a state
-        must give them again itself.
+        must give them again itself. The points are kept for `check_answers`.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -814,6 +828,7 @@ class ModelPrediction(EngineModel):
         return self.spaces.embed(X) / self.scale[:, None]
 
     def check_answers(self) -> Iterator[str]:
+        """As `EngineModel.check_answers`, on the examples whose points `defect` has kept."""
         decider = self.decider(self._conditions)
         return compare_points(decider, self.examples, self._example_points)
 

@@ -45,7 +45,7 @@ TRANSFORMER_METHODS = ("fit", "transform", "get_params")
 
 
 def reducer_class(name: str) -> type:
-    """Import and return the class of a reducer.
+    """Import and return the class of a reducer; importing a user's module runs its code.
 
     Parameters
     ----------
@@ -139,8 +139,8 @@ def class_default(reducer: Any, name: str) -> Any:
     Returns
     -------
     object
-        The value of `Reducer` if the class has no such attribute, as another scikit-learn
-        transformer.
+        The value of `Reducer` if the class has no such attribute, because it is another
+        scikit-learn transformer.
     """
     cls = reducer_class(reducer) if isinstance(reducer, str) else reducer
     return getattr(cls, name, getattr(__getattr__("Reducer"), name))
@@ -150,6 +150,7 @@ def has_own_unit(reducer: Any) -> bool:
     """Return whether the embedding of a reducer is never scaled, see `Reducer.own_unit`.
 
     Its first axis is then a predicted probability. `reducer` is a name, a class or an object.
+    Raises SettingError for an unknown name.
     """
     return bool(class_default(reducer, "own_unit"))
 

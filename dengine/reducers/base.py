@@ -80,7 +80,8 @@ class StopRule:
 
         That is so once `max_steps` steps were taken, or once the deadline has passed and at least
         `min_steps` steps were taken. It sets `late` to whether the deadline is the reason; if
-        `max_steps` is, `late` stays as it is.
+        `max_steps` is, `late` stays as it is. With a deadline it also sets `last_step`, to the
+        present time, if the step may begin.
         """
         if self.max_steps is not None and step >= self.max_steps:
             return True
@@ -194,7 +195,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     ) -> Floats:
         """Train for an engine, and return the embedding of the traces as references.
 
-        The default fits anew. A reducer that can goes on from the last training.
+        The default fits anew, and neither `stop` nor `numbers` has an effect. A reducer that can
+        goes on from the last training.
 
         Parameters
         ----------
@@ -221,43 +223,59 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def untrained_module(self, X: Floats) -> Any:
         """Return a module like the one that `module` returns after training on X (n, C, T).
 
-        Its attribute `dim` is the number of coordinates. None: it is not known before training.
-        The engine compiles this module ahead of the first version.
+        Its attribute `dim` is the number of coordinates. None, as by default: it is not known
+        before training. The engine compiles this module ahead of the first training, which then has
+        less to do. Kernels or weights may be drawn here.
         """
 
     def warm_up(self) -> None:  # a default: nothing to load
-        """Import what the first training needs. An engine calls it in a thread when it starts."""
+        """Import what the first training needs. An engine calls it in a thread at its start.
+
+        The default does nothing.
+        """
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute now, and keep, what the next `train` needs from traces X (n, C, T), labels aside.
 
-        `numbers` are those of the labels, as in `train`. The default does nothing.
+        `numbers` are those of the labels, as in `train`, by which `train` finds the results again.
+        The default does nothing.
         """
 
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, C, T) in every space; return float32 (n, K, d)."""
+        """Embed traces (n, C, T) in every space; return float32 (n, K, d).
+
+        Space k is fitted without the labels of fold k. By default there is one space, in which a
+        trace lies where `transform` puts it.
+        """
         return as_points(self.transform(X))[:, None, :]
 
     def embed_references(self, X: Floats, folds: Ints) -> Floats:
-        """Embed traces (n, C, T) as references; return (n, d), row i in space ``folds[i]``."""
+        """Embed traces (n, C, T) as references: float32 (n, d), row i in space ``folds[i]``.
+
+        If there is a single space, every row lies in it.
+        """
         return points_in_fold_space(self.embed(X), folds)
 
     def module(self) -> "nn.Module | None":
         """Return the embedding as a module that TorchScript can compile, (B, C, T) -> (B, K, d).
 
-        None: the reducer has none, so it answers in Python and is not exported.
+        None, as by default: the reducer has no module, so it embeds in Python and cannot be
+        exported.
         """
         return None
 
     def get_state(self) -> State | None:
         """Return arrays from which `set_state` restores the reducer bit for bit.
 
-        None: it can only be restored by fitting it again.
+        None, as by default: it can only be restored by fitting it again.
         """
         return None
 
     def restore_shape(self, state: Arrays) -> tuple[int, int]:
-        """Restore the shape of traces from the array "shape" of a state; return it, (C, T)."""
+        """Read the shape of traces from the array "shape" of a state; return it, (C, T).
+
+        It sets `trace_shape_` and scikit-learn's `n_features_in_`.
+        """
         channels, samples = map(int, state["shape"])
         self.trace_shape_ = (channels, samples)
         self.n_features_in_ = channels * samples
@@ -274,7 +292,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last fit."""
+        """Return the report of the last fit; by default an empty one."""
         return FitReport()
 
     def check_traces(self, X: Any, *, reset: bool = False) -> Floats:
@@ -343,6 +361,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         return int(self.get_params(deep=False)["n_components"])
 
     def __sklearn_tags__(self) -> Any:
+        """Return scikit-learn's tags: labels of two classes are needed if `uses_labels`."""
         tags = super().__sklearn_tags__()
         tags.target_tags.required = self.uses_labels
         if self.uses_labels:
@@ -359,7 +378,7 @@ def as_points(Z: Any) -> Floats:
 
 
 def as_rows(traces: Floats) -> Floats:
-    """Flatten traces (n, C, T) to (n, C * T); n may be 0."""
+    """Flatten traces (n, C, T) to (n, C * T), a view if they are contiguous; n may be 0."""
     n, channels, samples = traces.shape
     return traces.reshape(n, channels * samples)
 
@@ -409,7 +428,7 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     """Return labels of two classes as int64 (n,): 1 for the larger class, 0 for the other.
 
     Labels of 0 and 1 stay as they are, also if only one of them occurs. Another lone class becomes
-    1.
+    1. A column (n, 1) is taken, with a warning.
 
     Parameters
     ----------
@@ -453,7 +472,7 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
 
 
 def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
-    """Return the folds of traces (n, C, T), int64 (n,): those given, or by the traces' content.
+    """Return the folds of traces (n, C, T), int64 (n,): those given, or by a hash of each trace.
 
     Given folds are cast to int64. Raises SettingError if they are not one from 0 to n_folds - 1 for
     each trace.
@@ -504,7 +523,7 @@ def seed_of(random_state: Any) -> int | None:
 
 
 def draw_seed(random_state: Any) -> int:
-    """Return the seed of a `random_state`, a random one for None."""
+    """Return the seed of a `random_state` as `seed_of` does, but a random one for None."""
     seed = seed_of(random_state)
     return int(np.random.default_rng().integers(2**31)) if seed is None else seed
 
@@ -517,7 +536,7 @@ def uses_labels(transformer: Any) -> bool:
 def as_reducer(transformer: Any, folds: int) -> Reducer:
     """Return a transformer as a `Reducer`.
 
-    A `Reducer` that cross-fits by itself, or uses no labels, is returned as it is. Another
+    A `Reducer` that has several spaces, or uses no labels, is returned as it is. Another
     transformer that uses labels is wrapped in `CrossFitted`, which fits `folds` clones. One that
     uses no labels is wrapped in `LabelFree` and never gets any, so its single space has seen no
     label. Nothing is fitted here.
@@ -599,6 +618,8 @@ class CrossFitted(_Wrapping):
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Fit clone k on the traces outside fold k, for every k, and replace `clones_` and `dim_`.
+
+        If a fit raises, `clones_` may already hold clones that are not fitted.
 
         Parameters
         ----------

@@ -209,6 +209,7 @@ class ConvReducer(TorchReducer):
         self.rocket_.init_encoder(traces)
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
+        """As `TorchReducer._build`; `rocket_` is made as well, before the network."""
         # Before `encoder_`, by which other threads see that there is a module.
         self.rocket_ = RocketReducer(
             n_components=1,
@@ -238,6 +239,7 @@ class ConvReducer(TorchReducer):
         return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:
+        """As `Reducer.embed`; the first coordinate has the mean of both logits."""
         traces = self.check_traces(X)
         points = torch.from_numpy(super().embed(traces))
         return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
@@ -251,6 +253,7 @@ class ConvReducer(TorchReducer):
         return super().get_state() | rocket
 
     def set_state(self, state: Arrays) -> Self:
+        """As `TorchReducer.set_state`, with `rocket_`; StoreError for a state without one."""
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone
             raise incompatible_model_error("conv has no rocket beside its network")

@@ -92,8 +92,8 @@ def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
     Returns
     -------
     int
-        The largest number that leaves so many samples and 80 % of the variance of each channel; 1
-        if there is none, because the traces are short or oscillate.
+        The largest number that leaves `min_frames` samples, and 80 % of the variance of each
+        channel; 1 if there is none, because the traces are short or oscillate.
     """
     traces = traces[:: 1 + (len(traces) - 1) // STATISTICS_TRACES]
     samples = traces.size(2)

@@ -206,6 +206,8 @@ def weigh_towers(
 ) -> tuple[list[Tensor], Tensor]:
     """Choose for each head the shares by which the logits of towers are mixed to one logit.
 
+    A tower is a group of features with heads of its own.
+
     Tower by tower, the towers before keep a share of the mix, and the tower gets the rest. The kept
     share is that of eleven values from 0 to 1 with the smallest penalised log loss on the rows
     outside fold k, so that labels of fold k do not reach head k.
@@ -352,9 +354,11 @@ class RocketReducer(Reducer):
 
         X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,)
         identify the traces from call to call, so that the features of traces in the last call come
-        from a cache. `stop` may end the Newton steps. Of more than 4000 traces the heads read 4000.
-        Returns the points of all traces, float32 (n, d), row i in space ``folds[i]``. Raises
-        SettingError for fewer than 20 traces, and if the traces outside a fold have a single class.
+        from a cache. `stop` may end the Newton steps. Of more than 4000 traces the heads read 4000,
+        which a hash of the numbers draws. The module `net_`, and so what `module` returned before,
+        is changed in place. Returns the points of all traces, float32 (n, d), row i in space
+        ``folds[i]``. Raises SettingError for fewer than 20 traces, and if the traces outside a fold
+        have a single class.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -374,8 +378,9 @@ class RocketReducer(Reducer):
         """Fit the logistic heads, without checking the input, and return the held-out embedding.
 
         Call `init_encoder` first: without it all kernels are 0 and the result is meaningless,
-        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. The
-        other parameters and the result, float32 (n, d), are those of `train`.
+        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `net_`
+        is changed in place. The other parameters and the result, float32 (n, d), are those of
+        `train`.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -384,11 +389,13 @@ class RocketReducer(Reducer):
             return points_in_fold_space(points.numpy(), folds)
 
     def untrained_module(self, X: Floats) -> FeatureEmbedding:
-        """Return the module that answers, for traces (n, C, T); draw its kernels if there are none.
+        """Return the module that embeds traces, with drawn kernels, to compile before a training.
 
-        With fewer than `MIN_TRACES` traces, and none drawn yet, it is the module of a clone, since
-        the first training will draw the kernels from more traces. Otherwise it is the module that
-        later trainings change in place.
+        Before a training the heads of all spaces are 0. If no kernels are drawn yet, they are drawn
+        here from X (n, C, T), and the module is `net_` itself, which later trainings change in
+        place. But with fewer than `MIN_TRACES` traces it is the module of a clone, and this reducer
+        stays as it is, since the first training will draw the kernels from more traces. Raises
+        SettingError for a parameter out of its range or fewer than 2 samples.
         """
         is_started = "net_" in vars(self)
         reducer: Self = self if len(X) >= MIN_TRACES or is_started else clone(self)
@@ -398,8 +405,9 @@ class RocketReducer(Reducer):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces (n, C, T), and cache them for the next `train`.
 
-        They are found again by `numbers`; without these nothing is cached. The first call with
-        enough traces draws the kernels. It does nothing with fewer than `MIN_TRACES` traces.
+        They are found again by `numbers`, those of the labels; without these nothing is cached. The
+        first call with enough traces draws the kernels. It does nothing with fewer than
+        `MIN_TRACES` traces.
         """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_start(X), numbers)
@@ -630,14 +638,16 @@ class RocketReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
+        """Return the report of the last fit: Newton steps, and heads that predict the base rate."""
         check_is_fitted(self, "net_")
         return FitReport(self.n_iter_, self.note_)
 
     def embed(self, X: ArrayLike) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
-        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
-        that are not finite.
+        Space k is that of head k, which was fitted without the labels of fold k. Raises
+        NotFittedError before a fit, ValueError for traces of another shape and for values that are
+        not finite.
         """
         traces = self.check_traces(X)
         with torch.inference_mode():
@@ -719,7 +729,8 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints:
     """Draw `MAX_TRAINING_TRACES` of n rows, in order, without reading labels.
 
     A hash of the labels' numbers (n,) draws them, evenly in time. So most rows are those of the
-    last fit, and the heads start near where they end. None: the numbers are 0 to n - 1.
+    last fit, and the heads start near where they end. None: the numbers are 0 to n - 1. n must be
+    larger than `MAX_TRAINING_TRACES`.
     """
     values = np.arange(n) if numbers is None else numbers
     hashes = values.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)

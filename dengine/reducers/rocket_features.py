@@ -252,10 +252,10 @@ class RocketEncoder(nn.Module):
         return sums.mul_(1.0 / self.n_sparse_places).sqrt_().t()
 
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
-        """Set the scales of the channels and the filters, in place, from traces X (n, C, T).
+        """Set channel scales, kernels and thresholds, in place, from traces X (n, C, T).
 
-        `rng` draws the traces that are read, at most 256 for the scales and 64 for the filters, and
-        the kernels. A channel then becomes scale * x + shift. Call it once: a second call sets
+        `rng` draws the traces that are read, at most 256 for the scales and 64 for the thresholds,
+        and the kernels. A channel then becomes scale * x + shift. Call it once: a second call sets
         everything anew, and the features of every trace change.
         """
         if len(X) > SCALE_TRACES:

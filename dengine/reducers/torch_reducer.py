@@ -257,13 +257,20 @@ class TorchReducer(Reducer):
         return self._train(traces, labels, folds, stop or StopRule(), steps, numbers)
 
     def n_steps_due(self, n_labels: int) -> int:
-        """Return the number of steps that the next retrain takes on `n_labels` labels."""
+        """Return the number of steps that the next retrain takes on `n_labels` labels.
+
+        It is `steps`, or as many as are missing to complete training if these are more, up to twice
+        `steps`; beyond 4000 labels it is always `steps`.
+        """
         n_missing = self._n_steps_wanted(n_labels) - self.n_steps_
         largest = self.steps if n_labels > MANY_LABELS else CATCH_UP_FACTOR * self.steps
         return min(max(n_missing, self.steps), largest)
 
     def _n_steps_wanted(self, n_labels: int) -> int:
-        """Return the number of steps, over all trainings, that make training complete."""
+        """Return the number of steps, over all trainings, that make training complete.
+
+        It is 36 and 1.2 for each label, at most `fit_steps`.
+        """
         return int(min(self.fit_steps, INITIAL_STEPS + STEPS_PER_LABEL * n_labels))
 
     def _check_and_start(self, X: Floats) -> Floats:
@@ -351,7 +358,8 @@ class TorchReducer(Reducer):
         """Take AdamW steps, member k on the rows outside fold k.
 
         It changes the members and their averages in place, keeps the optimiser's moments, and sets
-        `n_steps_`, `n_new_steps_` and `loss_`. The answering `encoder_` stays as it is.
+        `n_steps_`, `n_new_steps_` and `loss_` (NaN if `stop` allows no step). `encoder_`, the
+        module that embeds, stays as it is; the members are in training mode afterwards.
 
         Parameters
         ----------
@@ -457,7 +465,7 @@ class TorchReducer(Reducer):
         members.eval()
 
     def _new_encoder(self) -> Encoder:
-        """Return the module that answers: the preprocessor and a copy of the averaged members."""
+        """Return a new module that embeds: the preprocessor and a copy of the averaged members."""
         members = fold_batch_norms(copy.deepcopy(self.averaged_members_).eval())
         encoder = Encoder(self.preprocessor_, members, self.n_components)  # type: ignore[arg-type]
         return encoder.eval().requires_grad_(False)
@@ -488,8 +496,9 @@ class TorchReducer(Reducer):
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
-        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
-        that are not finite.
+        Space k is that of member k, which was trained without the labels of fold k. Raises
+        NotFittedError before a fit, ValueError for traces of another shape and for values that are
+        not finite.
         """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
@@ -504,8 +513,9 @@ class TorchReducer(Reducer):
     def untrained_module(self, X: Floats) -> nn.Module | None:
         """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
-        After a training it is the present `module()`; before, that of a clone with initial
-        weights. None, with a warning in the log, if TorchScript cannot compile the network.
+        If there is an `encoder_`, as after a training, it is the present `module()`; else that of a
+        clone with initial weights. None, with a warning in the log, if TorchScript cannot compile
+        the network. Raises SettingError for a parameter or a network that cannot be used.
         """
         if "encoder_" in vars(self):
             return self.module()
@@ -515,6 +525,11 @@ class TorchReducer(Reducer):
         return untrained.module()
 
     def module(self) -> nn.Module | None:
+        """As `Reducer.module`: the present `encoder_`, which no later training changes.
+
+        None, with a warning in the log, if TorchScript cannot compile the network, which is tried
+        once. Raises NotFittedError before a fit.
+        """
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
         if self.can_compile_ is None:  # copies of the reducer, which an engine trains, keep it
@@ -539,7 +554,7 @@ class TorchReducer(Reducer):
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
         They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
-        optimiser, so that training can go on, and the points of a test trace, by which `set_state`
+        optimiser, so that training can go on, and the points of a fixed trace, by which `set_state`
         recognises the network. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
@@ -562,7 +577,7 @@ class TorchReducer(Reducer):
         """Restore what `get_state` returned, and return self.
 
         The constructor's parameters must be the same. Raises StoreError if the sizes are others, or
-        if the network gives other points for the test trace than when the state was taken. A state
+        if the network gives other points for a fixed trace than when the state was taken. A state
         without these points is not checked.
         """
         channels, samples = self.restore_shape(state)
@@ -691,7 +706,7 @@ def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
     """Return whether TorchScript compiles a network; log a warning if it does not.
 
     A user's network may hold Python that TorchScript does not support. Two members of it are built,
-    compiled and asked to find out, once for each network and shape; torch's global generator keeps
+    compiled and run to find out, once for each network and shape; torch's global generator keeps
     its state.
     """
     try:

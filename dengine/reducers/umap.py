@@ -265,10 +265,11 @@ class UmapReducer(Reducer):
         """Lay traces out, from the last layout if it can, and make them the encoder's references.
 
         X are traces (n, C, T); `numbers` (n,), increasing, identify them from training to training;
-        labels and folds are not read. `stop` may end the epochs. The layout starts anew without
-        `numbers`, or if fewer than half of the traces were in the last training. Returns the points
-        of the traces, float32 (n, n_components), not a copy of `embedding_`. Raises SettingError
-        for a parameter out of its range, or too few traces.
+        labels and folds are not read. `stop` may end the epochs; after its deadline at most ten
+        more are taken. The layout starts anew without `numbers`, or if fewer than half of the
+        traces were in the last training. Returns the points of the traces, float32 (n,
+        n_components), not a copy of `embedding_`. Raises SettingError for a parameter out of its
+        range, or too few traces.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
@@ -345,7 +346,7 @@ class UmapReducer(Reducer):
         stop: StopRule,
         n_epochs: int | None = None,
     ) -> None:
-        """Train on traces (n, C, T) with their labels' numbers, and let the new layout answer.
+        """Train on traces (n, C, T) with their labels' numbers, and make a new `encoder_`.
 
         It finds neighbours, joins them to a graph, and moves the points for `n_epochs` epochs
         (None: as many as are due) or fewer if `stop` ends them. Without numbers all traces are new.
@@ -407,6 +408,11 @@ class UmapReducer(Reducer):
 
     @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
+        """Embed traces (n, T) or (n, C, T) among the references; return float32 (n, 1, d).
+
+        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
+        that are not finite.
+        """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
         return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
@@ -441,8 +447,9 @@ class UmapReducer(Reducer):
     def report(self) -> FitReport:
         """Return the report of the last training: its epochs, and those that are missing.
 
-        The note names epochs of the first layout that are missing, "" if none are. Raises
-        NotFittedError before a fit.
+        A first layout, which starts from eigenvectors of the graph, takes 200 epochs (or
+        `n_epochs`), in one training or in several. The note says how many of them are missing, ""
+        if none are. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         left = self.n_steps_left_

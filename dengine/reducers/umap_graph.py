@@ -62,7 +62,7 @@ class Frames(nn.Module):
 
     @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
-        """Set centre and scale from traces (n, C, T)."""
+        """Set centre and scale, in place, from traces (n, C, T)."""
         self.centre.copy_(traces.double().mean(0))
         deviation = self(traces).double().square().mean().sqrt()
         self.scale.copy_(torch.where(deviation > 0.0, deviation, 1.0))

@@ -213,7 +213,8 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     """Draw the conditions of one insertion, its fault included; `rng` is advanced.
 
     Every quantity is drawn in every cycle, so that a change of one does not change the others. At
-    most one fault is drawn; it replaces the normal values that it concerns.
+    most one fault is drawn; it replaces the normal values that it concerns. A missed grasp replaces
+    none, and is told by `fault` alone.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ from .protocol import PORT
 def main(data: str, host: str, port: int, speed: float) -> None:
     """Start a simulated controller that plays a data set, and run it until it is interrupted.
 
-    Exit with a message if the data set cannot be loaded.
+    Exit with a message if the data set cannot be loaded; a port that is taken raises OSError.
     """
     try:
         program = RobotProgram(data)

@@ -139,7 +139,7 @@ class UrCell(AbstractContextManager["UrCell"]):
             raise
 
     def close(self) -> None:
-        """Close the connection; the robot's program goes on."""
+        """Close the connection and end its thread; the robot's program goes on."""
         self.recorder.close()
 
     def __exit__(self, *raised: object) -> None:
@@ -163,15 +163,21 @@ class UrCell(AbstractContextManager["UrCell"]):
         return self.last.trace
 
     def verify(self) -> bool:
-        """Have the part measured; return whether it is good. A bad part goes back to the bin."""
+        """Have the part measured; return whether it is good. A bad part goes back to the bin.
+
+        Raise CellError as `insert`.
+        """
         return self._execute_order(Verb.VERIFY) is ResultCode.GOOD
 
     def proceed(self) -> Outcome:
-        """Have the line go on without measuring; return what became known of the part."""
+        """Have the line go on without measuring; return what became known of the part.
+
+        Raise CellError as `insert`.
+        """
         return OUTCOMES[self._execute_order(Verb.PROCEED)]
 
     def reject(self) -> None:
-        """Have the part put back to the bin without measuring."""
+        """Have the part put back to the bin without measuring; raise CellError as `insert`."""
         self._execute_order(Verb.REJECT)
 
     def _execute_order(self, verb: Verb) -> ResultCode:
@@ -239,7 +245,8 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _wait_until_ready(self) -> int:
         """Wait until the program runs and owes no result; return the number of its last order.
 
-        Raise CellError after `start_timeout` seconds, with what is missing.
+        Packages that arrive meanwhile are discarded. Raise CellError after `start_timeout` seconds,
+        with what is missing.
         """
         problem = ""
         for row in self.recorder.rows(self.start_timeout):

@@ -140,12 +140,12 @@ class RobotProgram:
         return ResultCode.CONFIRMED if self.confirm else ResultCode.UNKNOWN
 
     def _insert(self, number: int) -> Generator[None, None, ResultCode]:
-        """Play the next trace into the outputs, a yield per control cycle; return DONE (`yield
-        from`).
+        """Play the next trace into the outputs, a yield per control cycle; return its result code.
 
-        The part is added to `played`. Before the trace come `approach` cycles, after it two at
-        rest. While it plays, the output PHASE has the order's number, and `place` is set. Returns
-        FAILED at once, without a cycle, if all traces were played.
+        The result, by `yield from`, is DONE, or FAILED at once, without a cycle, if all traces were
+        played. The part is added to `played`. Before the trace come `approach` cycles, after it two
+        at rest. While it plays, the output PHASE has the order's number, and `place` is part and
+        sample.
         """
         if len(self.played) == len(self.data):
             return ResultCode.FAILED  # the bin is empty
@@ -211,7 +211,10 @@ class Client:
         self.started = False
 
     def send(self, data: bytes) -> None:
-        """Send bytes; a client that has gone, or does not read for 5 s, is disconnected."""
+        """Send bytes; a client that has gone, or does not read for 5 s, is disconnected.
+
+        Nothing is raised then, and nothing more is sent to it.
+        """
         try:
             self.socket.sendall(data)
         except OSError:
@@ -322,13 +325,12 @@ class FakeController(AbstractContextManager["FakeController"]):
             self.clients.remove(client)
 
     def respond(self, client: Client, type_: PackageType, payload: bytes) -> None:
-        """Carry out one request of a client, and send the response if the protocol has one; the
-        caller holds the lock.
+        """Carry out one request of a client, and send the response if the protocol has one.
 
-        Text is ignored, and data sets `inputs`; neither has a response. The others are: declare
-        outputs or inputs, start (packages are sent until the next of these requests), pause, and
-        ask for versions. An input of another client is refused. A malformed request raises one of
-        `FOREIGN`.
+        The caller holds the lock. Text is ignored, and data sets `inputs`; neither has a response.
+        The others are: declare outputs or inputs, start (packages are sent until the next of these
+        requests), pause, and ask for versions. An input of another client is refused. A malformed
+        request raises one of `FOREIGN`.
         """
         match type_:
             case PackageType.TEXT:
@@ -357,7 +359,8 @@ class FakeController(AbstractContextManager["FakeController"]):
     def _declare_inputs(self, client: Client, names: list[str]) -> bytes:
         """Note the inputs that a client will write, and return the payload of the response.
 
-        None is noted if another client writes one of them, or there is none of a name.
+        If another client writes one of them, or there is no input of a name, none is noted, and the
+        response has the number 0 and says which.
         """
         in_use = {
             name

@@ -78,7 +78,7 @@ class PackageReader:
         """Add bytes, and yield every package that is complete; an incomplete rest is kept.
 
         Nothing is added before the iteration begins. Raise CellError for bytes that are no RTDE
-        package.
+        package; packages before them have been yielded.
         """
         self._bytes += piece
         while len(self._bytes) >= HEADER.size:

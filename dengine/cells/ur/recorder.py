@@ -47,7 +47,7 @@ class InsertionRecord:
 def spec_of_recording(
     samples: int = 1000, channels: Sequence[str] = ("FZ_Base",), rate_hz: float = 500.0
 ) -> TraceSpec:
-    """Return the contract of the traces that an `RtdeRecorder` with these settings records.
+    """Return the `TraceSpec` of the traces that an `RtdeRecorder` with these settings records.
 
     The unit of a force is N, any other unit is unknown.
     """
@@ -129,7 +129,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self.close()
 
     def arm(self) -> None:
-        """Discard what was received so far; record an insertion that begins from now on."""
+        """Discard what was received so far, begun or not; record what begins from now on."""
         self._reset()
         self._armed = self.stream.clear()
 
@@ -192,8 +192,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def feed(self, row: Row) -> InsertionRecord | None:
         """Add a package of the stream; return the insertion that it completes, else None.
 
-        If the controller's clock was set back, an insertion that has begun is returned as far as it
-        was received, and everything before is discarded.
+        Samples that were lost are NaN in its trace; all are if its start was lost. If the
+        controller's clock was set back, as by a restart, an insertion that has begun is returned as
+        far as it was received, and everything before is discarded.
         """
         record = None
         # An earlier time: the controller was restarted.

@@ -117,14 +117,14 @@ class RtdeClient:
                 yield self._outputs.unpack(package.payload)
 
     def send(self, values: Values) -> None:
-        """Write the input fields in one package; a column that is left out is written as 0.
+        """Write all input fields in one package; a column that is left out is written as 0.
 
-        Raise CellError if the connection is lost.
+        Names that are no columns are ignored. Raise CellError if the connection is lost.
         """
         self._send(self._inputs.pack(values))
 
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection, also one that is lost; whoever reads `rows` gets a CellError."""
         with suppress(OSError):  # the controller may have closed it first
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
@@ -297,14 +297,15 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def take(self, timeout: float) -> Row | None:
         """Remove and return the oldest buffered package.
 
-        None if none comes in `timeout` seconds, or before the stream is closed.
+        It waits `timeout` seconds for one, but not once the stream is closed; None if there is none
+        then.
         """
         with self._news:
             self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
             return self._rows.popleft() if self._rows else None
 
     def clear(self) -> int:
-        """Discard the buffered packages; return the number of earlier connections."""
+        """Discard the buffered packages; return the number of reconnections so far."""
         with self._news:
             self._rows.clear()
             return self._session
@@ -312,8 +313,12 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def write(self, values: Values | None) -> None:
         """Write inputs now, or once there is a connection again; a lost connection raises nothing.
 
-        By the next connection they must be less than `REPEAT_S` old, and the controller must not
-        have been restarted; else they are not written again.
+        All fields that the stream was opened with are written: columns that are left out become 0,
+        and names that are no columns are ignored.
+
+        If the connection is lost, the next one has them written again, unless they are `REPEAT_S`
+        old by then or the controller was restarted. Raises struct.error for a number that its field
+        cannot hold.
 
         Parameters
         ----------
@@ -366,8 +371,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def _count_and_buffer(self, row: Row) -> None:
         """Count a package and what is missing before it, buffer it, and wake who waits in `take`.
 
-        The first package of a new connection also has the inputs written again, if they are less
-        than `REPEAT_S` old. After a restart of the controller they are forgotten instead.
+        If the buffer is full, its oldest package is dropped. The first package of a new connection
+        also has the inputs written again, if they are less than `REPEAT_S` old. After a restart of
+        the controller they are forgotten instead.
         """
         with self._news:
             if self._newest is not None:
