@@ -2,7 +2,7 @@
 use them; a user catches `DengineError` or a subclass.
 
 `expect` and `instead` raise messages of one form: what was expected, what came, what to do.
-`shortened`, `excerpt` and `listed` keep a message to one line, `without_password` masks passwords,
+`shortened` and `listed` keep a message to one line, `without_password` masks passwords,
 `percent` writes shares, and `as_options` turns advice for Python into advice for the command line.
 """
 
@@ -10,7 +10,6 @@ import math
 import re
 import reprlib
 import shlex
-import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -53,24 +52,6 @@ def shortened(value: Any) -> str:
         return (
             f"a number of {value.bit_length()} bits" if is_integer else f"a {type(value).__name__}"
         )
-
-
-def excerpt(text: str, at: int = 0) -> str:
-    """Return the `repr` of the 60 characters of a text around position `at`, for a message.
-
-    "..." stands where text is left out. If the character at that position is not printable ASCII,
-    its Unicode name, code point and position, counted from 1, follow.
-    """
-    begin = max(min(at - MAX_LENGTH // 2, len(text) - MAX_LENGTH), 0)
-    end = begin + MAX_LENGTH
-    before = "..." if begin else ""
-    after = "..." if len(text) > end else ""
-    result = f"{before}{text[begin:end]!r}{after}"
-    char = text[at : at + 1]
-    if not char or (char.isascii() and char.isprintable()):
-        return result
-    name = unicodedata.name(char, "a control character")
-    return f"{result}, with {name} (U+{ord(char):04X}) at character {at + 1}"
 
 
 def listed(names: Iterable[Any]) -> str:
