@@ -64,24 +64,37 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-_LAST = "How many of the newest decisions are shown."
-_ACTION = "Only decisions with this action."
-_MODEL = (
-    "Only decisions where the model alone would have done this, as in an audit or in shadow mode."
-)
-_LABEL = "Only decisions with this label, or without a reported one."
-_SINCE = "Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC."
-
-
 @verb("dengine history engine.db --last 20 --events")
 @options.store_argument
-@click.option("--last", type=options.COUNT, default=50, show_default=True, help=_LAST)
-@click.option("--action", type=NameChoice("action"), help=_ACTION)
-@click.option("--model", "predicted", type=NameChoice("action"), help=_MODEL)
+@click.option(
+    "--last",
+    type=options.COUNT,
+    default=50,
+    show_default=True,
+    help="How many of the newest decisions are shown.",
+)
+@click.option("--action", type=NameChoice("action"), help="Only decisions with this action.")
+@click.option(
+    "--model",
+    "predicted",
+    type=NameChoice("action"),
+    help=(
+        "Only decisions where the model alone would have done this, as in an audit or in shadow "
+        "mode."
+    ),
+)
 @click.option("--reason", type=NameChoice("reason"), help="Only decisions with this reason.")
-@click.option("--label", type=NameChoice("label"), help=_LABEL)
+@click.option(
+    "--label",
+    type=NameChoice("label"),
+    help="Only decisions with this label, or without a reported one.",
+)
 @click.option("--part", metavar="NUMBER", help="Only decisions on the part with this number.")
-@click.option("--since", type=Moment(), help=_SINCE)
+@click.option(
+    "--since",
+    type=Moment(),
+    help="Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.",
+)
 @click.option("--until", type=Moment(), help="Only decisions before then, given as for --since.")
 @click.option("--events", is_flag=True, help="Show the retrains and events between them too.")
 def history(store: str, events: bool, **criteria: Any) -> None:

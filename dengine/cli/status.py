@@ -40,12 +40,17 @@ SHOWN_ELSEWHERE = (
     "last",
 )
 ONLY_WHILE_RUNNING = ("retraining", "store_lag")
-_LAST = "How many of the newest decisions have a column of their own."
 
 
 @verb("dengine status engine.db --last 500")
 @options.store_argument
-@click.option("--last", type=options.COUNT, default=500, show_default=True, help=_LAST)
+@click.option(
+    "--last",
+    type=options.COUNT,
+    default=500,
+    show_default=True,
+    help="How many of the newest decisions have a column of their own.",
+)
 @options.check_option
 def status(store: str, last: int, check_seconds: float) -> None:
     """Show how an engine is doing, and what its store holds.

@@ -37,14 +37,13 @@ def _login_name() -> str:
         return ""
 
 
-_SHADOW = (
-    "on: verify every part, and only record what the model would have done. off: let it decide."
-)
 shadow_option = click.option(
     "--shadow",
     type=click.Choice(["on", "off"]),
     callback=lambda context, option, state: None if state is None else state == "on",
-    help=_SHADOW,
+    help=(
+        "on: verify every part, and only record what the model would have done. off: let it decide."
+    ),
 )
 interval_option = click.option(
     "--interval", type=NameChoice("interval"), help="The confidence interval."
@@ -109,8 +108,12 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
         id_ = find_decision_id(engine.store, part)
         stored = engine.find(id_)
         if stored is not None and stored.success is LABELS[label]:
-            text = f"Decision {id_} was {label} already; nothing changed."
-            return Changed("report", text, None, engine.version)
+            return Changed(
+                "report",
+                f"Decision {id_} was {label} already; nothing changed.",
+                None,
+                engine.version,
+            )
         engine.report(id_, LABELS[label])
         engine.store.events.put("report", f"decision {id_} was {label}", author=author)
         event = engine.store.events.newest(1)[-1].number
@@ -224,8 +227,12 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
 
     with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
         report = engine.retrain()
-        text = f"trained by hand on {report.n_traces} traces: {report.reason}"
-        engine.store.events.put("retrain", text, asdict(report), author)
+        engine.store.events.put(
+            "retrain",
+            f"trained by hand on {report.n_traces} traces: {report.reason}",
+            asdict(report),
+            author,
+        )
     answers = f"Version {report.version} answers." if report.version else "No version answers yet."
     print_result(
         {"store": store, "author": author, "retrain": report},
@@ -243,21 +250,24 @@ WAITING = (
     "The journal of cell {} holds {:,} records that are not in the store yet; its engine, or the "
     "next one, moves them there."
 )
-_CELL = "Check this cell alone.  [default: all cells]"
-_EXPECT = (
-    "A digest that an earlier check showed. If the history does not hold it any more, it was cut "
-    "off or made anew."
-)
-
-
-_ACKNOWLEDGE = "End the alarms about lost data. They stay in the event log."
 
 
 @verb("dengine verify engine.db")
 @click.argument("store", metavar="STORE")
-@click.option("--cell", metavar="ID", help=_CELL)
-@click.option("--expect", metavar="DIGEST", help=_EXPECT)
-@click.option("--acknowledge", is_flag=True, help=_ACKNOWLEDGE)
+@click.option("--cell", metavar="ID", help="Check this cell alone.  [default: all cells]")
+@click.option(
+    "--expect",
+    metavar="DIGEST",
+    help=(
+        "A digest that an earlier check showed. If the history does not hold it any more, it was "
+        "cut off or made anew."
+    ),
+)
+@click.option(
+    "--acknowledge",
+    is_flag=True,
+    help="End the alarms about lost data. They stay in the event log.",
+)
 @author_option
 @click.pass_context
 def verify(
@@ -376,15 +386,16 @@ def restore(copy: str, store: Path) -> None:
     )
 
 
-_ANY_MODEL = "Accept a journal of a model that is not recorded as an export of this store."
-
-
 @verb("dengine import-labels cell.csv --store engine.db")
 @click.argument(
     "journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path)
 )
 @options.store_option("The store that the cell's model was exported from.", "--cell", required=True)
-@click.option("--any-model", is_flag=True, help=_ANY_MODEL)
+@click.option(
+    "--any-model",
+    is_flag=True,
+    help="Accept a journal of a model that is not recorded as an export of this store.",
+)
 def import_labels(journal: Path, store: str, any_model: bool) -> None:
     """Import the labels of a cell program into the store.
 

@@ -139,9 +139,10 @@ def prepare_export(
     model = source.model
     encoder = model.spaces.module()
     if not model.rule.scriptable:
-        rule = f"{type(model.rule).__name__} with the interval {model.rule.interval!r}"
-        do = f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does"
-        raise ExportError(f"{rule} does not compile to TorchScript; {do}.")
+        raise ExportError(
+            f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not "
+            f"compile to TorchScript; use {' or '.join(SCALAR_BOUNDS)}, and a rule that does."
+        )
     for module in (model.rule, encoder):
         if module is not None and is_code_changed(module):
             problem = f"The code of {type(module).__name__} was changed after it was compiled"
@@ -191,8 +192,10 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
         source: Exportable = model.exported(trace)
     except AttributeError as error:
         actual = type(model).__name__
-        wanted = "Expected a DataEngine or a ModelPrediction to export"
-        raise ExportError(f"{wanted}, got {actual}; a baseline stays in Python.") from error
+        raise ExportError(
+            f"Expected a DataEngine or a ModelPrediction to export, got {actual}; a baseline stays "
+            "in Python."
+        ) from error
     if engine is None:
         return source
     return replace(
@@ -347,8 +350,10 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     content = _read(path)
     digest = hashlib.sha256(content).hexdigest()
     if digest != expected:
-        sums = f"its SHA-256 is {digest[:12]}…, expected {expected[:12]}…"
-        raise ExportError(f"{path} is damaged or truncated: {sums}; copy it again.")
+        raise ExportError(
+            f"{path} is damaged or truncated: its SHA-256 is {digest[:12]}…, expected "
+            f"{expected[:12]}…; copy it again."
+        )
     if key is not None:
         signed = signature(content, key)
         file = sibling_path(path, "sig")
@@ -375,9 +380,9 @@ def _read(path: Path, most: int = -1) -> bytes:
         with path.open("rb") as file:
             return file.read(most)
     except FileNotFoundError as error:
-        problem = f"{error.filename} is missing"
-        do = "an export is a file and its .sha256, copied together"
-        raise ExportError(f"{problem}; {do}.") from error
+        raise ExportError(
+            f"{error.filename} is missing; an export is a file and its .sha256, copied together."
+        ) from error
     except (OSError, ValueError) as error:
         raise ExportError(f"{path} cannot be read: {error}.") from error
 
@@ -388,9 +393,10 @@ def metadata_of(content: bytes, path: Path) -> Metadata:
     No code of the file is run. Raises ExportError, which names `path`, if there is none or it has
     another schema.
     """
-    problem = f"{path} is not a dengine export, it holds no {METADATA}"
     with (
-        instead(ExportError, problem, *UNREADABLE),
+        instead(
+            ExportError, f"{path} is not a dengine export, it holds no {METADATA}", *UNREADABLE
+        ),
         zipfile.ZipFile(io.BytesIO(content)) as archive,
     ):
         names = (name for name in archive.namelist() if name.endswith(f"extra/{METADATA}"))
@@ -404,8 +410,9 @@ def check_schema(metadata: Any, path: Path) -> Metadata:
     """
     fields = metadata if isinstance(metadata, dict) else {}
     if fields.get("schema") != SCHEMA:
-        writer = f"dengine {fields.get('dengine', 'of an unknown version')}"
-        actual = f"schema {fields.get('schema')}, written by {writer}"
-        do = "export it anew, or load it with the dengine that wrote it"
-        raise ExportError(f"{path} has {actual}; this one reads schema {SCHEMA}: {do}.")
+        raise ExportError(
+            f"{path} has schema {fields.get('schema')}, written by dengine "
+            f"{fields.get('dengine', 'of an unknown version')}; this one reads schema {SCHEMA}: "
+            "export it anew, or load it with the dengine that wrote it."
+        )
     return fields

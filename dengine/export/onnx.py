@@ -137,8 +137,9 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     onnx = _import_package("onnx")
     target = Path(path)
     content = read_checked(target, key)
-    problem = f"{target} is not a dengine export in ONNX, it holds no {METADATA}"
-    with instead(ExportError, problem, Exception):  # protobuf's errors have no common base
+    with instead(
+        ExportError, f"{target} is not a dengine export in ONNX, it holds no {METADATA}", Exception
+    ):  # protobuf's errors have no common base
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
     return OnnxModel(content, check_schema(metadata, target))
@@ -347,8 +348,10 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
         difference = abs(actual.lower - expected.lower) + abs(actual.upper - expected.upper)
         same_counts = actual.action == expected.action and difference <= BOUND_TOLERANCE
         if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not same_counts):
-            problem = f"onnxruntime does not decide as the model does: {actual} for {expected}"
-            raise ExportError(f"{problem}; export torchscript.")
+            raise ExportError(
+                f"onnxruntime does not decide as the model does: {actual} for {expected}; export "
+                "torchscript."
+            )
 
 
 def _import_package(name: str) -> ModuleType:

@@ -218,8 +218,10 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
     """
     if isinstance(value, bytes):
         if len(value) % (4 * channels):
-            form = f"raw float32, little-endian, channel after channel, {channels} of them"
-            raise TraceError(f"Expected a list of numbers, or {form}, got {len(value)} bytes.")
+            raise TraceError(
+                "Expected a list of numbers, or raw float32, little-endian, channel after channel, "
+                f"{channels} of them, got {len(value)} bytes."
+            )
         words = np.frombuffer(value, dtype="<f4")
         if _look_like_float64(words):
             raise TraceError(

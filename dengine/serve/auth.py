@@ -251,9 +251,10 @@ class Guard:
         headers = Headers(scope=scope)
         host = headers.get("host")
         if not is_own_host(host, self.access.hosts):
-            names = "its IP address, localhost, or a name given by dengine serve --allow-host NAME"
             raise Refusal(
-                HTTPStatus.MISDIRECTED_REQUEST, f"Expected the server to be called by {names}."
+                HTTPStatus.MISDIRECTED_REQUEST,
+                "Expected the server to be called by its IP address, localhost, or a name given by "
+                "dengine serve --allow-host NAME.",
             )
         self._check_token(scope, headers)
         # Browsers say from which site a request comes. It must be this one, or no page at all.
@@ -287,10 +288,12 @@ class Guard:
         elif scope["path"] != "/healthz":
             if secret or "authorization" in headers:
                 self._log_wrong_token((scope.get("client") or ("", 0))[0])
-            how = "Authorization: Bearer TOKEN, or any user name with it as the password"
             challenge = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
             raise Refusal(
-                HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", challenge
+                HTTPStatus.UNAUTHORIZED,
+                "Expected the server's token: Authorization: Bearer TOKEN, or any user name with "
+                "it as the password.",
+                challenge,
             )
 
     def _log_wrong_token(self, client: str) -> None:
@@ -321,8 +324,11 @@ def _limit_body(receive: Receive, access: Access) -> Receive:
             async with asyncio.timeout_at(deadline):
                 message = await receive()
         except TimeoutError:
-            text = f"Expected the request's body within {access.body_seconds:g} s."
-            raise Refusal(HTTPStatus.REQUEST_TIMEOUT, text, CLOSE) from None
+            raise Refusal(
+                HTTPStatus.REQUEST_TIMEOUT,
+                f"Expected the request's body within {access.body_seconds:g} s.",
+                CLOSE,
+            ) from None
         is_incomplete = bool(message.get("more_body", False))
         bytes_left -= len(message.get("body", b""))
         if bytes_left < 0:
@@ -334,11 +340,12 @@ def _limit_body(receive: Receive, access: Access) -> Receive:
 
 def _too_large(largest: int) -> Refusal:
     """Return the refusal of a body of more than `largest` bytes."""
-    text = (
+    return Refusal(
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
         f"Expected a request of at most {largest} bytes (dengine serve --largest), "
-        "got a larger one."
+        "got a larger one.",
+        CLOSE,
     )
-    return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text, CLOSE)
 
 
 def _with_headers(send: Send) -> Send:

@@ -286,8 +286,12 @@ class HttpApi:
         def begin(engine: DataEngine, by: str) -> Changed:
             """Start the retrain, record as an event who asked for it, and return what changed."""
             if engine.state.is_retraining:
-                text = "A retrain is under way already; nothing changed."
-                return Changed("retrain", text, None, engine.version)
+                return Changed(
+                    "retrain",
+                    "A retrain is under way already; nothing changed.",
+                    None,
+                    engine.version,
+                )
             engine.release(by)
             engine.store.events.put("retrain", "asked for by hand", author=by)
             engine.retrain(wait=False)
@@ -314,8 +318,11 @@ class HttpApi:
         by = _checked_author(author)
         source = await self.service.call(copy_model)
         content = await asyncio.to_thread(_zip_export, source)
-        text = f"version {source.model_version} was downloaded"
-        await self.service.call(lambda engine: engine.store.events.put("export", text, author=by))
+        await self.service.call(
+            lambda engine: engine.store.events.put(
+                "export", f"version {source.model_version} was downloaded", author=by
+            )
+        )
         name = f"model_{source.model_version}.zip"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/zip", headers=headers)

@@ -302,8 +302,11 @@ class CellService:
                 return True, None
             retrain = engine.report(decision_id, label)
             if author:
-                text = f"decision {decision_id} was {'good' if label else 'bad'}"
-                engine.store.events.put("report", text, author=author)
+                engine.store.events.put(
+                    "report",
+                    f"decision {decision_id} was {'good' if label else 'bad'}",
+                    author=author,
+                )
             return False, retrain
 
         repeated, retrain = await self.call(work)

@@ -90,8 +90,7 @@ def routes(service: CellService, recorder: Recorder | None = None) -> list[Route
         Another media type or a compressed body gets 415.
         """
         if media_type(request) not in ("text/xml", "application/xml"):
-            text = "Expected an XML-RPC call, Content-Type: text/xml.\n"
-            return PlainTextResponse(text, 415)
+            return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
         xml = await call_method(calls, await request.body())
@@ -119,8 +118,10 @@ async def call_method(calls: dict[str, Call], body: bytes) -> bytes:
     try:
         signature(call).bind(*arguments)
     except TypeError as error:
-        text = f"Expected the arguments that {name} takes, got {len(arguments)}: {error}."
-        return fault(WRONG_ARGUMENTS, text)
+        return fault(
+            WRONG_ARGUMENTS,
+            f"Expected the arguments that {name} takes, got {len(arguments)}: {error}.",
+        )
     try:
         return xmlrpc.client.dumps((await call(*arguments),), methodresponse=True).encode()
     except DengineError as error:

@@ -77,9 +77,14 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
         If `out` exists, or cannot be written.
     """
     with reading(os.fspath(url)) as connection:
-        do = "pg_dump copies it, once the engines have ended: their journals lie on their machines"
         dialect = connection.dialect.name
-        expect(dialect == "sqlite", "a store in a file", dialect, do, StoreError)
+        expect(
+            dialect == "sqlite",
+            "a store in a file",
+            dialect,
+            "pg_dump copies it, once the engines have ended: their journals lie on their machines",
+            StoreError,
+        )
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.
@@ -131,8 +136,10 @@ def restore_store(
     """
     report = verify_history(os.fspath(copy))
     if not report.ok:
-        do = "see `dengine verify`, and take another copy"
-        raise StoreError(f"Expected a history as it was written in {copy}, found faults; {do}.")
+        raise StoreError(
+            f"Expected a history as it was written in {copy}, found faults; see `dengine verify`, "
+            "and take another copy."
+        )
     backup_store(copy, store)
     for cell in report.cells:
         path = journal_path(sa.URL.create("sqlite", database=os.fspath(store)), cell.cell_id)

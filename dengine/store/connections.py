@@ -83,10 +83,12 @@ def make_engine(url: str | None) -> sa.Engine:
             parsed = parsed.set(drivername="postgresql+psycopg")
         backend = parsed.get_backend_name()
         in_file = backend == "sqlite" and parsed.database not in (None, "", ":memory:")
-        expected = "a file, an SQLite file URL or a PostgreSQL URL"
-        do = "for a store that forgets use store=None"
         expect(
-            backend == "postgresql" or in_file, expected, parsed.render_as_string(), do, StoreError
+            backend == "postgresql" or in_file,
+            "a file, an SQLite file URL or a PostgreSQL URL",
+            parsed.render_as_string(),
+            "for a store that forgets use store=None",
+            StoreError,
         )
         if backend == "postgresql":
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=TIMEOUTS)
@@ -117,8 +119,10 @@ def _unusable_url(url: str, reason: str) -> StoreError:
 
     The message quotes only the part of the URL behind the last @, so that no password is in it.
     """
-    actual = f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'"
-    return StoreError(f"Expected a file or a database URL that can be used here, got {actual}.")
+    return StoreError(
+        f"Expected a file or a database URL that can be used here, got {url.split('@')[-1]!r}: "
+        f"{reason}. For PostgreSQL: pip install 'dengine[postgres]'."
+    )
 
 
 class CopyConnection(sqlite3.Connection):
@@ -265,9 +269,9 @@ def reading(url: str) -> Iterator[sa.Connection]:
         file = str(engine.url.database)
         # A `file:` name is a URI of SQLite's own.
         if sqlite and not (Path(file).is_file() or file.startswith("file:")):
-            do = "make a DataEngine with it, or let `dengine train` or `dengine run` make one"
             raise StoreError(
-                f"Expected a store that an engine has used, found no file {file}; {do}."
+                f"Expected a store that an engine has used, found no file {file}; make a "
+                "DataEngine with it, or let `dengine train` or `dengine run` make one."
             )
         with _store_errors("read", name), engine.connect() as connection:  # rolled back at the end
             connection.execution_options(**options)
@@ -535,9 +539,9 @@ class Database:
         key = int.from_bytes(digest[:8], "big", signed=True)
         taken = connection.execute("SELECT pg_try_advisory_lock(%s)", [key]).fetchone()[0]
         holder_query = (
-            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) "
-            "WHERE l.locktype = 'advisory' "
-            "AND (l.classid::bigint << 32) + l.objid::bigint = %s AND l.objsubid = 1 AND l.granted"
+            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) WHERE "
+            "l.locktype = 'advisory' AND (l.classid::bigint << 32) + l.objid::bigint = %s AND "
+            "l.objsubid = 1 AND l.granted"
         )
         holder = None if taken else connection.execute(holder_query, [key]).fetchone()
         connection.commit()

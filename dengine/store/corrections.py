@@ -70,10 +70,9 @@ class CorrectionTable(CellTable):
             if version is not None:
                 stored = self._versions.insert(connection, version)
                 if stored != version["version"]:
-                    expected = f"version {version['version']} to be the next"
                     raise StoreError(
-                        f"Expected {expected}, a peer of the product stored {stored - 1} "
-                        "meanwhile; try it again."
+                        f"Expected version {version['version']} to be the next, a peer of the "
+                        f"product stored {stored - 1} meanwhile; try it again."
                     )
             if change.settings is not None:
                 self._settings.replace(connection, change.settings)

@@ -59,9 +59,11 @@ class DecisionTable(CellTable):
         if not rows:
             return None
         if trace and not is_intact(TRACE, rows[0][-len(TRACE.c) :]):
-            where = f"as it was stored in {self._database.name}, its bytes have changed"
-            do = "see `dengine verify`, and restore the store from a copy"
-            raise StoreError(f"Expected the trace of decision {decision_id!r} {where}; {do}.")
+            raise StoreError(
+                f"Expected the trace of decision {decision_id!r} as it was stored in "
+                f"{self._database.name}, its bytes have changed; see `dengine verify`, and restore "
+                "the store from a copy."
+            )
         return read_decision(rows[0])
 
     def ids(self) -> Iterator[Sequence[str]]:

@@ -74,10 +74,12 @@ def encode_record(record: Record) -> bytes:
 
 def decode_record(blob: bytes) -> Record:
     """Return the record that `encode_record` wrote; raise StoreError for other bytes."""
-    do = "open the store with the dengine that wrote it"
     errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
     with instead(
-        StoreError, "Expected a record of a journal, got what cannot be read", *errors, do=do
+        StoreError,
+        "Expected a record of a journal, got what cannot be read",
+        *errors,
+        do="open the store with the dengine that wrote it",
     ):
         (length,) = LENGTH.unpack_from(blob)
         samples = blob[LENGTH.size + length :]
@@ -576,9 +578,10 @@ def _unpack_fields(content: bytes) -> dict[str, Any]:
 
 def forked_error(pid: int, name: str) -> StoreError:
     """Return the StoreError for a forked process that uses what its parent `pid` opened."""
-    actual = f"its fork {os.getpid()}"
-    do = "open it after the fork, in the process that uses it"
-    return StoreError(f"Expected the process that opened {name}, {pid}, got {actual}; {do}.")
+    return StoreError(
+        f"Expected the process that opened {name}, {pid}, got its fork {os.getpid()}; open it "
+        "after the fork, in the process that uses it."
+    )
 
 
 def describe_process() -> str:
@@ -591,10 +594,7 @@ def describe_process() -> str:
 
 def owned_error(owner: str, name: str) -> StoreError:
     """Return the StoreError for an engine whose cell another engine owns; it names that owner."""
-    do = (
-        "close that engine first, ask its page or its HTTP where it is served, or give this "
-        "one a cell_id of its own"
-    )
     return StoreError(
-        f"Expected a cell that no other engine runs on, but {owner} owns {name}; {do}."
+        f"Expected a cell that no other engine runs on, but {owner} owns {name}; close that engine "
+        "first, ask its page or its HTTP where it is served, or give this one a cell_id of its own."
     )

@@ -315,7 +315,7 @@ class LabelTable(CellTable):
         decisions.
         """
         if damaged:
-            names = f"decision {listed(damaged)}; see dengine verify"
             self._events.record_damage(
-                f"left out, since the {part} is not as it was stored: {names}"
+                f"left out, since the {part} is not as it was stored: "
+                f"decision {listed(damaged)}; see dengine verify"
             )

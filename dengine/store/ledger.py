@@ -161,12 +161,11 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
             begun = "without a key"
         elif tag is None:
             begun = "with a key"
-        expected = (
-            f"a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} "
-            f"names{'' if key else ', none'}"
+        raise StoreError(
+            f"Expected a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} "
+            f"names{'' if key else ', none'}; it was begun, or made anew, {begun}: have it name "
+            "the file of the ledger's own key, or none."
         )
-        do = "have it name the file of the ledger's own key, or none"
-        raise StoreError(f"Expected {expected}; it was begun, or made anew, {begun}: {do}.")
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:

@@ -82,13 +82,10 @@ def check_peer_settings(
     if different:
         expected = ", ".join(f"{key} {peer_values[key]}" for key in different)
         actual = ", ".join(f"{key} {values[key]}" for key in different)
-        do = (
-            "cells that share labels share what embeds them: give the same, or name another product"
-        )
         raise SettingError(
             f"Expected the settings of product {product!r}, as cell {name!r} has them "
-            f"({expected}), "
-            f"got {actual}; {do}."
+            f"({expected}), got {actual}; cells that share labels share what embeds them: give the "
+            "same, or name another product."
         )
 
 

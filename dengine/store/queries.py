@@ -165,12 +165,11 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     label = connection.execute(
         sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)
     ).first()
-    do = "it has worked without a product: name a new cell, and bring its labels over by an import"
     expect(
         settings is None and label is None,
         f"a new cell for product {product!r}",
         cell_id,
-        do,
+        "it has worked without a product: name a new cell, and bring its labels over by an import",
         StoreError,
     )
     lock(connection, PRODUCT, product)

@@ -66,9 +66,11 @@ def _when(record: Any) -> datetime:
 
 def unknown_decision(decision_id: str) -> UnknownDecisionError:
     """Return the error for a report on a decision that the store does not hold."""
-    actual = f"{shortened(decision_id)}, which this cell's store does not hold"
-    do = "report the `Decision.id` that `decide` returned, to the same store and cell_id"
-    return UnknownDecisionError(f"Expected the id of a stored decision, got {actual}; {do}.")
+    return UnknownDecisionError(
+        f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's "
+        "store does not hold; report the `Decision.id` that `decide` returned, to the same store "
+        "and cell_id."
+    )
 
 
 def already_reported(
@@ -96,18 +98,17 @@ def already_reported(
         if same
         else "if the first was wrong, look at how the part was checked"
     )
-    both = f"{stored} was reported first and stands, now came {new}"
     return ReportConflictError(
-        f"Expected one report a decision, got a second on {decision_id!r}: {both}; {advice}."
+        f"Expected one report a decision, got a second on {decision_id!r}: {stored} was reported "
+        f"first and stands, now came {new}; {advice}."
     )
 
 
 def nothing_to_correct(decision_id: str) -> ReportError:
     """Return the error for a correction of a decision that has no label."""
-    actual = f"{decision_id!r}, of which nothing was reported yet"
     return ReportError(
-        f"Expected a decision with a label, got {actual}; there is nothing to correct: report its "
-        "label."
+        f"Expected a decision with a label, got {decision_id!r}, of which nothing was reported "
+        "yet; there is nothing to correct: report its label."
     )
 
 
@@ -582,9 +583,9 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
         )
     except (ValueError, TypeError) as error:
         name = getattr(record_type, "__name__", record_type)
-        do = "see `dengine verify`, and restore the store from a copy"
         raise StoreError(
-            f"Expected a row of {name} as it was written, got another: {error}; {do}."
+            f"Expected a row of {name} as it was written, got another: {error}; see `dengine "
+            "verify`, and restore the store from a copy."
         ) from error
 
 

@@ -108,8 +108,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             StoreError,
         )
         alone = product is None or url is not None
-        do = "name a file or a server, which its cells share"
-        expect(alone, "no product of a store in memory", product, do, StoreError)
+        expect(
+            alone,
+            "no product of a store in memory",
+            product,
+            "name a file or a server, which its cells share",
+            StoreError,
+        )
         self.wait = _checked_wait(wait)
         self.clock = clock
         self.database = Database(url if url is None else str(url), cell_id, clock, product)
@@ -196,6 +201,11 @@ def _checked_wait(wait: float | None) -> float:
     seconds = math.nan
     with suppress(ValueError):
         seconds = float(value)
-    wanted = f"{WAIT_VARIABLE if wait is None else 'a wait'} above 0 seconds"
-    expect(0.0 < seconds < math.inf, wanted, value, f"{WAIT} is the default", StoreError)
+    expect(
+        0.0 < seconds < math.inf,
+        f"{WAIT_VARIABLE if wait is None else 'a wait'} above 0 seconds",
+        value,
+        f"{WAIT} is the default",
+        StoreError,
+    )
     return seconds

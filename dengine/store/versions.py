@@ -194,10 +194,9 @@ class VersionTable(CellTable):
         if row.state is None or (
             row.state_sum is not None and state_sum(row.state) != row.state_sum
         ):
-            where = f"as it was stored in {self._database.name}, its bytes have changed"
             raise VersionError(
-                f"Expected the state of version {row.version} {where}; restore the store from "
-                "a copy."
+                f"Expected the state of version {row.version} as it was stored in "
+                f"{self._database.name}, its bytes have changed; restore the store from a copy."
             )
         with instead(VersionError, f"Version {row.version} cannot be read", StoreError):
             state = from_npz(row.state, self._database.name)
