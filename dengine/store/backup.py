@@ -20,7 +20,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import OutputError, StoreError, expect, instead
-from ..files import output_file
+from ..files import FilePath, output_file
 from .connections import reading
 from .journal import Journal, Record, journal_path, read_undrained
 from .records import CHUNK
@@ -50,7 +50,7 @@ class BackupReport:
     without_journal: tuple[str, ...]
 
 
-def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> BackupReport:
+def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
     Engines may run meanwhile: everything that they had acknowledged when this was called is in the
@@ -108,9 +108,7 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
     return BackupReport(decisions, labels, sum(map(len, waiting.values())), without)
 
 
-def restore_store(
-    copy: str | os.PathLike[str], store: str | os.PathLike[str]
-) -> tuple[CellHistory, ...]:
+def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     """Copy a backup to the place of a store, on this or another machine, with a journal per cell.
 
     The journal names the newest ledger entry, so that the first engine knows that nothing is

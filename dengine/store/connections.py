@@ -31,7 +31,7 @@ from .ledger import (
     newest_entry,
 )
 from .queries import Scope, join_product
-from .records import as_text, chunks
+from .records import Clock, EntryName, Row, as_text, chunks
 from .schema import CELL, DECISION, LEDGER, check_schema, lock, prepare_tables
 
 T = TypeVar("T")
@@ -342,7 +342,7 @@ class Database:
         self,
         url: str | None,
         cell_id: str,
-        clock: Callable[[], float],
+        clock: Clock,
         product: str | None,
     ) -> None:
         self.cell_id = cell_id
@@ -354,7 +354,7 @@ class Database:
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._commits = threading.local()  # of each thread: `is_wanted` of `commit_if`
         self._key = b"" if url is None else ledger_key()
-        self.newest_entry: tuple[int, str] | None = None
+        self.newest_entry: EntryName | None = None
         self.on_entry: Callable[[], object] = lambda: None
         self._engine = self._writer = make_engine(url)
         chain_writes(self._engine)
@@ -616,7 +616,7 @@ class Database:
     # Rows
 
     def insert(
-        self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
+        self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Row]
     ) -> list[int]:
         """Insert rows of this cell into a table, each with a number; return these numbers.
 

@@ -19,7 +19,7 @@ from ..errors import StoreError, listed
 from .journal import Journal, Record, decode_record
 from .lookup import DecisionIndex
 from .recording import RETRY_SECONDS, Recorder
-from .records import DATA_LOST, LOSS_REMEDY
+from .records import DATA_LOST, LOSS_REMEDY, LabelNumbers
 
 if TYPE_CHECKING:
     from .sql import SqlStore
@@ -70,7 +70,7 @@ class Drainer:
         self._changed = recorder.changed
         self._wanted = 0  # up to this record somebody waits for the database
         self._error = ""
-        self._label_numbers: list[tuple[str, int]] = []  # of a product, not yet collected
+        self._label_numbers: LabelNumbers = []  # of a product, not yet collected
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="dengine-store", daemon=True)
@@ -130,7 +130,7 @@ class Drainer:
             "try this again when it is back."
         )
 
-    def pop_label_numbers(self) -> list[tuple[str, int]]:
+    def pop_label_numbers(self) -> LabelNumbers:
         """Return the numbers of labels, as `Outbox.pop_label_numbers` says."""
         with self._changed:
             numbers = self._label_numbers

@@ -19,6 +19,7 @@ from .records import (
     FORGOTTEN,
     LATE_STOP,
     Event,
+    LabelNumbers,
     NewLabel,
     StoredDecision,
     as_text,
@@ -67,7 +68,7 @@ class RecordInsertion:
         self._database = database
         self._corrections = corrections
 
-    def commit(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+    def commit(self, records: Sequence[Record]) -> LabelNumbers:
         """Commit records, as `SqlStore.apply_records` says.
 
         If the database refuses a value, the records are halved, each half in a transaction of its
@@ -85,9 +86,7 @@ class RecordInsertion:
         self._database.write(lambda connection: self._insert_events(connection, [], [text]))
         return []
 
-    def _insert(
-        self, connection: sa.Connection, records: Sequence[Record]
-    ) -> list[tuple[str, int]]:
+    def _insert(self, connection: sa.Connection, records: Sequence[Record]) -> LabelNumbers:
         """Insert what is not stored yet, without a commit.
 
         Return (decision id, number) of the labels that are stored now.

@@ -40,7 +40,17 @@ from typing import Any
 from ..errors import StoreError, instead
 from ..records import Decision
 from .owned_file import OwnedFile, open_plain, sync
-from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
+from .records import (
+    OF_DECISION,
+    EntryName,
+    Event,
+    NewLabel,
+    StoredDecision,
+    from_row,
+    pack,
+    to_row,
+    unpack,
+)
 
 # Length of a record's JSON text, before it; the samples of a trace or point follow it.
 LENGTH = struct.Struct("<I")
@@ -110,7 +120,7 @@ class Head:
         When it was written, in seconds since 1970.
     """
 
-    newest: tuple[int, str] | None = None
+    newest: EntryName | None = None
     n_drained: int = 0
     n_synced: int = 0
     digest: str = ""
@@ -162,7 +172,7 @@ class Journal:
         self.dropped = 0
         self.loss = ""
         self.head = read_head(path)
-        self.entries: list[tuple[int, str]] = []
+        self.entries: list[EntryName] = []
         self._head_file: FileIO | None = None  # opened when it is written first
         # Guards what header and head hold: two threads write them.
         self._describing = threading.RLock()
@@ -271,7 +281,7 @@ class Journal:
                 return
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
-    def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
+    def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write the newest ledger entry and `drained_to` to the header and to the head.
 
         Nothing is synced: an older header is harmless, since the store ignores

@@ -25,7 +25,7 @@ import hmac
 import json
 import os
 import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from itertools import groupby
@@ -35,6 +35,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from ..files import read_key
+from .records import Clock, EntryName, Row
 from .schema import CHAINED, CORRECTION, LABEL, LEDGER, LEDGER_KEY, RESERVED, SETTING, VERSION
 
 KEY_VARIABLE = "DENGINE_LEDGER_KEY"  # of the environment: the file of the key of all ledgers
@@ -50,7 +51,7 @@ START = bytes(32)  # the digest before a cell's first entry
 NOT_SUMMED = {"sum", "state"}
 
 
-def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
+def row_sum(table: str, row: Row) -> bytes:
     """Return the sum of a row: SHA-256 over the table's name and each value's name, type and bytes.
 
     It is the same on SQLite and PostgreSQL, as written and as read: true is 1 (SQLite has no
@@ -189,7 +190,7 @@ def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
     return digest.digest()
 
 
-def entry_digest(previous: bytes, head: Mapping[str, Any], key: bytes = b"") -> bytes:
+def entry_digest(previous: bytes, head: Row, key: bytes = b"") -> bytes:
     """Return the digest of a ledger entry over all its columns and the digest of the entry before.
 
     Parameters
@@ -261,7 +262,7 @@ class LedgerEntry:
         self._sums: dict[str, list[bytes]] = {}
         self.settings = False
 
-    def add_rows(self, table: str, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    def add_rows(self, table: str, rows: Sequence[Row]) -> list[Row]:
         """Add the sums of rows that are about to be inserted into a table.
 
         Return copies of the rows with two more columns: `entry`, the number of this entry, and
@@ -273,7 +274,7 @@ class LedgerEntry:
         self._sums.setdefault(table, []).extend(row["sum"] for row in chained)
         return chained
 
-    def append(self, clock: Callable[[], float]) -> tuple[int, str] | None:
+    def append(self, clock: Clock) -> EntryName | None:
         """Insert the entry into the ledger, as the transaction's last step; this does not commit.
 
         Parameters
