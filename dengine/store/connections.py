@@ -456,8 +456,11 @@ class Database:
 
     def has_entry(self, number: int, digest: str) -> bool:
         """Return whether the cell's ledger has an entry with this number and hexadecimal digest."""
-        query = sa.select(LEDGER.c.digest).where(LEDGER.c.cell_id == self.cell_id)
-        rows = self.read(query.where(LEDGER.c.number == number))
+        rows = self.read(
+            sa.select(LEDGER.c.digest).where(
+                LEDGER.c.cell_id == self.cell_id, LEDGER.c.number == number
+            )
+        )
         return [row.digest.hex() for row in rows] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:

@@ -109,11 +109,10 @@ class CorrectionTable(CellTable):
         list of Correction
             Of all cells of the product.
         """
-        query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(
-            CORRECTION.join(LABEL, CORRECTION_OF_LABEL)
-        )
-        query = query.where(
-            self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after)
+        query = (
+            sa.select(*CORRECTION.c, LABEL.c.seq)
+            .select_from(CORRECTION.join(LABEL, CORRECTION_OF_LABEL))
+            .where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after))
         )
         return [
             from_row(Correction, row._mapping)
@@ -160,7 +159,10 @@ class CorrectionTable(CellTable):
         None without a label. Ids that are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
-        query = sa.select(
-            *DECISION.c["id", "content_hash", "quarantined", "time"], *label
-        ).select_from(WITH_LABELS)
-        return self._database.rows_by_id(connection, query, ids)
+        return self._database.rows_by_id(
+            connection,
+            sa.select(*DECISION.c["id", "content_hash", "quarantined", "time"], *label).select_from(
+                WITH_LABELS
+            ),
+            ids,
+        )

@@ -57,8 +57,9 @@ class EventTable(CellTable):
 
         If the store cannot be written, the text is logged instead, and nothing raised.
         """
-        query = sa.select(EVENT.c.number).where(self._own(EVENT))
-        query = query.where(EVENT.c.kind == "damaged", EVENT.c.text == as_text(text))
+        query = sa.select(EVENT.c.number).where(
+            self._own(EVENT), EVENT.c.kind == "damaged", EVENT.c.text == as_text(text)
+        )
         if not self._read(query.limit(1)):
             try:
                 self.put("damaged", text)
@@ -113,6 +114,10 @@ class EventTable(CellTable):
         is_decision = self._own(DECISION) & (DECISION.c.id == decision_id)
         decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
         kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
-        query = sa.select(EVENT).where(self._own(EVENT), kinds, EVENT.c.entry > decided)
-        rows = self._read(query.order_by(EVENT.c.number).limit(1))
+        rows = self._read(
+            sa.select(EVENT)
+            .where(self._own(EVENT), kinds, EVENT.c.entry > decided)
+            .order_by(EVENT.c.number)
+            .limit(1)
+        )
         return from_row(Event, rows[0]._mapping) if rows else None

@@ -174,8 +174,12 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
 
     The digest is 32 bytes, the chains are JSON. None if the cell has no entry.
     """
-    query = sa.select(*LEDGER.c["number", "digest", "chains"]).where(LEDGER.c.cell_id == cell_id)
-    return connection.execute(query.order_by(LEDGER.c.number.desc()).limit(1)).first()
+    return connection.execute(
+        sa.select(*LEDGER.c["number", "digest", "chains"])
+        .where(LEDGER.c.cell_id == cell_id)
+        .order_by(LEDGER.c.number.desc())
+        .limit(1)
+    ).first()
 
 
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
@@ -317,8 +321,9 @@ def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
 
     {} for an unknown cell.
     """
-    query = sa.select(SETTING.c.key, SETTING.c.value)
-    query = query.where(SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED))
+    query = sa.select(SETTING.c.key, SETTING.c.value).where(
+        SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED)
+    )
     return {row.key: row.value for row in connection.execute(query)}
 
 
@@ -369,8 +374,12 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
         check_key(connection, cell_id, key)
     except StoreError as error:
         return f"{error}"
-    query = sa.select(LEDGER).where(LEDGER.c.cell_id == cell_id)
-    rows = connection.execute(query.order_by(LEDGER.c.number.desc()).limit(2))
+    rows = connection.execute(
+        sa.select(LEDGER)
+        .where(LEDGER.c.cell_id == cell_id)
+        .order_by(LEDGER.c.number.desc())
+        .limit(2)
+    )
     newest, before = [*(dict(row._mapping) for row in rows), {}, {}][:2]
     previous = before.get("digest", START)
     if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
@@ -402,10 +411,20 @@ def _find_table_error(
     number = IN_FORCE[name]
     table = number.table
     selected = table.c.cell_id == cell_id
-    entry = sa.select(table.c.entry).where(selected, number >= first).order_by(number).limit(1)
-    is_earlier = table.c.entry < sa.func.coalesce(entry.scalar_subquery(), 2**62)
-    earlier = sa.select(table.c.entry, number).where(selected, number < first, is_earlier)
-    before = connection.execute(earlier.order_by(number.desc()).limit(1)).first()
+    is_earlier = table.c.entry < sa.func.coalesce(
+        sa.select(table.c.entry)
+        .where(selected, number >= first)
+        .order_by(number)
+        .limit(1)
+        .scalar_subquery(),
+        2**62,
+    )
+    before = connection.execute(
+        sa.select(table.c.entry, number)
+        .where(selected, number < first, is_earlier)
+        .order_by(number.desc())
+        .limit(1)
+    ).first()
     chain = ""
     if before is not None:
         is_entry = (LEDGER.c.cell_id == cell_id) & (LEDGER.c.number == before.entry)
@@ -413,8 +432,11 @@ def _find_table_error(
         chain = _parse_chains(text or "").get(name, "")
         selected = selected & (number > before[1])
     selected &= table.c.entry.is_(None) | (table.c.entry <= last_entry)
-    query = sa.select(*(column for column in table.c if column.name != "state"))
-    rows = connection.execute(query.where(selected).order_by(number))
+    rows = connection.execute(
+        sa.select(*(column for column in table.c if column.name != "state"))
+        .where(selected)
+        .order_by(number)
+    )
     for _, group in groupby(rows, lambda row: row.entry):
         entry_rows = [dict(zip(rows.keys(), row, strict=True)) for row in group]
         if changed := [row for row in entry_rows if row_sum(name, row) != row["sum"]]:

@@ -116,8 +116,11 @@ def list_cells(url: str) -> list[CellSummary]:
 
     Raise StoreError if it is no store. Nothing is written.
     """
-    accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))
-    accepted = accepted.where(VERSION.c.accepted == sa.true()).group_by(VERSION.c.cell_id)
+    accepted = (
+        sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))
+        .where(VERSION.c.accepted == sa.true())
+        .group_by(VERSION.c.cell_id)
+    )
     with reading(url) as connection:
         settings = connection.execute(sa.select(*SETTING.c["cell_id", "key", "value"])).all()
         decisions = _count_by_cell(connection, DECISION)

@@ -424,8 +424,11 @@ class CellCheck:
         key = table.c[KEY[table.name]]
         required_key = required.c[KEY[required.name]]
         is_pair = (required.c.cell_id == table.c.cell_id) & (required_key == key)
-        query = sa.select(key).select_from(table.outerjoin(required, is_pair))
-        query = query.where(table.c.cell_id == self.cell_id, required_key.is_(None))
+        query = (
+            sa.select(key)
+            .select_from(table.outerjoin(required, is_pair))
+            .where(table.c.cell_id == self.cell_id, required_key.is_(None))
+        )
         for id_ in self.connection.execute(query).scalars():
             yield self._fault(required.name, id_, f"is missing: a row of {table.name} is there")
 

@@ -238,8 +238,8 @@ class VersionTable(CellTable):
 
         Its columns are retrain, version, and `kept`, whether the state is kept.
         """
-        query = sa.select(
-            *VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept")
+        return (
+            sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
+            .where(self._scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
+            .order_by(VERSION.c.retrain.desc())
         )
-        query = query.where(self._scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
-        return query.order_by(VERSION.c.retrain.desc())
