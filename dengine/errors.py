@@ -1,11 +1,12 @@
-"""The exceptions of dengine, and functions that raise them and build their messages. All modules
-use them; a user catches `DengineError` or a subclass.
+"""The exceptions of dengine, functions that raise them and build their messages, and the log. All
+modules use them; a user catches `DengineError` or a subclass.
 
 `expect` and `instead` raise messages of one form: what was expected, what came, what to do.
 `shortened` and `listed` keep a message to one line, `without_password` masks passwords,
 `percent` writes shares, and `as_options` turns advice for Python into advice for the command line.
 """
 
+import logging
 import math
 import re
 import reprlib
@@ -14,6 +15,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+log = logging.getLogger("dengine")
 MASK = "***"
 # Up to the last @, for a password may hold an unescaped one, or a blank. A path writes // as /.
 URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")

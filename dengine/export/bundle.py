@@ -1,7 +1,7 @@
 """What every exported file has, TorchScript or ONNX: description, checksum and signature.
 `torchscript` and `onnx` write and read their files through the functions here: `prepare_export`
-checks and builds the module, `describe` and `write_export` write, `read_checked` and
-`read_metadata` read, and `make_key` makes the key that signs.
+checks and builds the module, `describe` and `write_export` write, `read_checked` and `metadata_of`
+read, and `make_key` makes the key that signs.
 
     dengine export --make-key cell.key
     dengine export engine.db --out model.ts --key cell.key  # model.ts, .ts.sha256, .ts.sig
@@ -68,18 +68,19 @@ def make_key(path: FilePath) -> Path:
         If there is a file already, because models may be signed with it, or it cannot be written.
     """
     target = Path(path)
+    if os.path.lexists(target):
+        raise ExportError(
+            f"{target} is there already, and files may be signed with it; name a new one."
+        )
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    try:
-        with os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file:
-            file.write(secrets.token_hex(32) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except FileExistsError as error:
-        problem = f"{target} is there already, and files may be signed with it"
-        raise ExportError(f"{problem}; name a new one.") from error
-    except OSError as error:
-        problem = f"Cannot write {target}: {error.strerror}"
-        raise ExportError(f"{problem}; choose a folder that exists and is writable.") from error
+    do = "choose a folder that exists and is writable"
+    with (
+        instead(ExportError, f"Cannot write {target}", OSError, do=do),
+        os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file,
+    ):
+        file.write(secrets.token_hex(32) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
     return target
 
 
@@ -216,7 +217,7 @@ def describe(source: Exportable) -> Metadata:
 
     It names schema, versions, time, trace contract, policy, references (number and SHA-256), the
     order of fields, actions and reasons, audits and seed. It can be read without loading the model,
-    see `read_metadata`.
+    see `metadata_of`.
     """
     model = source.model
     index = model.index
@@ -307,28 +308,6 @@ def _check_outputs(path: FilePath, force: bool) -> None:
     """Raise OutputError unless the file, its checksum and its signature may be written."""
     for file in (Path(path), sibling_path(path, "sha256"), sibling_path(path, "sig")):
         check_output(file, force)
-
-
-def read_metadata(path: FilePath, *, key: FilePath | None = None) -> Metadata:
-    """Read the description in an exported TorchScript file, without loading its code.
-
-    Parameters
-    ----------
-    path : path-like
-    key : path-like, optional
-        File of the key that it must be signed with.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    ExportError
-        For a file that is missing, unreadable, damaged or not signed with the key, that is no
-        export or has another schema.
-    """
-    return metadata_of(read_checked(Path(path), key), Path(path))
 
 
 def read_checked(path: Path, key: FilePath | None = None) -> bytes:

@@ -15,7 +15,6 @@ missing head is logged. A last line without its end was being written when the p
 it is left out. Anything else that does not fit is a DataError that names the line.
 """
 
-import logging
 import os
 import zlib
 from collections.abc import Mapping
@@ -28,7 +27,7 @@ import numpy as np
 
 from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
-from ..errors import DataError, StoreError, instead
+from ..errors import DataError, StoreError, instead, log
 from ..files import FilePath
 from ..recipe import Recipe
 from ..records import FITS, Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
@@ -38,7 +37,6 @@ from ..traces import as_trace, can_fit_length
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
 
-log = logging.getLogger("dengine")
 FORM = 4
 LABELS = {"1": True, "0": False}
 LARGEST_COUNT = 2**62

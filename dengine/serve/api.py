@@ -9,7 +9,6 @@ not finite.
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -38,6 +37,7 @@ from ..errors import (
     TraceError,
     UnknownDecisionError,
     as_options,
+    log,
     shortened,
     without_password,
 )
@@ -49,7 +49,6 @@ from ..representation import to_jsonable
 from ..store.records import Correction, Event, StoredDecision, StoredVersion, VersionError
 from .service import ReportResponse
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 Json = dict[str, Any]
 JSON = "application/json"

@@ -10,7 +10,6 @@ and by the headers `Origin` and `Sec-Fetch-Site`, and refuses them.
 import asyncio
 import base64
 import hmac
-import logging
 import os
 import stat
 from contextvars import ContextVar
@@ -25,10 +24,9 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import SettingError, instead
+from ..errors import SettingError, instead, log
 from .api import Refusal, problem_response
 
-log = logging.getLogger("dengine")
 MIN_TOKEN_LENGTH = 16  # characters
 MAX_CLIENTS = 1000  # whose wrong tokens are logged
 SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing

@@ -31,13 +31,12 @@ from asyncua.ua import VariantType
 from asyncua.ua.attribute_ids import AttributeIds
 from asyncua.ua.status_codes import StatusCodes
 
-from ..errors import DengineError, SettingError, as_options
+from ..errors import DengineError, SettingError, as_options, log
 from ..files import FilePath
 from .auth import host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
-log = logging.getLogger("dengine")
 PORT = 4840
 MAX_MESSAGE = 1 << 20  # bytes, 250,000 samples
 CHUNK = 65535  # bytes of a part of a message

@@ -7,7 +7,6 @@ XML: no document type, no entity, nothing from outside.
 """
 
 import asyncio
-import logging
 import xmlrpc.client
 from inspect import signature
 from typing import Any
@@ -17,13 +16,12 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
-from ..errors import DengineError, ReportError, as_options
+from ..errors import DengineError, ReportError, as_options, log
 from .api import media_type
 from .auth import RPC
 from .robot_calls import Call, Recorder, RobotCalls, one_line
 from .service import CellService
 
-log = logging.getLogger("dengine")
 SMALL_BODY = 1 << 16  # bytes; a larger call is parsed in a thread
 TAGS = (
     "int",

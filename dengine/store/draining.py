@@ -5,7 +5,6 @@ than a time limit, even where the database does not answer. `JournalledStore` ha
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
@@ -15,7 +14,7 @@ from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..errors import StoreError, listed
+from ..errors import StoreError, listed, log
 from .journal import Journal, Record, decode_record
 from .lookup import DecisionIndex
 from .recording import RETRY_SECONDS, Recorder
@@ -24,7 +23,6 @@ from .records import DATA_LOST, LOSS_REMEDY, LabelNumbers
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 DRAIN_SECONDS = 0.25  # synced records wait so long for others before they are drained together
 LAG_SECONDS = 1.0  # a larger lag is a fault of the store

@@ -2,13 +2,12 @@
 one.
 """
 
-import logging
 from collections.abc import Mapping
 from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import StoreError
+from ..errors import StoreError, log
 from .cell_table import CellTable
 from .records import (
     ACKNOWLEDGED,
@@ -22,8 +21,6 @@ from .records import (
     to_row,
 )
 from .schema import DECISION, EVENT
-
-log = logging.getLogger("dengine")
 
 
 class EventTable(CellTable):

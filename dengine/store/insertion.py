@@ -3,14 +3,13 @@ events. Records may come twice, and may contradict what is stored; nothing is gu
 lost: one that cannot be stored becomes an event, "dead letter". `SqlStore` has one.
 """
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import StoreError
+from ..errors import StoreError, log
 from .connections import ROW_ERRORS, Database
 from .corrections import CorrectionTable
 from .journal import Record
@@ -29,8 +28,6 @@ from .records import (
     trace_row,
 )
 from .schema import DECISION, EVENT, LABEL, TRACE
-
-log = logging.getLogger("dengine")
 
 
 @dataclass

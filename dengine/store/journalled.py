@@ -9,7 +9,6 @@ disk or the database does not answer. `lag` is how far the database is behind.
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
@@ -17,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
-from ..errors import NotTakenError, StoreError
+from ..errors import NotTakenError, StoreError, log
 from ..records import RetrainReport
 from .draining import Drainer
 from .journal import HEADER, decode_record
@@ -30,7 +29,6 @@ from .views import HistoryFilter
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 NO_LIMIT = 1e9  # seconds: never reached
 LOCK_SECONDS = 0.001  # a wait for the lock that counts as none

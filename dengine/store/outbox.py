@@ -6,7 +6,6 @@ makes the one that fits a store.
 
 from __future__ import annotations
 
-import logging
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
@@ -15,7 +14,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
-from ..errors import StoreError
+from ..errors import StoreError, log
 from ..records import RetrainReport
 from .journal import forked_error
 from .records import Arrays, LabelNumbers, NewLabel, StoredDecision
@@ -23,7 +22,6 @@ from .records import Arrays, LabelNumbers, NewLabel, StoredDecision
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 
 

@@ -5,7 +5,6 @@ both.
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
@@ -13,11 +12,10 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from ..errors import NotTakenError
+from ..errors import NotTakenError, log
 from .journal import Journal, LostJournalError, Record, encode_record
 from .records import Clock, StoredDecision, new_event
 
-log = logging.getLogger("dengine")
 BATCH_SECONDS = 0.05  # a record waits so long for others before they are written together
 RETRY_SECONDS = 1.0  # between two attempts after a failure
 LONG = 8 << 20  # bytes of a journal that is to be cleared
