@@ -87,8 +87,8 @@ class Out:
 
         Parameters
         ----------
-        contents : mapping of str to DataFrame, Figure or str
-            File name -> a table (written as CSV), a figure or a text. The name "" is `path` itself.
+        contents : mapping of str to DataFrame or Figure
+            File name -> a table (written as CSV) or a figure. The name "" is `path` itself.
 
         Returns
         -------
@@ -105,16 +105,13 @@ class Out:
 
         from ..experiments.figures import save
         from ..experiments.tables import write_csv
-        from ..files import write_manifest, write_output
+        from ..files import write_manifest
 
         paths = []
         for name, content in contents.items():
             path = self.path / name
             if isinstance(content, Figure):
                 paths.append(save(content, path, force=self.force))
-            elif isinstance(content, str):
-                text = content.encode("utf-8")
-                paths.append(write_output(path, text, self.force, make_folder=True))
             else:
                 paths.append(write_csv(content, path, self.force))
         if "" not in contents:

@@ -64,18 +64,19 @@ def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _change_and_print(
-    store: str, author: str, allow_import: bool, change: Callable[[DataEngine], Changed]
+    change: Callable[[DataEngine, str], Changed], store: str, author: str, allow_import: bool
 ) -> None:
-    """Open the store's engine, let `change` change it, and print what changed.
+    """Open the store's engine, let `change` change it for the author, and print what changed.
 
-    `change` returns a `Changed`, which says so in words. The engine is closed before that is
-    printed. The JSON document also has the policy and the certificate after the change.
+    `change` returns a `Changed`, which says so in words; the other arguments are `store_options`.
+    The engine is closed before that is printed. The JSON document also has the policy and the
+    certificate after the change.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
 
     with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
-        changed = change(engine)
+        changed = change(engine, author)
         certificate = engine.certificate()
         policy = engine.policy
     event = ""
@@ -91,7 +92,7 @@ def _change_and_print(
 @store_options
 @click.argument("part", metavar="PART|ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-def report(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
+def report(part: str, label: str, **changing: Any) -> None:
     """Report whether a part was good or bad.
 
     The part is named by its number, if it has one decision beside rejects, or by that decision's
@@ -103,7 +104,7 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
 
-    def change(engine: DataEngine) -> Changed:
+    def change(engine: DataEngine, author: str) -> Changed:
         """Report the label and record an event; report nothing if the decision has that label."""
         id_ = find_decision_id(engine.store, part)
         stored = engine.find(id_)
@@ -115,18 +116,18 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
                 engine.version,
             )
         engine.report(id_, LABELS[label])
-        engine.store.events.put("report", f"decision {id_} was {label}", author=author)
-        event = engine.store.events.newest(1)[-1].number
+        text = f"decision {id_} was {label}"
+        event = engine.store.events.put("report", text, author=author)
         return Changed("report", f"Decision {id_} was {label}.", event, engine.version)
 
-    _change_and_print(store, author, allow_import, change)
+    _change_and_print(change, **changing)
 
 
 @verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
 @store_options
 @click.argument("part", metavar="PART|ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-def correct(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
+def correct(part: str, label: str, **changing: Any) -> None:
     """Correct a wrong label: the part was good, or bad.
 
     The part is named as for `dengine report`. From now on its decision counts with the corrected
@@ -135,48 +136,46 @@ def correct(store: str, part: str, label: str, author: str, allow_import: bool) 
     """
     from ..history.explain import find_decision_id
 
-    def change(engine: DataEngine) -> Changed:
-        return engine.correct(find_decision_id(engine.store, part), LABELS[label], author)
-
-    _change_and_print(store, author, allow_import, change)
+    _change_and_print(
+        lambda engine, author: engine.correct(
+            find_decision_id(engine.store, part), LABELS[label], author
+        ),
+        **changing,
+    )
 
 
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")
 @store_options
 @click.argument("decisions", metavar="ID...", nargs=-1, required=True)
 @click.option("--reason", default="", help="Why, for the record.")
-def forget(
-    store: str, decisions: tuple[str, ...], reason: str, author: str, allow_import: bool
-) -> None:
+def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
     """Leave labels out of everything that is learned and counted.
 
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings a label
     back. If one of the decisions is unknown or has no label, none is forgotten.
     """
-
-    def change(engine: DataEngine) -> Changed:
-        return engine.forget(*decisions, author=author, reason=reason)
-
-    _change_and_print(store, author, allow_import, change)
+    _change_and_print(
+        lambda engine, author: engine.forget(*decisions, author=author, reason=reason), **changing
+    )
 
 
 @verb("dengine rollback engine.db 1")
 @store_options
 @click.argument("version", metavar="VERSION", type=int)
-def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
+def rollback(version: int, **changing: Any) -> None:
     """Use an earlier model version again, as a new version.
 
     Labels that came since are among its references, and corrections count. It is pinned: no
     automatic retrain replaces it, until `dengine release` or `dengine retrain`.
     """
-    _change_and_print(store, author, allow_import, lambda engine: engine.rollback(version, author))
+    _change_and_print(lambda engine, author: engine.rollback(version, author), **changing)
 
 
 @verb("dengine release engine.db")
 @store_options
-def release(store: str, author: str, allow_import: bool) -> None:
+def release(**changing: Any) -> None:
     """Let retrains replace a pinned version again."""
-    _change_and_print(store, author, allow_import, lambda engine: engine.release(author))
+    _change_and_print(lambda engine, author: engine.release(author), **changing)
 
 
 @verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
@@ -196,10 +195,10 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     """
     if settings:
         _change_and_print(
+            lambda engine, by: engine.set_policy(engine.policy.changed(**settings), by),
             store,
             author,
             allow_import,
-            lambda engine: engine.set_policy(engine.policy.changed(**settings), author),
         )
         return
     from ..engine.engine import DataEngine

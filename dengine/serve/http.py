@@ -293,10 +293,9 @@ class HttpApi:
                     engine.version,
                 )
             engine.release(by)
-            engine.store.events.put("retrain", "asked for by hand", author=by)
+            event = engine.store.events.put("retrain", "asked for by hand", author=by)
             engine.retrain(wait=False)
-            event = engine.store.events.newest(1)[-1]
-            return Changed("retrain", "The retrain has begun.", event.number, engine.version)
+            return Changed("retrain", "The retrain has begun.", event, engine.version)
 
         return await self._change(author, begin)
 

@@ -31,8 +31,8 @@ class EventTable(CellTable):
 
     def put(
         self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""
-    ) -> None:
-        """Commit an event with the present time.
+    ) -> int:
+        """Commit an event with the present time, and return its number.
 
         Parameters
         ----------
@@ -45,9 +45,10 @@ class EventTable(CellTable):
             For data that JSON does not have, and if the database fails.
         """
         event = new_event(kind, text, self._database.clock(), data, author)
-        self._database.write(
+        (number,) = self._database.write(
             lambda connection: self._database.insert(connection, EVENT.c.number, [to_row(event)])
         )
+        return number
 
     def record_damage(self, text: str) -> None:
         """Commit an event of kind "damaged", unless the cell has one with this text.
