@@ -480,7 +480,7 @@ class GaussianProcess(Baseline):
         Z = self._components.transform(X)
         mean, variance = self._classifier.latent_mean_and_variance(Z)
         half = normal_quantile(self.policy.alpha) * np.sqrt(np.maximum(variance, 0.0))
-        return BaselinePrediction(np.asarray(expit(mean - half)), np.asarray(expit(mean + half)))
+        return BaselinePrediction(expit(mean - half), expit(mean + half))
 
 
 def risk_bound(n_wrong: int, n: int, delta: float) -> float:

@@ -530,10 +530,9 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
 
     It has the decision's trace, the band of good parts (None where there is none), up to `N_BADS`
     newest bad traces among the newest `N_LABELS` labels (none if their shape differs), and the
-    corrections of its label. Band and bad traces are rounded for a picture. Raises StoreError for
-    a damaged trace of the decision or of a neighbour; other damaged rows are left out, and an event
-    records that. Raises UnknownDecisionError without a decision, ReportConflictError if the part
-    has several.
+    corrections of its label. Raises StoreError for a damaged trace of the decision or of a
+    neighbour; other damaged rows are left out, and an event records that. Raises
+    UnknownDecisionError without a decision, ReportConflictError if the part has several.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -541,18 +540,11 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     bads = labelled.traces[labelled.labels == 0][-N_BADS:]
     if bads.shape[1:] != trace.shape:
         bads = np.zeros((0, *trace.shape))
-    # float64, because the range of float32 values can overflow.
-    finite = np.nan_to_num(trace, posinf=0.0, neginf=0.0).astype(np.float64)
-    digits = 4 - int(np.log10(np.ptp(finite) or 1.0))  # enough for a picture
-    arrays = {name: getattr(explanation.envelope, name, None) for name in ("low", "median", "high")}
-    rounded = {
-        name: None if values is None else np.round(values.astype(np.float64), digits)
-        for name, values in (arrays | {"bads": bads}).items()
-    }
+    band = {name: getattr(explanation.envelope, name, None) for name in ("low", "median", "high")}
     decision_id = explanation.decision.decision.id
     corrections = [item for item in store.corrections.after() if item.decision_id == decision_id]
     return response_fields(
-        "Explanation", explanation, trace=trace, corrections=corrections, **rounded
+        "Explanation", explanation, trace=trace, bads=bads, corrections=corrections, **band
     )
 
 
