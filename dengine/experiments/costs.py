@@ -57,6 +57,7 @@ Z = normal_quantile(ALPHA_EACH)
 MOST_NEIGHBOURS = 10**7
 MOST_MORE = 10_000  # times the recordings: what needs more is never shown
 Groups = Mapping[Policy, Sequence[Replay]]
+Play = Callable[[Sequence[Task]], Sequence[Replay]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,7 +416,7 @@ class PolicySearch:
         else:
             self.remaining.append(candidate)
 
-    def run(self, play: Callable[[Sequence[Task]], Sequence[Replay]]) -> None:
+    def run(self, play: Play) -> None:
         """Halve the candidates in rounds, and let the last ones play fresh shuffles.
 
         It shortens `remaining` and keeps the replays, of which `curve` makes the result.
@@ -437,12 +438,7 @@ class PolicySearch:
         self._fresh.update(fresh)
         self._play(play, fresh, None)
 
-    def _play(
-        self,
-        play: Callable[[Sequence[Task]], Sequence[Replay]],
-        seeds: range,
-        scores: Contender | None,
-    ) -> bool:
+    def _play(self, play: Play, seeds: range, scores: Contender | None) -> bool:
         """Play the remaining candidates over some seeds, if given on the scores of one engine.
 
         Returns whether all was played.

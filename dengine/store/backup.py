@@ -23,7 +23,7 @@ from ..errors import OutputError, StoreError, expect, instead
 from ..files import FilePath, output_file
 from .connections import reading
 from .journal import Journal, Record, journal_path, read_undrained
-from .records import CHUNK
+from .records import chunks
 from .schema import DECISION, LABEL, SETTING
 from .sql import SqlStore
 from .verification import CellHistory, verify_history
@@ -167,8 +167,8 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
     if not records:
         return
     with SqlStore(str(file), cell) as store:
-        for begin in range(0, len(records), CHUNK):
-            store.apply_records(records[begin : begin + CHUNK])
+        for part in chunks(records):
+            store.apply_records(part)
 
 
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:
