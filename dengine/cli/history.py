@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
 from datetime import UTC, datetime
 from heapq import merge
 from typing import TYPE_CHECKING, Any
@@ -111,7 +110,7 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
-    with closing(open_store(store, must_exist=True)) as opened:
+    with open_store(store, must_exist=True) as opened:
         decisions = list(read_history(opened, **criteria))
         since = criteria["since"]
         if since is None and decisions:
@@ -230,7 +229,7 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
-    with closing(open_store(store, must_exist=True)) as opened:
+    with open_store(store, must_exist=True) as opened:
         if decision == "last":
             newest = next(history(opened, last=1), None)
             if newest is None:

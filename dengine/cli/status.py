@@ -1,6 +1,5 @@
 """The verb `dengine status`: how an engine is doing, as far as its store tells."""
 
-from contextlib import closing
 from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +76,7 @@ def status(store: str, last: int, check_seconds: float) -> None:
             )
             return
         store = address(store, cells[0].cell_id)
-    with closing(open_store(store, must_exist=True)) as opened:
+    with open_store(store, must_exist=True) as opened:
         report = read_status(opened, last, watching=True)
     record = {"store": store} | to_jsonable(report)
     record["certificate"] = certificate_record(report.certificate)
