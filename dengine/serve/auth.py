@@ -11,6 +11,7 @@ import asyncio
 import base64
 import hmac
 import os
+import re
 import stat
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -28,6 +29,8 @@ from ..errors import SettingError, instead, log
 from .api import Refusal, problem_response
 
 MIN_TOKEN_LENGTH = 16  # characters
+# A secret, a role and the owner's name.
+TOKEN_LINE = re.compile(rf"([!-~]{{{MIN_TOKEN_LENGTH},}})(?:\s+(viewer|operator)(?:\s+(.+))?)?")
 MAX_CLIENTS = 1000  # whose wrong tokens are logged
 SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing
 RPC = "/RPC2"  # a robot that cannot send headers may append its token to this path
@@ -112,20 +115,16 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
             f"Expected a token file that only its owner may use, {file} has mode {mode:o}; "
             f"run: chmod 600 {file}"
         )
-    lines = [line.split() for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
-    tokens = tuple(Token(line[0], line[1:2] != ["viewer"], " ".join(line[2:])) for line in lines)
-    secrets = {
-        token.secret for token in tokens if token.secret.isascii() and token.secret.isprintable()
-    }
-    if not tokens or len(secrets) < len(tokens) or min(map(len, secrets)) < MIN_TOKEN_LENGTH:
+    lines = [line for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
+    matches = [TOKEN_LINE.fullmatch(line.strip()) for line in lines]
+    tokens = tuple(
+        Token(match[1], match[2] != "viewer", match[3] or "") for match in matches if match
+    )
+    if not tokens or len({token.secret for token in tokens}) < len(lines):
         raise SettingError(
             f"Expected tokens of at least {MIN_TOKEN_LENGTH} ASCII characters in {file}, one per "
-            f"line and each once; make one: (umask 077; openssl rand -hex 24 > {file})"
-        )
-    if any(line[1:2] not in ([], ["viewer"], ["operator"]) for line in lines):
-        raise SettingError(
-            f"Expected viewer or operator, and then a name, after each token of {file}; "
-            "or the token alone."
+            "line and each once, alone or followed by viewer or operator and then a name; make "
+            f"one: (umask 077; openssl rand -hex 24 > {file})"
         )
     return tokens
 
