@@ -227,39 +227,33 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     values.
     """
     padded = [*words[:N_DECISION_WORDS], *[""] * (N_DECISION_WORDS - len(words))]
-    id_, label, part, *decided = padded
+    id_, label, part, action, predicted, reason, lower, upper, n_success, n_failure = padded
     with instead(DataError, f"The decision in {where} cannot be read", ValueError):
-        action = Action(decided[0])
-        predicted = Action(decided[1])
-        reason = Reason(decided[2])
-        lower = float(decided[3])
-        upper = float(decided[4])
-        n_success = int(decided[5])
-        n_failure = int(decided[6])
-    has_counts = 0 <= min(n_success, n_failure) <= max(n_success, n_failure) < LARGEST_COUNT
-    is_valid = 0.0 <= lower <= upper <= 1.0 and has_counts
-    expect_data(is_valid, f"bounds between 0 and 1 and counts in {where}", ",".join(decided[3:7]))
-    is_rejected = action is Action.REJECT
+        decision = Decision(
+            id=id_,
+            action=Action(action),
+            predicted=Action(predicted),
+            lower=float(lower),
+            upper=float(upper),
+            n_success=int(n_success),
+            n_failure=int(n_failure),
+            embedding=None,
+            model_version=0,
+            reason=Reason(reason),
+            audit=reason == Reason.AUDIT.value,
+            propensity=1.0,
+            part=part or None,
+        )
+    counts = (decision.n_success, decision.n_failure)
+    has_counts = 0 <= min(counts) <= max(counts) < LARGEST_COUNT
+    is_valid = 0.0 <= decision.lower <= decision.upper <= 1.0 and has_counts
+    expect_data(is_valid, f"bounds between 0 and 1 and counts in {where}", ",".join(padded[6:]))
+    is_rejected = decision.action is Action.REJECT
     is_valid = id_ != "" and (label == "" or (label in LABELS and not is_rejected))
     expect_data(is_valid, f"an id, and a label of 1, 0 or nothing in {where}", (id_, label))
     trace = np.zeros((1, 0), dtype=np.float32)
     if not is_rejected:
         trace = _parse_trace(words[N_DECISION_WORDS:], spec, where)
-    decision = Decision(
-        id=id_,
-        action=action,
-        predicted=predicted,
-        lower=lower,
-        upper=upper,
-        n_success=n_success,
-        n_failure=n_failure,
-        embedding=None,
-        model_version=0,
-        reason=reason,
-        audit=reason is Reason.AUDIT,
-        propensity=1.0,
-        part=part or None,
-    )
     return JournalLine(decision, trace, LABELS.get(label))
 
 
