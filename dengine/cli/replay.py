@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from ..datasets import Dataset
     from ..experiments.costs import CostCurve, PolicyCost
-    from ..experiments.grid import Task
+    from ..experiments.grid import PlayedReplay, Task
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
 
@@ -86,8 +86,6 @@ class PlayedTasks(NamedTuple):
     ----------
     replays : list of Replay
         In the order of their tasks.
-    interrupted : str
-        A sentence that says how many were finished, if something left some out; else "".
     costs : dict of str to float
         seconds : wall time. core_seconds : of one core, over all replays. kept : how many replays
         had been kept by an earlier run.
@@ -96,7 +94,6 @@ class PlayedTasks(NamedTuple):
     """
 
     replays: list[Replay]
-    interrupted: str
     costs: dict[str, float]
     error: BaseException | None
 
@@ -109,8 +106,7 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
     """
     from ..experiments.grid import iterate_replays
 
-    replays: dict[int, Replay] = {}
-    n_kept = 0
+    played: list[PlayedReplay] = []
     begin = time.perf_counter()
     interruption: BaseException | None = None
     n_cycles = len(tasks) * (stream.cycles or len(dataset))
@@ -118,24 +114,20 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
         # A callback cannot travel to other processes: there the bar moves by whole replays.
         on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
         try:
-            for i, replay, kept in iterate_replays(
+            for item in iterate_replays(
                 dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
             ):
-                replays[i] = replay
-                n_kept += kept
-                advance(len(replay) if on_cycle is None or kept else 0)
+                played.append(item)
+                advance(len(item.replay) if on_cycle is None or item.kept else 0)
         except (KeyboardInterrupt, Exception) as error:  # what was finished is shown first
             interruption = error
-    interrupted = ""
-    if interruption is not None:
-        interrupted = f"Interrupted: {len(replays)} of {len(tasks)} replays were finished"
+    replays = [item.replay for item in sorted(played, key=lambda item: item.position)]
     costs = {
         "seconds": time.perf_counter() - begin,
-        "core_seconds": sum(replay.seconds for replay in replays.values()),
-        "kept": n_kept,
+        "core_seconds": sum(replay.seconds for replay in replays),
+        "kept": sum(item.kept for item in played),
     }
-    finished = [replays[i] for i in sorted(replays)]
-    return PlayedTasks(finished, interrupted, costs, interruption)
+    return PlayedTasks(replays, costs, interruption)
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
@@ -348,7 +340,8 @@ def _replay_and_print(
     tasks = grid_tasks(
         contenders, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid
     )
-    replays, interrupted, costs, error = _play_tasks(dataset, tasks, stream)
+    replays, costs, error = _play_tasks(dataset, tasks, stream)
+    interrupted = f"Interrupted: {len(replays)} of {len(tasks)} replays were finished"
     if not replays:
         _end(error, f"{interrupted}; there is nothing to show.", False)
     frame = tables.frame_of(replays, check_seconds)
@@ -360,7 +353,7 @@ def _replay_and_print(
         "in_order": not stream.shuffle,
         "faults": dataset.faults,
         "rows": rows,
-        "interrupted": bool(interrupted),
+        "interrupted": error is not None,
         "costs": costs,
     }
     legend = legend_or_hint(tables.LEGEND)

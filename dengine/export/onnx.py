@@ -189,8 +189,7 @@ class OnnxModel:
         self.session = runtime.InferenceSession(content, options, providers=providers)
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
-        warm = np.linspace(-1.0, 1.0, self.trace.channels * self.trace.samples)
-        self.decide(warm.reshape(self.trace.channels, self.trace.samples))
+        self.decide(golden_trace(self.trace))  # warms it up
 
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
@@ -309,8 +308,7 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
     messages up to WARNING, are off in the whole process, because torch names packages that it could
     use and need not. Raises ExportError if torch makes no program.
     """
-    ramp = torch.linspace(-1.0, 1.0, spec.channels * spec.samples)
-    example = (ramp.reshape(spec.channels, spec.samples),)
+    example = (torch.from_numpy(golden_trace(spec)),)
     options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)

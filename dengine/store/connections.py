@@ -361,11 +361,12 @@ class Database:
         self.url = self._engine.url  # its password included
         self.name = self.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
-        in_file = self.url.get_backend_name() == "sqlite" and self.url.database is not None
-        file = sqlite_file(self.url) if in_file else None
-        # None: in memory, or a server
-        self._file = file if file is not None and file.is_file() else None
-        self._opened = None if self._file is None else self._file.stat()
+        # The file with what it was when it was opened. None: in memory, or a server.
+        self._file: tuple[Path, os.stat_result] | None = None
+        if self.url.get_backend_name() == "sqlite" and self.url.database is not None:
+            file = sqlite_file(self.url)
+            if file.is_file():
+                self._file = file, file.stat()
 
     def _open(self, product: str | None) -> Scope:
         """Create the tables or check them, enter the cell if it is new, and set `newest_entry`.
@@ -434,10 +435,11 @@ class Database:
 
         PostgreSQL and a store in memory are not checked.
         """
-        if self._file is None or self._opened is None:
+        if self._file is None:
             return
+        file, opened = self._file
         with suppress(OSError):
-            if os.path.samestat(self._file.stat(), self._opened):
+            if os.path.samestat(file.stat(), opened):
                 return
         raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
 
