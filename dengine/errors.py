@@ -1,20 +1,21 @@
-"""The exceptions of dengine, and functions that raise them and build their messages. All modules
-use them; a user catches `DengineError` or a subclass.
+"""The exceptions of dengine, functions that raise them and build their messages, and the log. All
+modules use them; a user catches `DengineError` or a subclass.
 
 `expect` and `instead` raise messages of one form: what was expected, what came, what to do.
-`shortened`, `excerpt` and `listed` keep a message to one line, `without_password` masks passwords,
+`shortened` and `listed` keep a message to one line, `without_password` masks passwords,
 `percent` writes shares, and `as_options` turns advice for Python into advice for the command line.
 """
 
+import logging
 import math
 import re
 import reprlib
 import shlex
-import unicodedata
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+log = logging.getLogger("dengine")
 MASK = "***"
 # Up to the last @, for a password may hold an unescaped one, or a blank. A path writes // as /.
 URL = re.compile(r"(\w[\w+.-]*:/{1,2}[^\s:/@'\"]*):(\S*|[^\n'\"]*)@")
@@ -53,24 +54,6 @@ def shortened(value: Any) -> str:
         return (
             f"a number of {value.bit_length()} bits" if is_integer else f"a {type(value).__name__}"
         )
-
-
-def excerpt(text: str, at: int = 0) -> str:
-    """Return the `repr` of the 60 characters of a text around position `at`, for a message.
-
-    "..." stands where text is left out. If the character at that position is not printable ASCII,
-    its Unicode name, code point and position, counted from 1, follow.
-    """
-    begin = max(min(at - MAX_LENGTH // 2, len(text) - MAX_LENGTH), 0)
-    end = begin + MAX_LENGTH
-    before = "..." if begin else ""
-    after = "..." if len(text) > end else ""
-    result = f"{before}{text[begin:end]!r}{after}"
-    char = text[at : at + 1]
-    if not char or (char.isascii() and char.isprintable()):
-        return result
-    name = unicodedata.name(char, "a control character")
-    return f"{result}, with {name} (U+{ord(char):04X}) at character {at + 1}"
 
 
 def listed(names: Iterable[Any]) -> str:

@@ -47,8 +47,12 @@ def read_key(path: FilePath, error: type[DengineError]) -> bytes:
 
     Raises `error` if the file cannot be read, or the secret has fewer than 16 bytes.
     """
-    message = f"The key's file {path} cannot be read"
-    with instead(error, message, OSError, do="dengine export --make-key writes one"):
+    with instead(
+        error,
+        f"The key's file {path} cannot be read",
+        OSError,
+        do="dengine export --make-key writes one",
+    ):
         secret = Path(path).read_bytes().rstrip(b"\r\n")
     wanted = f"a key of {MIN_KEY_BYTES} bytes or more in {path}"
     is_long = len(secret) >= MIN_KEY_BYTES
@@ -73,9 +77,10 @@ def check_size(size: float, source: object) -> None:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         limit = min(MAX_BYTES, memory // 2) if memory > 0 else MAX_BYTES
     if size > limit:
-        wanted = f"at most {_size_text(limit)} of arrays in {source}"
-        do = "split it, or read it where there is more memory"
-        raise DataError(f"Expected {wanted}, got {_size_text(size)}; {do}.")
+        raise DataError(
+            f"Expected at most {_size_text(limit)} of arrays in {source}, got {_size_text(size)}; "
+            "split it, or read it where there is more memory."
+        )
 
 
 def read_errors(
@@ -305,7 +310,13 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
 
 def _write_errors(target: Path, *also: type[Exception]) -> AbstractContextManager[None]:
     """Return a context manager that raises OutputError with advice for OSError and `also`."""
-    do = (
-        "choose a folder that exists, is writable and has room, and a file that no program has open"
+    return instead(
+        OutputError,
+        f"Cannot write {target}",
+        OSError,
+        *also,
+        do=(
+            "choose a folder that exists, is writable and has room, and a file that no program has "
+            "open"
+        ),
     )
-    return instead(OutputError, f"Cannot write {target}", OSError, *also, do=do)

@@ -16,8 +16,11 @@ def import_class(path: str) -> type:
         If the module cannot be imported, whatever it raises, or has no class of that name.
     """
     module, _, name = path.partition(":")
-    message = f"Expected module:Class that can be imported here, got {shortened(path)}"
-    with instead(SettingError, message, Exception):
+    with instead(
+        SettingError,
+        f"Expected module:Class that can be imported here, got {shortened(path)}",
+        Exception,
+    ):
         value = getattr(import_module(module), name)
     if not isinstance(value, type):
         kind = type(value).__name__

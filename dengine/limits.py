@@ -61,8 +61,12 @@ class ForceLimits:
         valid = valid and self.low <= self.high and (self.low, self.high) != (-math.inf, math.inf)
         valid = valid and _is_channel(self.channel)
         valid = valid and (self.along is None or _is_channel(self.along))
-        wanted = "start <= end, low <= high, one of these finite, and channels from 0 on, or names"
-        expect(valid, f"force_limits with {wanted}", self)
+        expect(
+            valid,
+            "force_limits with start <= end, low <= high, one of these finite, and channels from 0 "
+            "on, or names",
+            self,
+        )
 
     def __str__(self) -> str:
         fields = [
@@ -97,9 +101,9 @@ class ForceLimits:
         except SettingError:
             raise
         except (TypeError, ValueError) as error:
-            form = "START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, :reject behind it"
             raise SettingError(
-                f"Expected force_limits as {form}, got {shortened(text)}."
+                "Expected force_limits as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, "
+                f":along=2, :reject behind it, got {shortened(text)}."
             ) from error
 
 

@@ -81,8 +81,12 @@ class ReducerDefault:
 
 def _check_retrain_every(value: Any) -> None:
     """Raise SettingError for a `retrain_every` that is no integer in range."""
-    at_least = "retrain_every to be an integer of at least 1"
-    expect(is_whole(value, 1, 10**9), at_least, value, "at most 1,000,000,000")
+    expect(
+        is_whole(value, 1, 10**9),
+        "retrain_every to be an integer of at least 1",
+        value,
+        "at most 1,000,000,000",
+    )
 
 
 @dataclass(frozen=True)
@@ -154,8 +158,11 @@ class Recipe:
             expect(valid, "params of plain names and values", {name: value}, "hand an object in")
         methods = ("fit", "get_params")
         valid = isinstance(self.reducer, str) or all(hasattr(self.reducer, m) for m in methods)
-        wanted = "a reducer's name, or a scikit-learn transformer with fit and get_params"
-        expect(valid, wanted, self.reducer)
+        expect(
+            valid,
+            "a reducer's name, or a scikit-learn transformer with fit and get_params",
+            self.reducer,
+        )
         expect(isinstance(self.policy, Policy), "policy to be a Policy", self.policy)
 
     @property
@@ -198,8 +205,10 @@ class Recipe:
             return cls.from_toml(text, where=str(recipe))
         if CLASS_PATH.fullmatch(str(recipe)):
             return cls(str(recipe))
-        wanted = f"a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a reducer"
-        raise SettingError(f"Expected {wanted}; {str(recipe)[:200]} is none.")
+        raise SettingError(
+            f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a "
+            f"reducer; {str(recipe)[:200]} is none."
+        )
 
     @classmethod
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
@@ -242,9 +251,10 @@ class Recipe:
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
         if missing and str(recipe.reducer) not in RECIPES:
-            actual = f"a recipe of {recipe.name} without {listed(missing)}"
-            do = "restore the store from a copy"
-            raise StoreError(f"Expected {where} to hold every setting, got {actual}; {do}.")
+            raise StoreError(
+                f"Expected {where} to hold every setting, got a recipe of {recipe.name} without "
+                f"{listed(missing)}; restore the store from a copy."
+            )
         return recipe
 
     def to_toml(self) -> str:
@@ -297,8 +307,9 @@ def _check_keys(table: Table, record_type: Any, where: str) -> None:
     names = sorted(f.name for f in fields(record_type))
     unknown = sorted(set(table) - set(names))
     if unknown:
-        message = f"{where} has an unknown key {listed(unknown)}; known are {', '.join(names)}."
-        raise SettingError(message)
+        raise SettingError(
+            f"{where} has an unknown key {listed(unknown)}; known are {', '.join(names)}."
+        )
 
 
 def _read_text(path: Path) -> str | None:
@@ -310,12 +321,14 @@ def _read_text(path: Path) -> str | None:
         if not path.is_file():
             return None
         if path.stat().st_size > LARGEST:
-            limit = f"a recipe of at most {LARGEST // 2**20} MB"
-            raise SettingError(f"Expected {limit}, {path} is larger.")
+            raise SettingError(
+                f"Expected a recipe of at most {LARGEST // 2**20} MB, {path} is larger."
+            )
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        actual = f"{error.reason} at byte {error.start}"
-        raise SettingError(f"{path} is not UTF-8 text: {actual}; save it as UTF-8.") from error
+        raise SettingError(
+            f"{path} is not UTF-8 text: {error.reason} at byte {error.start}; save it as UTF-8."
+        ) from error
     except OSError as error:  # a name that is too long among them
         raise SettingError(
             f"Cannot read the recipe {str(path)[:200]}: {error.strerror}."

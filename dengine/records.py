@@ -216,9 +216,13 @@ def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
     """
     if "trace" not in settings:
         return None
-    message = f"Expected a trace's contract in the settings, got {shortened(settings['trace'])}"
     with instead(
-        StoreError, message, ValueError, TypeError, RecursionError, do="restore the store"
+        StoreError,
+        f"Expected a trace's contract in the settings, got {shortened(settings['trace'])}",
+        ValueError,
+        TypeError,
+        RecursionError,
+        do="restore the store",
     ):
         return TraceSpec(**json.loads(settings["trace"]))
 
@@ -381,9 +385,11 @@ def as_success(value: Any, owner: str = "") -> bool:
     if isinstance(plain, bool | np.bool_ | Real) and (plain == 0 or plain == 1):
         return bool(plain)
     whose = f" of {owner}," if owner else ""
-    wanted = f"a label, True (success) or False (failure), or exactly 1 or 0,{whose}"
-    do = "nothing was stored: turn it into one of these first, as in success=(answer == 'OK')"
-    raise ReportError(f"Expected {wanted} got {shortened(value)}; {do}.")
+    raise ReportError(
+        f"Expected a label, True (success) or False (failure), or exactly 1 or 0,{whose} got "
+        f"{shortened(value)}; nothing was stored: turn it into one of these first, as in "
+        "success=(answer == 'OK')."
+    )
 
 
 def as_outcome(value: Any, owner: str = "") -> Outcome:
@@ -393,9 +399,13 @@ def as_outcome(value: Any, owner: str = "") -> Outcome:
     whose outcome it is.
     """
     whose = f" of {owner}," if owner else ""
-    message = f"Expected an Outcome, {', '.join(Outcome)},{whose} got {shortened(value)}"
-    do = "return Outcome.UNKNOWN where nothing is known"
-    with instead(ReportError, message, ValueError, TypeError, do=do):
+    with instead(
+        ReportError,
+        f"Expected an Outcome, {', '.join(Outcome)},{whose} got {shortened(value)}",
+        ValueError,
+        TypeError,
+        do="return Outcome.UNKNOWN where nothing is known",
+    ):
         return Outcome(value)
 
 
@@ -425,7 +435,11 @@ def as_id(value: Any) -> str:
 
     Raises ReportError for anything but a text of 1 to 200 printable characters.
     """
-    wanted = f"the id of a decision, a text of 1 to {LONGEST} characters that print"
-    do = "report the `Decision.id` that `decide` returned"
-    expect(is_name(value), wanted, value, do, ReportError)
+    expect(
+        is_name(value),
+        f"the id of a decision, a text of 1 to {LONGEST} characters that print",
+        value,
+        "report the `Decision.id` that `decide` returned",
+        ReportError,
+    )
     return str(value)

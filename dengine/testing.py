@@ -96,8 +96,9 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     assert enough_spaces, "in one space every label would be counted where it was seen"
     Z = trained.embed(Q)
     fold = np.arange(20) % trained.n_spaces
-    message = "two fits differ: give it a random_state"
-    np.testing.assert_array_equal(_train_clone(reducer).embed(Q), Z, err_msg=message)
+    np.testing.assert_array_equal(
+        _train_clone(reducer).embed(Q), Z, err_msg="two fits differ: give it a random_state"
+    )
     np.testing.assert_array_equal(trained.embed_references(Q, fold), Z[np.arange(20), fold])
     assert Z.ndim == 3, f"expected (n, K, d), got {Z.shape}"
     expected = f"expected 20 traces in {trained.n_spaces} spaces"
@@ -124,8 +125,9 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
         labels = y.copy()
         labels[fold == k] = np.random.default_rng(k).permutation(1 - y[fold == k])
         other = _train_clone(reducer, times=2, labels=labels).embed(QUERIES)
-        message = f"labels of fold {k} moved space {k}"
-        np.testing.assert_array_equal(other[:, k], Z[:, k], err_msg=message)
+        np.testing.assert_array_equal(
+            other[:, k], Z[:, k], err_msg=f"labels of fold {k} moved space {k}"
+        )
 
 
 def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
@@ -144,8 +146,9 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
             raise
         # If this fit fails as well, labels are not the reason, and its own error is raised.
         clone(reducer).fit(X if isinstance(reducer, Reducer) else X[:, 0], y)
-        message = "its fit works with labels alone, got none; set uses_labels = True"
-        raise AssertionError(f"{message} ({error})") from error
+        raise AssertionError(
+            f"its fit works with labels alone, got none; set uses_labels = True ({error})"
+        ) from error
 
 
 def fit_starts_afresh(reducer: Any) -> None:
@@ -313,8 +316,9 @@ def check_reducer(reducer: Any) -> None:
             problem = str(error)
             if isinstance(error, torch.jit.Error):
                 problem = f"TorchScript compiles its module and cannot run it: {reason_of(error)}"
-            message = f"{type(reducer).__name__} breaks {check.__name__!r}: {problem}"
-            raise AssertionError(message) from error
+            raise AssertionError(
+                f"{type(reducer).__name__} breaks {check.__name__!r}: {problem}"
+            ) from error
 
 
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:

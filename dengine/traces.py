@@ -55,15 +55,17 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
     x = _as_real(_channels_of(trace, trace_spec) if hasattr(trace, "columns") else trace)
     x = x[None, :] if x.ndim == 1 else x
     if x.ndim != 2 or x.size == 0:
-        wanted = "one trace, (samples,) or (channels, samples)"
-        raise TraceError(f"Expected {wanted}, got shape {np.shape(trace)}.")
+        raise TraceError(
+            f"Expected one trace, (samples,) or (channels, samples), got shape {np.shape(trace)}."
+        )
     if trace_spec is not None:
         x = _match_spec(x, trace_spec)
     elif len(x) > x.shape[1]:
-        actual = f"{len(x)} channels of {x.shape[1]} samples, which looks transposed"
-        meant = f"TraceSpec(samples={x.shape[1]}, channels={len(x)})"
-        do = f"turn it, trace.T, or agree on {meant} first if it is meant"
-        raise TraceError(f"Expected (channels, samples), got {actual}; {do}.")
+        raise TraceError(
+            f"Expected (channels, samples), got {len(x)} channels of {x.shape[1]} samples, which "
+            f"looks transposed; turn it, trace.T, or agree on TraceSpec(samples={x.shape[1]}, "
+            f"channels={len(x)}) first if it is meant."
+        )
     x = np.ascontiguousarray(x)
     return x if x.flags.writeable else x.copy()  # torch warns of read-only, memory-mapped arrays
 
@@ -92,8 +94,9 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     x = _as_real(X)
     x = x[:, None, :] if x.ndim == 2 else x
     if x.ndim != 3 or 0 in x.shape[1:]:
-        wanted = "traces (n, samples) or (n, channels, samples)"
-        raise TraceError(f"Expected {wanted}, got shape {np.shape(X)}.")
+        raise TraceError(
+            f"Expected traces (n, samples) or (n, channels, samples), got shape {np.shape(X)}."
+        )
     if trace_spec is not None:
         x = _match_spec(x, trace_spec)
     return np.ascontiguousarray(x)
@@ -106,8 +109,10 @@ def as_labels(y: ArrayLike) -> NDArray[np.int64]:
     """
     labels = np.asarray(y)
     if not np.isin(labels, (0, 1)).all():
-        do = "turn them into these before they count"
-        raise DataError(f"Expected labels 1 (success) and 0 (failure), got others; {do}.")
+        raise DataError(
+            "Expected labels 1 (success) and 0 (failure), got others; turn them into these before "
+            "they count."
+        )
     return labels.astype(np.int64)
 
 
@@ -160,11 +165,12 @@ def _channels_of(table: Any, trace_spec: TraceSpec | None) -> Any:
     """
     names = [] if trace_spec is None else list(trace_spec.columns)
     if not names:
-        do = "name its channels, TraceSpec(columns=...), or pass table[CHANNELS].to_numpy().T"
-        raise TraceError(f"Expected an array (channels, samples), got a table; {do}.")
+        raise TraceError(
+            "Expected an array (channels, samples), got a table; name its channels, "
+            "TraceSpec(columns=...), or pass table[CHANNELS].to_numpy().T."
+        )
     if not set(names) <= set(table.columns):
-        wanted = f"the columns {', '.join(names)}"
-        raise TraceError(f"Expected {wanted}, got {listed(table.columns)}.")
+        raise TraceError(f"Expected the columns {', '.join(names)}, got {listed(table.columns)}.")
     return table[names].to_numpy().T
 
 
@@ -177,13 +183,15 @@ def _as_real(values: ArrayLike) -> TraceArray:
     try:
         array: NDArray[Any] = np.asarray(values)
     except (ValueError, TypeError) as error:
-        wanted = "real numbers, in rows of one length"
-        raise TraceError(f"Expected {wanted}, got others: {error}.") from error
+        raise TraceError(
+            f"Expected real numbers, in rows of one length, got others: {error}."
+        ) from error
     if array.dtype == np.float32:
         return array  # as controllers send it: the guard below costs a tenth of a decision
     if array.dtype.kind not in "fiub":
-        do = "convert the trace to float32"
-        raise TraceError(f"Expected real numbers, got dtype {array.dtype}; {do}.")
+        raise TraceError(
+            f"Expected real numbers, got dtype {array.dtype}; convert the trace to float32."
+        )
     with np.errstate(over="ignore"):  # what overflows becomes an infinity, which `TraceGate` finds
         return array.astype(np.float32, copy=False)
 
@@ -340,9 +348,11 @@ def check_rate(force_limits: Sequence[ForceLimits], trace_spec: TraceSpec | None
     """
     in_seconds = [limits for limits in force_limits if limits.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
-        why = f"because force limits are in seconds ({listed(in_seconds)})"
-        do = "state time.rate_hz of recordings, or start with TraceSpec(samples=..., rate_hz=...)"
-        raise SettingError(f"Expected the rate of the traces, {why}, got an unknown one; {do}.")
+        raise SettingError(
+            "Expected the rate of the traces, because force limits are in seconds "
+            f"({listed(in_seconds)}), got an unknown one; state time.rate_hz of recordings, or "
+            "start with TraceSpec(samples=..., rate_hz=...)."
+        )
 
 
 WITHIN_LIMITS = -1  # in place of an `ActionCode`
@@ -437,11 +447,11 @@ def convert_trace(trace: Any, trace_spec: TraceSpec | None, may_start_over: bool
     except TraceError as error:
         if not may_start_over or trace_spec is None:
             raise
-        shape = f"{trace_spec.channels} x {trace_spec.samples}"
-        origin = f"The contract, {shape}, was set by the first trace"
-        do = f"start over with a new store and {_spec_advice(trace)}"
-        why = "nothing was learned by it yet: if that trace was the wrong one"
-        raise TraceError(f"{error} {origin}, and {why}, {do}.") from error
+        raise TraceError(
+            f"{error} The contract, {trace_spec.channels} x {trace_spec.samples}, was set by the "
+            "first trace, and nothing was learned by it yet: if that trace was the wrong one, "
+            f"start over with a new store and {_spec_advice(trace)}."
+        ) from error
 
 
 def _spec_advice(trace: Any) -> str:
@@ -476,10 +486,10 @@ def infer_trace_spec(x: TraceArray, trace: object) -> tuple[TraceSpec, bool]:
     """
     trace_spec = TraceSpec(samples=x.shape[1], channels=x.shape[0])
     if trace_spec.samples < MIN_SAMPLES:
-        wanted = f"a first trace of {MIN_SAMPLES} samples or more"
-        why = "for it sets the contract of all that follow"
-        do = f"record longer, or start with {_spec_advice(x)} if it is meant"
-        actual = f"{trace_spec.channels} x {trace_spec.samples}"
-        raise TraceError(f"Expected {wanted}, {why}, got {actual}; {do}.")
+        raise TraceError(
+            f"Expected a first trace of {MIN_SAMPLES} samples or more, for it sets the contract of "
+            f"all that follow, got {trace_spec.channels} x {trace_spec.samples}; record longer, or "
+            f"start with {_spec_advice(x)} if it is meant."
+        )
     reason, _ = TraceGate(trace_spec)(torch.from_numpy(x))
     return trace_spec, reason == 0

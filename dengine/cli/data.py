@@ -240,7 +240,7 @@ def train(
     except StepInterruptedError as interrupt:
         exit_interrupted(
             f"Interrupted: {interrupt.args[0]} of {len(dataset)} traces are in {store}; the same "
-            f"command continues there."
+            "command continues there."
         )
     with DataEngine.open_or_create(
         store, wait=LONG_WAIT, recipe=recipe, allow_import=allow_import
@@ -253,11 +253,11 @@ def train(
             "import": imported,
         }
         if not (imported.imported or engine.state.new_labels) and engine.version:
-            text = (
+            print_result(
+                record | {"retrain": None},
                 f"{store} already has all of {dataset.name}, nothing was done. "
-                f"Version {engine.version} of {name} answers."
+                f"Version {engine.version} of {name} answers.",
             )
-            print_result(record | {"retrain": None}, text)
             return
         with progress_bar("training", None):
             reports = [engine.retrain()]

@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
 from datetime import UTC, datetime
 from heapq import merge
 from typing import TYPE_CHECKING, Any
@@ -64,24 +63,37 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-_LAST = "How many of the newest decisions are shown."
-_ACTION = "Only decisions with this action."
-_MODEL = (
-    "Only decisions where the model alone would have done this, as in an audit or in shadow mode."
-)
-_LABEL = "Only decisions with this label, or without a reported one."
-_SINCE = "Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC."
-
-
 @verb("dengine history engine.db --last 20 --events")
 @options.store_argument
-@click.option("--last", type=options.COUNT, default=50, show_default=True, help=_LAST)
-@click.option("--action", type=NameChoice("action"), help=_ACTION)
-@click.option("--model", "predicted", type=NameChoice("action"), help=_MODEL)
+@click.option(
+    "--last",
+    type=options.COUNT,
+    default=50,
+    show_default=True,
+    help="How many of the newest decisions are shown.",
+)
+@click.option("--action", type=NameChoice("action"), help="Only decisions with this action.")
+@click.option(
+    "--model",
+    "predicted",
+    type=NameChoice("action"),
+    help=(
+        "Only decisions where the model alone would have done this, as in an audit or in shadow "
+        "mode."
+    ),
+)
 @click.option("--reason", type=NameChoice("reason"), help="Only decisions with this reason.")
-@click.option("--label", type=NameChoice("label"), help=_LABEL)
+@click.option(
+    "--label",
+    type=NameChoice("label"),
+    help="Only decisions with this label, or without a reported one.",
+)
 @click.option("--part", metavar="NUMBER", help="Only decisions on the part with this number.")
-@click.option("--since", type=Moment(), help=_SINCE)
+@click.option(
+    "--since",
+    type=Moment(),
+    help="Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.",
+)
 @click.option("--until", type=Moment(), help="Only decisions before then, given as for --since.")
 @click.option("--events", is_flag=True, help="Show the retrains and events between them too.")
 def history(store: str, events: bool, **criteria: Any) -> None:
@@ -98,7 +110,7 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
-    with closing(open_store(store, must_exist=True)) as opened:
+    with open_store(store, must_exist=True) as opened:
         decisions = list(read_history(opened, **criteria))
         since = criteria["since"]
         if since is None and decisions:
@@ -217,7 +229,7 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
-    with closing(open_store(store, must_exist=True)) as opened:
+    with open_store(store, must_exist=True) as opened:
         if decision == "last":
             newest = next(history(opened, last=1), None)
             if newest is None:

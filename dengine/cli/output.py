@@ -10,14 +10,12 @@ import math
 import re
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from textwrap import fill
-from threading import Event, Thread
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
 
 Record = dict[str, Any]  # what `--json` prints, by name
 SCREEN_WIDTH = 80  # columns where no terminal says otherwise; every table fits them
-LINE_SECONDS = 30.0  # between two lines about progress where there is no terminal
 INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
 # The names of two flags, and the keys in click's context that hold whether they were given.
 JSON = "--json"
@@ -90,8 +87,8 @@ class Out:
 
         Parameters
         ----------
-        contents : mapping of str to DataFrame, Figure or str
-            File name -> a table (written as CSV), a figure or a text. The name "" is `path` itself.
+        contents : mapping of str to DataFrame or Figure
+            File name -> a table (written as CSV) or a figure. The name "" is `path` itself.
 
         Returns
         -------
@@ -108,16 +105,13 @@ class Out:
 
         from ..experiments.figures import save
         from ..experiments.tables import write_csv
-        from ..files import write_manifest, write_output
+        from ..files import write_manifest
 
         paths = []
         for name, content in contents.items():
             path = self.path / name
             if isinstance(content, Figure):
                 paths.append(save(content, path, force=self.force))
-            elif isinstance(content, str):
-                text = content.encode("utf-8")
-                paths.append(write_output(path, text, self.force, make_folder=True))
             else:
                 paths.append(write_csv(content, path, self.force))
         if "" not in contents:
@@ -314,9 +308,7 @@ def certificate_record(certificate: "Certificate") -> Record:
 
 @contextmanager
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on stderr while the block runs; none beside `--json`.
-
-    Where stderr is no terminal, a line every 30 s says how far the work is.
+    """Show a progress bar on stderr while the block runs; none beside `--json` or without terminal.
 
     Parameters
     ----------
@@ -329,59 +321,16 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
     advance : callable
         `advance(n)` moves the bar by n steps.
     """
-    if as_json():
+    if as_json() or not sys.stderr.isatty():
         yield lambda n: None
         return
-    if not sys.stderr.isatty():
-        with _progress_lines(label, total) as advance:
-            yield advance
-        return
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(without_password(label), total=total)
         yield lambda n: bar.advance(task, n)
-
-
-@contextmanager
-def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Write a line to stderr every `LINE_SECONDS` while the block runs, as `progress_bar` does."""
-    n_steps = 0
-    ended = Event()
-
-    def advance(n: int) -> None:
-        """Count n more steps."""
-        nonlocal n_steps
-        n_steps += n
-
-    def write_lines() -> None:
-        """Write until the block ends."""
-        begin = time.monotonic()
-        while not ended.wait(LINE_SECONDS):
-            seconds = format_duration(time.monotonic() - begin)
-            text = f"{label}: {n_steps:,} of {total or '?'} in {seconds}"
-            click.echo(without_password(text), err=True)
-
-    Thread(target=write_lines, daemon=True).start()
-    try:
-        yield advance
-    finally:
-        ended.set()
 
 
 class StepInterruptedError(Exception):

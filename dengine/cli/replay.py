@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
     from ..datasets import Dataset
     from ..experiments.costs import CostCurve, PolicyCost
-    from ..experiments.grid import Task
+    from ..experiments.grid import PlayedReplay, Task
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
 
@@ -86,8 +86,6 @@ class PlayedTasks(NamedTuple):
     ----------
     replays : list of Replay
         In the order of their tasks.
-    interrupted : str
-        A sentence that says how many were finished, if something left some out; else "".
     costs : dict of str to float
         seconds : wall time. core_seconds : of one core, over all replays. kept : how many replays
         had been kept by an earlier run.
@@ -96,7 +94,6 @@ class PlayedTasks(NamedTuple):
     """
 
     replays: list[Replay]
-    interrupted: str
     costs: dict[str, float]
     error: BaseException | None
 
@@ -109,8 +106,7 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
     """
     from ..experiments.grid import iterate_replays
 
-    replays: dict[int, Replay] = {}
-    n_kept = 0
+    played: list[PlayedReplay] = []
     begin = time.perf_counter()
     interruption: BaseException | None = None
     n_cycles = len(tasks) * (stream.cycles or len(dataset))
@@ -118,24 +114,20 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
         # A callback cannot travel to other processes: there the bar moves by whole replays.
         on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
         try:
-            for i, replay, kept in iterate_replays(
+            for item in iterate_replays(
                 dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
             ):
-                replays[i] = replay
-                n_kept += kept
-                advance(len(replay) if on_cycle is None or kept else 0)
+                played.append(item)
+                advance(len(item.replay) if on_cycle is None or item.kept else 0)
         except (KeyboardInterrupt, Exception) as error:  # what was finished is shown first
             interruption = error
-    interrupted = ""
-    if interruption is not None:
-        interrupted = f"Interrupted: {len(replays)} of {len(tasks)} replays were finished"
+    replays = [item.replay for item in sorted(played, key=lambda item: item.position)]
     costs = {
         "seconds": time.perf_counter() - begin,
-        "core_seconds": sum(replay.seconds for replay in replays.values()),
-        "kept": n_kept,
+        "core_seconds": sum(replay.seconds for replay in replays),
+        "kept": sum(item.kept for item in played),
     }
-    finished = [replays[i] for i in sorted(replays)]
-    return PlayedTasks(finished, interrupted, costs, interruption)
+    return PlayedTasks(replays, costs, interruption)
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
@@ -151,13 +143,6 @@ def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
         raise error
 
 
-_CYCLES = "Only this many parts of each stream.  [default: all]"
-_IN_ORDER = "Play the stream once, in its recorded order, drift included."
-_N_JOBS = "Number of replays at a time; -1: one for each core. Timings are right with 1 only."
-_KEEP = (
-    "Folder of finished replays, which are not played again: an interrupted run continues, and "
-    "other costs are computed at once."
-)
 _SHUFFLES = "Number of shuffled replays of each recipe."
 
 
@@ -195,10 +180,27 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
             help=text,
         ),
         "seed": options.seed_option,
-        "cycles": click.option("--cycles", type=COUNT, help=_CYCLES),
-        "in_order": click.option("--in-order", is_flag=True, help=_IN_ORDER),
-        "n_jobs": options.n_jobs_option(n_jobs, _N_JOBS),
-        "keep": click.option("--keep", type=options.FOLDER, metavar="FOLDER", help=_KEEP),
+        "cycles": click.option(
+            "--cycles", type=COUNT, help="Only this many parts of each stream.  [default: all]"
+        ),
+        "in_order": click.option(
+            "--in-order",
+            is_flag=True,
+            help="Play the stream once, in its recorded order, drift included.",
+        ),
+        "n_jobs": options.n_jobs_option(
+            n_jobs,
+            "Number of replays at a time; -1: one for each core. Timings are right with 1 only.",
+        ),
+        "keep": click.option(
+            "--keep",
+            type=options.FOLDER,
+            metavar="FOLDER",
+            help=(
+                "Folder of finished replays, which are not played again: an interrupted run "
+                "continues, and other costs are computed at once."
+            ),
+        ),
     }
     if least > 1:
         del flags["in_order"]
@@ -242,14 +244,6 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     _replay_and_print([choice.make_contender()], {"confirms": [confirm]}, **played)
 
 
-_REDUCERS = "With commas between; names that are no reducers of dengine are baselines."
-_PAPER = "The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."
-_FEEDBACK = (
-    f"What the engine learns about accepted parts, of {','.join(CONFIRM_BY_FEEDBACK)}: only their "
-    f"stops, or also which are good."
-)
-
-
 @verb("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/")
 @options.data_options()
 @click.option(
@@ -258,10 +252,12 @@ _FEEDBACK = (
     default="conv,umap,pca",
     show_default=True,
     type=CommaList(NameChoice("method", OWN_RECIPE)),
-    help=_REDUCERS,
+    help="With commas between; names that are no reducers of dengine are baselines.",
 )
 @options.policy_options
-@click.option("--paper", is_flag=True, help=_PAPER)
+@click.option(
+    "--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."
+)
 @options.bundle_options("lists", options.drop_none, POLICY_LISTS)
 @click.option(
     "--feedback",
@@ -269,7 +265,10 @@ _FEEDBACK = (
     default="stops",
     show_default=True,
     metavar="LIST",
-    help=_FEEDBACK,
+    help=(
+        f"What the engine learns about accepted parts, of {','.join(CONFIRM_BY_FEEDBACK)}: only "
+        "their stops, or also which are good."
+    ),
 )
 @stream_options(30, 1, 1, _SHUFFLES)
 @options.check_option
@@ -341,7 +340,8 @@ def _replay_and_print(
     tasks = grid_tasks(
         contenders, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid
     )
-    replays, interrupted, costs, error = _play_tasks(dataset, tasks, stream)
+    replays, costs, error = _play_tasks(dataset, tasks, stream)
+    interrupted = f"Interrupted: {len(replays)} of {len(tasks)} replays were finished"
     if not replays:
         _end(error, f"{interrupted}; there is nothing to show.", False)
     frame = tables.frame_of(replays, check_seconds)
@@ -353,7 +353,7 @@ def _replay_and_print(
         "in_order": not stream.shuffle,
         "faults": dataset.faults,
         "rows": rows,
-        "interrupted": bool(interrupted),
+        "interrupted": error is not None,
         "costs": costs,
     }
     legend = legend_or_hint(tables.LEGEND)
@@ -419,11 +419,12 @@ def _replay_files(
     yield "curves.png", curves(groups, title)
     for name, (first, *_) in _group_replays(replays, lambda replay: replay.name).items():
         if not np.isnan(first.position).all():  # baselines embed nothing
-            map_title = f"{name}, newest parts of one replay (seed {first.seed})"
             # In characters that every file system takes.
             yield (
                 re.sub(r"[^\w.=-]+", "_", f"map_{name}") + ".png",
-                embedding_map(first, title=map_title),
+                embedding_map(
+                    first, title=f"{name}, newest parts of one replay (seed {first.seed})"
+                ),
             )
 
 
@@ -469,16 +470,20 @@ CURVE_FIELDS = (
 )
 
 
-_ESCAPE = "Cost of a bad part that is accepted: a line stop, or worse."
-_FALSE_REJECT = "Cost of a good part that is rejected."
 PRICES = {
     "check": click.option(
         "--check", type=float, default=5.0, show_default=True, help="Cost of one verification."
     ),
-    "escape": click.option("--escape", type=float, required=True, help=_ESCAPE),
-    "false_reject": click.option("--false-reject", type=float, required=True, help=_FALSE_REJECT),
+    "escape": click.option(
+        "--escape",
+        type=float,
+        required=True,
+        help="Cost of a bad part that is accepted: a line stop, or worse.",
+    ),
+    "false_reject": click.option(
+        "--false-reject", type=float, required=True, help="Cost of a good part that is rejected."
+    ),
 }
-_FRESH = "Number of shuffles that the last two policies play; earlier ones choose these."
 
 
 @verb(
@@ -492,7 +497,9 @@ _FRESH = "Number of shuffles that the last two policies play; earlier ones choos
 )
 @options.recipe_options
 @options.bundle_options("lists", options.drop_none, GRID_LISTS)
-@stream_options(4, 2, -1, _FRESH)
+@stream_options(
+    4, 2, -1, "Number of shuffles that the last two policies play; earlier ones choose these."
+)
 @explain_option
 @options.out_option
 def costs(

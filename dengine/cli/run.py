@@ -69,15 +69,6 @@ class DrivenRun(NamedTuple):
     failure: CellError | None
 
 
-_CELL = (
-    "replay: the parts of --data, in their order. simulated: physics in MuJoCo. ur: a Universal "
-    "Robots controller."
-)
-_CYCLES = "Number of parts to insert, one in each cycle."
-_STORE = "Keeps everything; without a store the run is forgotten."
-_SHADOW = "Verify every part; what the model would have done is only recorded."
-
-
 @verb("dengine run --cell replay --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9")
 @click.option(
     "--cell",
@@ -85,18 +76,31 @@ _SHADOW = "Verify every part; what the model would have done is only recorded."
     type=click.Choice(("replay", "simulated", "ur")),
     default="replay",
     show_default=True,
-    help=_CELL,
+    help=(
+        "replay: the parts of --data, in their order. simulated: physics in MuJoCo. ur: a "
+        "Universal Robots controller."
+    ),
 )
 @click.option("--host", metavar="HOST[:PORT]", help="The robot's address, for --cell ur.")
 @options.data_options(live=True)
 @options.scenario_option
 @options.check_option
-@click.option("--cycles", type=options.COUNT, default=300, show_default=True, help=_CYCLES)
-@options.store_option(_STORE)
+@click.option(
+    "--cycles",
+    type=options.COUNT,
+    default=300,
+    show_default=True,
+    help="Number of parts to insert, one in each cycle.",
+)
+@options.store_option("Keeps everything; without a store the run is forgotten.")
 @options.recipe_options
 @options.new_seed_option
 @options.allow_import_option
-@click.option("--shadow", is_flag=True, help=_SHADOW)
+@click.option(
+    "--shadow",
+    is_flag=True,
+    help="Verify every part; what the model would have done is only recorded.",
+)
 @explain_option
 @options.out_option
 def run(
@@ -167,8 +171,9 @@ def run(
             f"{n_left} continues there."
         )
     if driven.failure is not None:
-        text = f"{driven.failure} {n_done} of {cycles} cycles were done. {kept}"
-        raise CellError(text) from driven.failure
+        raise CellError(
+            f"{driven.failure} {n_done} of {cycles} cycles were done. {kept}"
+        ) from driven.failure
     if n_left:
         shown = "the table shows those" if n_done else "there is nothing to show"
         exit_interrupted(f"Interrupted: {n_done} of {cycles} cycles were done; {shown}.", kept)
@@ -267,8 +272,12 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
         played = np.flatnonzero(np.isin(content_hash(dataset.X), hashes))
         first = int(played[-1]) + 1 if len(played) else 0
         n_left = len(dataset) - first
-        advice = f"{first} of {len(dataset)} parts were played before"
-        expect(cycles <= n_left, f"at most {n_left} cycles", cycles, advice)
+        expect(
+            cycles <= n_left,
+            f"at most {n_left} cycles",
+            cycles,
+            f"{first} of {len(dataset)} parts were played before",
+        )
         cell = ReplayCell(dataset, np.arange(first, len(dataset)))
         return cell, f"recording {dataset.name} from part {first + 1}"
 

@@ -1,6 +1,5 @@
 """The verb `dengine status`: how an engine is doing, as far as its store tells."""
 
-from contextlib import closing
 from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -40,12 +39,17 @@ SHOWN_ELSEWHERE = (
     "last",
 )
 ONLY_WHILE_RUNNING = ("retraining", "store_lag")
-_LAST = "How many of the newest decisions have a column of their own."
 
 
 @verb("dengine status engine.db --last 500")
 @options.store_argument
-@click.option("--last", type=options.COUNT, default=500, show_default=True, help=_LAST)
+@click.option(
+    "--last",
+    type=options.COUNT,
+    default=500,
+    show_default=True,
+    help="How many of the newest decisions have a column of their own.",
+)
 @options.check_option
 def status(store: str, last: int, check_seconds: float) -> None:
     """Show how an engine is doing, and what its store holds.
@@ -72,7 +76,7 @@ def status(store: str, last: int, check_seconds: float) -> None:
             )
             return
         store = address(store, cells[0].cell_id)
-    with closing(open_store(store, must_exist=True)) as opened:
+    with open_store(store, must_exist=True) as opened:
         report = read_status(opened, last, watching=True)
     record = {"store": store} | to_jsonable(report)
     record["certificate"] = certificate_record(report.certificate)

@@ -37,14 +37,13 @@ def _login_name() -> str:
         return ""
 
 
-_SHADOW = (
-    "on: verify every part, and only record what the model would have done. off: let it decide."
-)
 shadow_option = click.option(
     "--shadow",
     type=click.Choice(["on", "off"]),
     callback=lambda context, option, state: None if state is None else state == "on",
-    help=_SHADOW,
+    help=(
+        "on: verify every part, and only record what the model would have done. off: let it decide."
+    ),
 )
 interval_option = click.option(
     "--interval", type=NameChoice("interval"), help="The confidence interval."
@@ -65,18 +64,19 @@ def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _change_and_print(
-    store: str, author: str, allow_import: bool, change: Callable[[DataEngine], Changed]
+    change: Callable[[DataEngine, str], Changed], store: str, author: str, allow_import: bool
 ) -> None:
-    """Open the store's engine, let `change` change it, and print what changed.
+    """Open the store's engine, let `change` change it for the author, and print what changed.
 
-    `change` returns a `Changed`, which says so in words. The engine is closed before that is
-    printed. The JSON document also has the policy and the certificate after the change.
+    `change` returns a `Changed`, which says so in words; the other arguments are `store_options`.
+    The engine is closed before that is printed. The JSON document also has the policy and the
+    certificate after the change.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
 
     with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
-        changed = change(engine)
+        changed = change(engine, author)
         certificate = engine.certificate()
         policy = engine.policy
     event = ""
@@ -92,7 +92,7 @@ def _change_and_print(
 @store_options
 @click.argument("part", metavar="PART|ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-def report(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
+def report(part: str, label: str, **changing: Any) -> None:
     """Report whether a part was good or bad.
 
     The part is named by its number, if it has one decision beside rejects, or by that decision's
@@ -104,26 +104,30 @@ def report(store: str, part: str, label: str, author: str, allow_import: bool) -
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
 
-    def change(engine: DataEngine) -> Changed:
+    def change(engine: DataEngine, author: str) -> Changed:
         """Report the label and record an event; report nothing if the decision has that label."""
         id_ = find_decision_id(engine.store, part)
         stored = engine.find(id_)
         if stored is not None and stored.success is LABELS[label]:
-            text = f"Decision {id_} was {label} already; nothing changed."
-            return Changed("report", text, None, engine.version)
+            return Changed(
+                "report",
+                f"Decision {id_} was {label} already; nothing changed.",
+                None,
+                engine.version,
+            )
         engine.report(id_, LABELS[label])
-        engine.store.events.put("report", f"decision {id_} was {label}", author=author)
-        event = engine.store.events.newest(1)[-1].number
+        text = f"decision {id_} was {label}"
+        event = engine.store.events.put("report", text, author=author)
         return Changed("report", f"Decision {id_} was {label}.", event, engine.version)
 
-    _change_and_print(store, author, allow_import, change)
+    _change_and_print(change, **changing)
 
 
 @verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
 @store_options
 @click.argument("part", metavar="PART|ID")
 @click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
-def correct(store: str, part: str, label: str, author: str, allow_import: bool) -> None:
+def correct(part: str, label: str, **changing: Any) -> None:
     """Correct a wrong label: the part was good, or bad.
 
     The part is named as for `dengine report`. From now on its decision counts with the corrected
@@ -132,48 +136,46 @@ def correct(store: str, part: str, label: str, author: str, allow_import: bool) 
     """
     from ..history.explain import find_decision_id
 
-    def change(engine: DataEngine) -> Changed:
-        return engine.correct(find_decision_id(engine.store, part), LABELS[label], author)
-
-    _change_and_print(store, author, allow_import, change)
+    _change_and_print(
+        lambda engine, author: engine.correct(
+            find_decision_id(engine.store, part), LABELS[label], author
+        ),
+        **changing,
+    )
 
 
 @verb("dengine forget engine.db import-ad72a2e9751fbf6f-0 --reason 'the fixture was bent'")
 @store_options
 @click.argument("decisions", metavar="ID...", nargs=-1, required=True)
 @click.option("--reason", default="", help="Why, for the record.")
-def forget(
-    store: str, decisions: tuple[str, ...], reason: str, author: str, allow_import: bool
-) -> None:
+def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
     """Leave labels out of everything that is learned and counted.
 
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings a label
     back. If one of the decisions is unknown or has no label, none is forgotten.
     """
-
-    def change(engine: DataEngine) -> Changed:
-        return engine.forget(*decisions, author=author, reason=reason)
-
-    _change_and_print(store, author, allow_import, change)
+    _change_and_print(
+        lambda engine, author: engine.forget(*decisions, author=author, reason=reason), **changing
+    )
 
 
 @verb("dengine rollback engine.db 1")
 @store_options
 @click.argument("version", metavar="VERSION", type=int)
-def rollback(store: str, version: int, author: str, allow_import: bool) -> None:
+def rollback(version: int, **changing: Any) -> None:
     """Use an earlier model version again, as a new version.
 
     Labels that came since are among its references, and corrections count. It is pinned: no
     automatic retrain replaces it, until `dengine release` or `dengine retrain`.
     """
-    _change_and_print(store, author, allow_import, lambda engine: engine.rollback(version, author))
+    _change_and_print(lambda engine, author: engine.rollback(version, author), **changing)
 
 
 @verb("dengine release engine.db")
 @store_options
-def release(store: str, author: str, allow_import: bool) -> None:
+def release(**changing: Any) -> None:
     """Let retrains replace a pinned version again."""
-    _change_and_print(store, author, allow_import, lambda engine: engine.release(author))
+    _change_and_print(lambda engine, author: engine.release(author), **changing)
 
 
 @verb("dengine policy engine.db --alpha 0.05 --lower-bound 0.95")
@@ -193,10 +195,10 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     """
     if settings:
         _change_and_print(
+            lambda engine, by: engine.set_policy(engine.policy.changed(**settings), by),
             store,
             author,
             allow_import,
-            lambda engine: engine.set_policy(engine.policy.changed(**settings), author),
         )
         return
     from ..engine.engine import DataEngine
@@ -224,8 +226,12 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
 
     with DataEngine.open(store, wait=LONG_WAIT, allow_import=allow_import) as engine:
         report = engine.retrain()
-        text = f"trained by hand on {report.n_traces} traces: {report.reason}"
-        engine.store.events.put("retrain", text, asdict(report), author)
+        engine.store.events.put(
+            "retrain",
+            f"trained by hand on {report.n_traces} traces: {report.reason}",
+            asdict(report),
+            author,
+        )
     answers = f"Version {report.version} answers." if report.version else "No version answers yet."
     print_result(
         {"store": store, "author": author, "retrain": report},
@@ -243,21 +249,24 @@ WAITING = (
     "The journal of cell {} holds {:,} records that are not in the store yet; its engine, or the "
     "next one, moves them there."
 )
-_CELL = "Check this cell alone.  [default: all cells]"
-_EXPECT = (
-    "A digest that an earlier check showed. If the history does not hold it any more, it was cut "
-    "off or made anew."
-)
-
-
-_ACKNOWLEDGE = "End the alarms about lost data. They stay in the event log."
 
 
 @verb("dengine verify engine.db")
 @click.argument("store", metavar="STORE")
-@click.option("--cell", metavar="ID", help=_CELL)
-@click.option("--expect", metavar="DIGEST", help=_EXPECT)
-@click.option("--acknowledge", is_flag=True, help=_ACKNOWLEDGE)
+@click.option("--cell", metavar="ID", help="Check this cell alone.  [default: all cells]")
+@click.option(
+    "--expect",
+    metavar="DIGEST",
+    help=(
+        "A digest that an earlier check showed. If the history does not hold it any more, it was "
+        "cut off or made anew."
+    ),
+)
+@click.option(
+    "--acknowledge",
+    is_flag=True,
+    help="End the alarms about lost data. They stay in the event log.",
+)
 @author_option
 @click.pass_context
 def verify(
@@ -376,15 +385,16 @@ def restore(copy: str, store: Path) -> None:
     )
 
 
-_ANY_MODEL = "Accept a journal of a model that is not recorded as an export of this store."
-
-
 @verb("dengine import-labels cell.csv --store engine.db")
 @click.argument(
     "journal", metavar="JOURNAL", type=click.Path(exists=True, dir_okay=False, path_type=Path)
 )
 @options.store_option("The store that the cell's model was exported from.", "--cell", required=True)
-@click.option("--any-model", is_flag=True, help=_ANY_MODEL)
+@click.option(
+    "--any-model",
+    is_flag=True,
+    help="Accept a journal of a model that is not recorded as an export of this store.",
+)
 def import_labels(journal: Path, store: str, any_model: bool) -> None:
     """Import the labels of a cell program into the store.
 

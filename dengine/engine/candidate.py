@@ -10,17 +10,15 @@ happens either all at once or in short steps between cycles.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from ..decision.scripting import reason_of
+from ..errors import log
 from ..model.base import EngineModel
 from ..records import RetrainReport
 from .guard import NO_REFERENCE, guarded
 from .trainer import Trained, TrainedOn, TrainingWindow
-
-log = logging.getLogger("dengine")
 
 
 class Candidate:

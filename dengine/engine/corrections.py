@@ -317,8 +317,12 @@ class Corrections:
             Where the store does not answer, and for an engine that is closed or was opened for
             reading.
         """
-        example = "for example Policy(alpha=0.05, lower_bound=0.95)"
-        expect(isinstance(policy, Policy), "a Policy", policy, example)
+        expect(
+            isinstance(policy, Policy),
+            "a Policy",
+            policy,
+            "for example Policy(alpha=0.05, lower_bound=0.95)",
+        )
         present = self._settings.now
         check_rate(policy.force_limits, present.trace)
         old_values = present.recipe.policy.to_values()
@@ -423,10 +427,9 @@ def _check_baseline_settings(changes: Settings) -> None:
     """
     idle = sorted(set(changes) - set(BASELINE_SETTINGS))
     if idle:
-        effect = f"so {', '.join(idle)} would have no effect"
-        do = "change only audit_rate, stops, label_within, force_limits and shadow"
         raise SettingError(
-            f"A model that was handed in decides by its own numbers, {effect}; {do}."
+            f"A model that was handed in decides by its own numbers, so {', '.join(idle)} would "
+            "have no effect; change only audit_rate, stops, label_within, force_limits and shadow."
         )
 
 

@@ -6,7 +6,6 @@ The functions below it check what a caller passes, a part's number and an id tha
 before, and make a VERIFY without a trace.
 """
 
-import logging
 import uuid
 from contextlib import suppress
 from dataclasses import replace
@@ -18,7 +17,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ..decision.decider import DecisionConditions, Verdict, decider_without_model
-from ..errors import NotTakenError, StoreError, TraceConflictError, TraceError, expect
+from ..errors import NotTakenError, StoreError, TraceConflictError, TraceError, expect, log
 from ..folds import part_hash
 from ..model.base import EngineModel
 from ..records import (
@@ -40,8 +39,6 @@ from .guard import NOT_PRECOMPUTED, guarded
 from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce, read_peers_trace_spec
-
-log = logging.getLogger("dengine")
 
 
 class DecisionMaker:
@@ -338,8 +335,10 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
     """
     x = convert_trace(trace, spec, False)
     if not np.array_equal(x, stored.trace, equal_nan=True):
-        wanted = f"the trace that decision {stored.decision.id!r} was made on"
-        raise TraceConflictError(f"Expected {wanted}, got another; give it an id of its own.")
+        raise TraceConflictError(
+            f"Expected the trace that decision {stored.decision.id!r} was made on, got another; "
+            "give it an id of its own."
+        )
     return stored.decision
 
 
@@ -378,6 +377,11 @@ def as_part(part: Any) -> str | None:
         return None
     is_whole = isinstance(part, int | np.integer) and not isinstance(part, bool)
     text = str(part) if is_whole and abs(int(part)) < 10**LONGEST else part
-    wanted = f"a part's number, a whole number or a text of 1 to {LONGEST} characters that print"
-    expect(is_name(text), wanted, part, "strip what a scanner added, or pass None", TraceError)
+    expect(
+        is_name(text),
+        f"a part's number, a whole number or a text of 1 to {LONGEST} characters that print",
+        part,
+        "strip what a scanner added, or pass None",
+        TraceError,
+    )
     return str(text)

@@ -13,7 +13,6 @@ call the same methods.
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 import time
@@ -30,7 +29,7 @@ from numpy.typing import ArrayLike
 from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import NotTakenError, StoreError, UnknownDecisionError, expect, listed
+from ..errors import NotTakenError, StoreError, UnknownDecisionError, expect, listed, log
 from ..files import FilePath
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
@@ -84,9 +83,6 @@ if TYPE_CHECKING:
 
     from ..store.opening import StoreLike
     from ..store.sql import SqlStore
-
-
-log = logging.getLogger("dengine")
 
 
 class RunOptions(TypedDict, total=False):
@@ -677,8 +673,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         if trace is None or success:
             raise UnknownDecisionError(
                 f"Expected the id of a decision of this cell, got {decision_id!r}, which is "
-                "unknown; "
-                "a system stop whose decision was lost can be reported with its trace."
+                "unknown; a system stop whose decision was lost can be reported with its trace."
             )
         x = self._maker.convert(trace)
         stored = self._maker.record_lost_accept(x, as_part(part), decision_id)
@@ -1000,6 +995,9 @@ def _new_settings(
     chosen = EngineSettings(choose_recipe(reducer, recipe, given), seed, trace=trace)
     settings, template = chosen.with_template(model)
     n_traces = template.min_traces
-    window = f"a window of at least {n_traces} labelled traces, on which it trains first"
-    expect(settings.recipe.window >= n_traces, window, settings.recipe.window)
+    expect(
+        settings.recipe.window >= n_traces,
+        f"a window of at least {n_traces} labelled traces, on which it trains first",
+        settings.recipe.window,
+    )
     return settings, template

@@ -9,11 +9,11 @@ A line stop that comes later takes the confirmation back, in the store as a corr
 the part counts as unreported, which is no success.
 """
 
-import logging
 from collections import OrderedDict
 from collections.abc import Callable, Collection
 from enum import Enum
 
+from ..errors import log
 from ..records import Action, Reason, Source, source_of
 from ..store.outbox import Outbox
 from ..store.records import (
@@ -28,7 +28,6 @@ from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
 
-log = logging.getLogger("dengine")
 MOST_CONFIRMED = 100  # labels of confirmed parts that wait for a report
 RECENT = 50  # decisions that the share of novel ones fades over
 NEARLY_ALL = 0.8  # of them, and somebody should look

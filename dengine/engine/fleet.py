@@ -8,11 +8,9 @@ The cells of a product share one store. A cell whose connection is lost goes on 
 
 from __future__ import annotations
 
-import logging
-
 import numpy as np
 
-from ..errors import StoreError
+from ..errors import StoreError, log
 from ..store.outbox import Outbox
 from ..store.records import ModelVersion, ProductNews, without_rule
 from .guard import NOT_READY, guarded
@@ -21,7 +19,6 @@ from .live_model import LiveModel
 from .resume import add_labels_since, newest_reference, restore_model
 from .trainer import Clock, TrainedOn, TrainingWindow
 
-log = logging.getLogger("dengine")
 NEWS_SECONDS = 1.0  # between two questions for news
 MOST = 200  # labels taken in at once: each is embedded, some tenths of a millisecond
 ROUNDS = 5  # of them before a retrain: after a long absence it need not know all

@@ -5,7 +5,6 @@ not among them.
 """
 
 import json
-import logging
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from .. import __version__
 from ..decision.decider import DecisionConditions
 from ..decision.policy import NO_LIMITS, Policy
-from ..errors import ImportRefusedError, SettingError, StoreError, expect, listed, shortened
+from ..errors import ImportRefusedError, SettingError, StoreError, expect, listed, log, shortened
 from ..model.base import EngineModel, Model, as_engine_model
 from ..model.neighbours import ModelPrediction
 from ..recipe import OBJECT_PREFIX, Recipe, describe_estimator
@@ -24,7 +23,6 @@ from ..traces import ForceLimitsGate
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
-log = logging.getLogger("dengine")
 
 MAX_SEED = 2**32 - 1  # the largest one that NumPy's and scikit-learn's generators take
 # Settings of a policy that have an effect on a baseline.
@@ -97,8 +95,11 @@ class EngineSettings:
     evidence: EvidenceWindow = EvidenceWindow()
 
     def __post_init__(self) -> None:
-        allowed = f"a seed of 0 or more, an integer of at most {MAX_SEED}"
-        expect(is_whole(self.seed, 0, MAX_SEED), allowed, self.seed)
+        expect(
+            is_whole(self.seed, 0, MAX_SEED),
+            f"a seed of 0 or more, an integer of at most {MAX_SEED}",
+            self.seed,
+        )
         is_spec = self.trace is None or isinstance(self.trace, TraceSpec)
         expect(is_spec, "a TraceSpec as trace", self.trace, "TraceSpec(samples=1000) for one")
         if self.trace is not None:
@@ -177,8 +178,13 @@ class EngineSettings:
         for setting in ("seed", "policy_since", "evidence_since", "began_in"):
             text = texts.get(setting, "0")
             is_valid = text.isdecimal() and text.isascii() and len(text) < 100
-            wanted = f"a {setting} in the store's settings"
-            expect(is_valid, wanted, text, "restore the store from a copy", StoreError)
+            expect(
+                is_valid,
+                f"a {setting} in the store's settings",
+                text,
+                "restore the store from a copy",
+                StoreError,
+            )
             numbers.append(int(text))
         return cls(
             recipe,
@@ -276,8 +282,8 @@ def _with_objects(
     """
     if "model" in texts and model is None:
         raise SettingError(
-            f"The engine of {name} drove a {texts['model']}; "
-            "hand it in again: open(url, model=...)."
+            f"The engine of {name} drove a {texts['model']}; hand it in again: open(url, "
+            "model=...)."
         )
     if "model" not in texts and model is not None:
         raise SettingError(
@@ -312,8 +318,8 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
     made_with = texts.get("described")
     if made_with is not None and description != made_with:
         raise SettingError(
-            f"{name} was made with {made_with}, got {description}: "
-            "its labels were counted by that one."
+            f"{name} was made with {made_with}, got {description}: its labels were counted by that "
+            "one."
         )
 
 
@@ -360,10 +366,11 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
         return
     refused = [name for name in recipe.user_classes if name not in (allow_import or ())]
     if refused:
-        again = "name it again (reducer=, recipe=, policy=; --reducer, --guarantee)"
-        allow = "allow it, where you trust the store (allow_import=True; --allow-import)"
-        got = f"{shortened(refused[0])}, which {store} names"
-        raise ImportRefusedError(f"Expected leave to import {got}: {again}, or {allow}.")
+        raise ImportRefusedError(
+            f"Expected leave to import {shortened(refused[0])}, which {store} names: name it again "
+            "(reducer=, recipe=, policy=; --reducer, --guarantee), or allow it, where you trust "
+            "the store (allow_import=True; --allow-import)."
+        )
 
 
 def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
@@ -424,12 +431,11 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     if policy is not None and replace(policy, **effective) != Policy():
         idle.append("policy")
     if idle:
-        effect = f"so {', '.join(idle)} would have no effect"
-        do = (
-            "set it on the model, or leave it out "
-            f"(of a policy {listed(BASELINE_SETTINGS)} alone count)"
+        raise SettingError(
+            f"A model that is handed in decides by its own rule, so {', '.join(idle)} would have "
+            "no effect; set it on the model, or leave it out (of a policy "
+            f"{listed(BASELINE_SETTINGS)} alone count)."
         )
-        raise SettingError(f"A model that is handed in decides by its own rule, {effect}; {do}.")
 
 
 def flat_settings(recipe: Recipe) -> dict[str, Any]:

@@ -57,6 +57,7 @@ Z = normal_quantile(ALPHA_EACH)
 MOST_NEIGHBOURS = 10**7
 MOST_MORE = 10_000  # times the recordings: what needs more is never shown
 Groups = Mapping[Policy, Sequence[Replay]]
+Play = Callable[[Sequence[Task]], Sequence[Replay]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +252,7 @@ class CostCurve:
         elif cheapest != row:
             text += (
                 f" {policy_name(cheapest.policy)} costs {amount(cheapest.cost)}, which is not "
-                f"cheaper beyond chance, and lets more bad parts through: of 1,000 parts "
+                "cheaper beyond chance, and lets more bad parts through: of 1,000 parts "
                 f"{1000 * cheapest.escaped:.2g}, not {1000 * row.escaped:.2g}."
             )
         if missing is not None:
@@ -359,13 +360,24 @@ class PolicySearch:
         data = load_dataset(dataset)
         contender = Contender.load(recipe)
         expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
-        do = "where a bad part costs no more than its check, accept every part unchecked"
-        expect(costs.check < costs.escape, "a check below an escape", astuple(costs)[:2], do)
-        do = "where a wrong decision costs nothing, there is nothing to check"
-        expect(costs.false_reject > 0.0, "a false reject that costs something", 0, do)
-        labels = f"{int(data.y.sum()):,} good and {int((1 - data.y).sum()):,} bad ones"
-        do = "record until both have come: one kind does not show what errors cost"
-        expect(0.0 < data.y.mean() < 1.0, "good and bad recordings", labels, do)
+        expect(
+            costs.check < costs.escape,
+            "a check below an escape",
+            astuple(costs)[:2],
+            "where a bad part costs no more than its check, accept every part unchecked",
+        )
+        expect(
+            costs.false_reject > 0.0,
+            "a false reject that costs something",
+            0,
+            "where a wrong decision costs nothing, there is nothing to check",
+        )
+        expect(
+            0.0 < data.y.mean() < 1.0,
+            "good and bad recordings",
+            f"{int(data.y.sum()):,} good and {int((1 - data.y).sum()):,} bad ones",
+            "record until both have come: one kind does not show what errors cost",
+        )
         self.costs = costs
         self._repeats = repeats
         self._seed = seed
@@ -374,8 +386,12 @@ class PolicySearch:
         self.out_of_reach: list[str] = []
         for changes in candidates(contender, costs, alphas, lower_bounds):
             self._add(contender, changes, self._cycles * float(data.y.mean()))
-        do = f"this is what they lack: {'; '.join(self.out_of_reach)}"
-        expect(bool(self.remaining), "recordings enough for one policy", len(data), do)
+        expect(
+            bool(self.remaining),
+            "recordings enough for one policy",
+            len(data),
+            f"this is what they lack: {'; '.join(self.out_of_reach)}",
+        )
         # Plays the scores of all candidates; a baseline has none.
         self._scores: Contender | None = None
         if contender.baseline is None:
@@ -401,12 +417,14 @@ class PolicySearch:
             parts = "accepted parts without a bad one"
             if policy.guarantee == "local":
                 parts = "good neighbours"
-            has = f"{n_good:,.0f} good parts are played"
-            self.out_of_reach.append(f"{policy_name(policy)} needs {n_needed:,} {parts}, {has}")
+            self.out_of_reach.append(
+                f"{policy_name(policy)} needs {n_needed:,} {parts}, {n_good:,.0f} good parts are "
+                "played"
+            )
         else:
             self.remaining.append(candidate)
 
-    def run(self, play: Callable[[Sequence[Task]], Sequence[Replay]]) -> None:
+    def run(self, play: Play) -> None:
         """Halve the candidates in rounds, and let the last ones play fresh shuffles.
 
         While more than two remain, they play two shuffles, and the dearer half is left behind. It
@@ -429,12 +447,7 @@ class PolicySearch:
         self._fresh.update(fresh)
         self._play(play, fresh, None)
 
-    def _play(
-        self,
-        play: Callable[[Sequence[Task]], Sequence[Replay]],
-        seeds: range,
-        scores: Contender | None,
-    ) -> bool:
+    def _play(self, play: Play, seeds: range, scores: Contender | None) -> bool:
         """Play the remaining candidates over some seeds, and keep their replays.
 
         With `scores`, one engine that checks every part is replayed for each seed, and each

@@ -175,8 +175,9 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     for axes, name, values, marks in panels:
         for value, (word, style) in marks.items():
             points = z[embedded & (values[-WINDOW:] == value)]
-            label = f"{word} ({len(points)})"
-            axes.scatter(*points.T, label=label, alpha=0.7, linewidths=0, **style)
+            axes.scatter(
+                *points.T, label=f"{word} ({len(points)})", alpha=0.7, linewidths=0, **style
+            )
         if not embedded.any():
             axes.text(0.5, 0.5, "no trace was embedded yet", ha="center", transform=axes.transAxes)
         finish(axes, xlabel=x_label)
@@ -325,10 +326,11 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     precision.set_ylim(max(0.0, min(precision.get_ylim()[0], bounds[0] - 1)), 100.5)
     # At least half as much again above the tolerance: the panel shows whether errors keep to it.
     highest = max(errors.get_ylim()[1], 1.5 * tolerances[0])
-    y_label = "bad of accepted, good of\nrejected (dashed) [%]"
-    finish(errors, ylim=(0, highest), ylabel=y_label)
-    windows = f"end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn"
-    errors.set(xlabel=f"cycle ({windows})")
+    finish(errors, ylim=(0, highest), ylabel="bad of accepted, good of\nrejected (dashed) [%]")
+    errors.set(
+        xlabel=f"cycle ("
+        f"end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn)"
+    )
     figure.legend(handles=handles, loc="outside lower center", frameon=False, fontsize=SMALL)
     return figure
 
@@ -353,8 +355,8 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     costs = curve.costs
     title = (
         f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape {costs.escape:g} "
-        f"{unit}, false reject {costs.false_reject:g} {unit}\n"
-        f"{counted(curve.shuffles, 'shuffle')} of {curve.cycles} parts, with 95 % intervals"
+        f"{unit}, false reject {costs.false_reject:g} {unit}\n{counted(curve.shuffles, 'shuffle')} "
+        f"of {curve.cycles} parts, with 95 % intervals"
     )
     n_last = len(curve.rows)
     rows = [*curve.rows, *curve.left_behind]
@@ -508,5 +510,4 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
         rows = finite & (y == success)
         means = channel_means(data.cube[rows, :1])[:, 0]
         bottom.scatter(x[rows], means, s=8, color=colour, alpha=0.5, linewidths=0, label=name)
-    x_label = "recording, in the order in which they were made"
-    finish(bottom, xlabel=x_label, ylabel=f"mean {label}")
+    finish(bottom, xlabel="recording, in the order in which they were made", ylabel=f"mean {label}")

@@ -220,8 +220,12 @@ def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
     contenders = [Contender.load(recipe) for recipe in recipes]
     keys = [(contender.name, contender.recipe.policy) for contender in contenders]
     repeated = next((name for name, policy in keys if keys.count((name, policy)) > 1), None)
-    advice = "tell them apart by Contender(name, recipe)"
-    expect(repeated is None, "a name of its own for each", repeated, advice)
+    expect(
+        repeated is None,
+        "a name of its own for each",
+        repeated,
+        "tell them apart by Contender(name, recipe)",
+    )
     return contenders
 
 

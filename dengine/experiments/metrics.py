@@ -141,8 +141,12 @@ class Costs:
             value = getattr(self, field.name)
             is_cost = is_number(value) and 0.0 <= value < math.inf
             expect(is_cost, f"a finite cost of 0 or more as {field.name}", value)
-        advice = "where it is free, verify everything"
-        expect(self.check > 0.0, "a check that costs something", 0, advice)
+        expect(
+            self.check > 0.0,
+            "a check that costs something",
+            0,
+            "where it is free, verify everything",
+        )
 
     @property
     def worst_accept(self) -> float:

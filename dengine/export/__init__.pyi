@@ -1,5 +1,4 @@
 from .bundle import make_key as make_key
-from .bundle import read_metadata as read_metadata
 from .cell_journal import import_journal as import_journal
 from .onnx import export_onnx as export_onnx
 from .onnx import load_onnx as load_onnx

@@ -1,7 +1,7 @@
 """What every exported file has, TorchScript or ONNX: description, checksum and signature.
 `torchscript` and `onnx` write and read their files through the functions here: `prepare_export`
-checks and builds the module, `describe` and `write_export` write, `read_checked` and
-`read_metadata` read, and `make_key` makes the key that signs.
+checks and builds the module, `describe` and `write_export` write, `read_checked` and `metadata_of`
+read, and `make_key` makes the key that signs.
 
     dengine export --make-key cell.key
     dengine export engine.db --out model.ts --key cell.key  # model.ts, .ts.sha256, .ts.sig
@@ -68,18 +68,19 @@ def make_key(path: FilePath) -> Path:
         If there is a file already, because models may be signed with it, or it cannot be written.
     """
     target = Path(path)
+    if os.path.lexists(target):
+        raise ExportError(
+            f"{target} is there already, and files may be signed with it; name a new one."
+        )
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    try:
-        with os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file:
-            file.write(secrets.token_hex(32) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except FileExistsError as error:
-        problem = f"{target} is there already, and files may be signed with it"
-        raise ExportError(f"{problem}; name a new one.") from error
-    except OSError as error:
-        problem = f"Cannot write {target}: {error.strerror}"
-        raise ExportError(f"{problem}; choose a folder that exists and is writable.") from error
+    do = "choose a folder that exists and is writable"
+    with (
+        instead(ExportError, f"Cannot write {target}", OSError, do=do),
+        os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file,
+    ):
+        file.write(secrets.token_hex(32) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
     return target
 
 
@@ -139,9 +140,10 @@ def prepare_export(
     model = source.model
     encoder = model.spaces.module()
     if not model.rule.scriptable:
-        rule = f"{type(model.rule).__name__} with the interval {model.rule.interval!r}"
-        do = f"use {' or '.join(SCALAR_BOUNDS)}, and a rule that does"
-        raise ExportError(f"{rule} does not compile to TorchScript; {do}.")
+        raise ExportError(
+            f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not "
+            f"compile to TorchScript; use {' or '.join(SCALAR_BOUNDS)}, and a rule that does."
+        )
     for module in (model.rule, encoder):
         if module is not None and is_code_changed(module):
             problem = f"The code of {type(module).__name__} was changed after it was compiled"
@@ -191,8 +193,10 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
         source: Exportable = model.exported(trace)
     except AttributeError as error:
         actual = type(model).__name__
-        wanted = "Expected a DataEngine or a ModelPrediction to export"
-        raise ExportError(f"{wanted}, got {actual}; a baseline stays in Python.") from error
+        raise ExportError(
+            f"Expected a DataEngine or a ModelPrediction to export, got {actual}; a baseline stays "
+            "in Python."
+        ) from error
     if engine is None:
         return source
     return replace(
@@ -213,7 +217,7 @@ def describe(source: Exportable) -> Metadata:
 
     It names schema, versions, time, trace contract, policy, references (number and SHA-256), the
     order of fields, actions and reasons, audits and seed. It can be read without loading the model,
-    see `read_metadata`.
+    see `metadata_of`.
     """
     model = source.model
     index = model.index
@@ -306,28 +310,6 @@ def _check_outputs(path: FilePath, force: bool) -> None:
         check_output(file, force)
 
 
-def read_metadata(path: FilePath, *, key: FilePath | None = None) -> Metadata:
-    """Read the description in an exported TorchScript file, without loading its code.
-
-    Parameters
-    ----------
-    path : path-like
-    key : path-like, optional
-        File of the key that it must be signed with.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    ExportError
-        For a file that is missing, unreadable, damaged or not signed with the key, that is no
-        export or has another schema.
-    """
-    return metadata_of(read_checked(Path(path), key), Path(path))
-
-
 def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     """Return the content of a file after checking its checksum and, with a key, its signature.
 
@@ -347,8 +329,10 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     content = _read(path)
     digest = hashlib.sha256(content).hexdigest()
     if digest != expected:
-        sums = f"its SHA-256 is {digest[:12]}…, expected {expected[:12]}…"
-        raise ExportError(f"{path} is damaged or truncated: {sums}; copy it again.")
+        raise ExportError(
+            f"{path} is damaged or truncated: its SHA-256 is {digest[:12]}…, expected "
+            f"{expected[:12]}…; copy it again."
+        )
     if key is not None:
         signed = signature(content, key)
         file = sibling_path(path, "sig")
@@ -375,9 +359,9 @@ def _read(path: Path, most: int = -1) -> bytes:
         with path.open("rb") as file:
             return file.read(most)
     except FileNotFoundError as error:
-        problem = f"{error.filename} is missing"
-        do = "an export is a file and its .sha256, copied together"
-        raise ExportError(f"{problem}; {do}.") from error
+        raise ExportError(
+            f"{error.filename} is missing; an export is a file and its .sha256, copied together."
+        ) from error
     except (OSError, ValueError) as error:
         raise ExportError(f"{path} cannot be read: {error}.") from error
 
@@ -388,9 +372,10 @@ def metadata_of(content: bytes, path: Path) -> Metadata:
     No code of the file is run. Raises ExportError, which names `path`, if there is none or it has
     another schema.
     """
-    problem = f"{path} is not a dengine export, it holds no {METADATA}"
     with (
-        instead(ExportError, problem, *UNREADABLE),
+        instead(
+            ExportError, f"{path} is not a dengine export, it holds no {METADATA}", *UNREADABLE
+        ),
         zipfile.ZipFile(io.BytesIO(content)) as archive,
     ):
         names = (name for name in archive.namelist() if name.endswith(f"extra/{METADATA}"))
@@ -404,8 +389,9 @@ def check_schema(metadata: Any, path: Path) -> Metadata:
     """
     fields = metadata if isinstance(metadata, dict) else {}
     if fields.get("schema") != SCHEMA:
-        writer = f"dengine {fields.get('dengine', 'of an unknown version')}"
-        actual = f"schema {fields.get('schema')}, written by {writer}"
-        do = "export it anew, or load it with the dengine that wrote it"
-        raise ExportError(f"{path} has {actual}; this one reads schema {SCHEMA}: {do}.")
+        raise ExportError(
+            f"{path} has schema {fields.get('schema')}, written by dengine "
+            f"{fields.get('dengine', 'of an unknown version')}; this one reads schema {SCHEMA}: "
+            "export it anew, or load it with the dengine that wrote it."
+        )
     return fields

@@ -15,7 +15,6 @@ missing head is logged. A last line without its end was being written when the p
 it is left out. Anything else that does not fit is a DataError that names the line.
 """
 
-import logging
 import os
 import zlib
 from collections.abc import Mapping
@@ -28,7 +27,7 @@ import numpy as np
 
 from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
-from ..errors import DataError, StoreError, instead
+from ..errors import DataError, StoreError, instead, log
 from ..files import FilePath
 from ..recipe import Recipe
 from ..records import FITS, Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
@@ -38,7 +37,6 @@ from ..traces import as_trace, can_fit_length
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
 
-log = logging.getLogger("dengine")
 FORM = 4
 LABELS = {"1": True, "0": False}
 LARGEST_COUNT = 2**62
@@ -123,8 +121,9 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     head = rows[0].decode("utf-8", errors="replace").split() if rows else []
     if len(head) != 4 or head[:3] != ["#", "dengine", str(FORM)]:
         wanted = f"Expected a journal that begins with '# dengine {FORM} SUM'"
-        do = "import it with the dengine whose program wrote it"
-        raise DataError(f"{wanted}, {path} does not; {do}.")
+        raise DataError(
+            f"{wanted}, {path} does not; import it with the dengine whose program wrote it."
+        )
     lines: list[JournalLine] = []
     parts: dict[str, JournalLine] = {}  # by id, with the label so far
     unlabelled: list[JournalLine] = []  # the part decided last, until its label comes
@@ -184,8 +183,9 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
         number, crc = head.read_text(encoding="ascii").split()
         has_line = int(crc, 16) in crcs[int(number) - 1 :][:1]
     except (OSError, ValueError):
-        problem = "%s, which knows how long the journal is, is missing or cannot be read: %s"
-        log.warning(problem, head, risk)
+        log.warning(
+            "%s, which knows how long the journal is, is missing or cannot be read: %s", head, risk
+        )
         return ""
     return "" if has_line else f"{path} does not hold line {number}, which its head knows: {risk}"
 
@@ -195,8 +195,9 @@ def _split_words(content: bytes, where: str) -> list[str]:
 
     Raises DataError, naming `where`, if the line is not UTF-8 or begins with another word.
     """
-    wanted = f"Expected UTF-8 in {where}, it is damaged, or no journal"
-    with instead(DataError, wanted, UnicodeDecodeError):
+    with instead(
+        DataError, f"Expected UTF-8 in {where}, it is damaged, or no journal", UnicodeDecodeError
+    ):
         words = content.decode("utf-8").split(",")
     is_known = words[0] in ("part", "label")
     expect_data(is_known, f"a line that begins with part or label in {where}", words[0])
@@ -226,40 +227,33 @@ def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
     and 1 stand for these. Raises DataError, naming `where`, for impossible values.
     """
     padded = [*words[:N_DECISION_WORDS], *[""] * (N_DECISION_WORDS - len(words))]
-    id_, label, part, *decided = padded
+    id_, label, part, action, predicted, reason, lower, upper, n_success, n_failure = padded
     with instead(DataError, f"The decision in {where} cannot be read", ValueError):
-        action = Action(decided[0])
-        predicted = Action(decided[1])
-        reason = Reason(decided[2])
-        lower = float(decided[3])
-        upper = float(decided[4])
-        n_success = int(decided[5])
-        n_failure = int(decided[6])
-    has_counts = 0 <= min(n_success, n_failure) <= max(n_success, n_failure) < LARGEST_COUNT
-    is_valid = 0.0 <= lower <= upper <= 1.0 and has_counts
-    wanted = f"bounds between 0 and 1 and counts in {where}"
-    expect_data(is_valid, wanted, ",".join(decided[3:7]))
-    is_rejected = action is Action.REJECT
+        decision = Decision(
+            id=id_,
+            action=Action(action),
+            predicted=Action(predicted),
+            lower=float(lower),
+            upper=float(upper),
+            n_success=int(n_success),
+            n_failure=int(n_failure),
+            embedding=None,
+            model_version=0,
+            reason=Reason(reason),
+            audit=reason == Reason.AUDIT.value,
+            propensity=1.0,
+            part=part or None,
+        )
+    counts = (decision.n_success, decision.n_failure)
+    has_counts = 0 <= min(counts) <= max(counts) < LARGEST_COUNT
+    is_valid = 0.0 <= decision.lower <= decision.upper <= 1.0 and has_counts
+    expect_data(is_valid, f"bounds between 0 and 1 and counts in {where}", ",".join(padded[6:]))
+    is_rejected = decision.action is Action.REJECT
     is_valid = id_ != "" and (label == "" or (label in LABELS and not is_rejected))
     expect_data(is_valid, f"an id, and a label of 1, 0 or nothing in {where}", (id_, label))
     trace = np.zeros((1, 0), dtype=np.float32)
     if not is_rejected:
         trace = _parse_trace(words[N_DECISION_WORDS:], spec, where)
-    decision = Decision(
-        id=id_,
-        action=action,
-        predicted=predicted,
-        lower=lower,
-        upper=upper,
-        n_success=n_success,
-        n_failure=n_failure,
-        embedding=None,
-        model_version=0,
-        reason=reason,
-        audit=reason is Reason.AUDIT,
-        propensity=1.0,
-        part=part or None,
-    )
     return JournalLine(decision, trace, LABELS.get(label))
 
 
@@ -273,10 +267,13 @@ def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> TraceArray:
     n = spec.channels * spec.samples
     samples, rest = divmod(len(words), spec.channels)
     is_valid = rest == 0 and can_fit_length(samples, spec.samples, FITS.index(spec.fit))
-    do = "it is damaged, or of another cell"
-    expect_data(is_valid, f"{n} samples in {where}", len(words), do)
-    problem = f"The samples in {where} are no row of numbers"
-    with instead(DataError, problem, ValueError), np.errstate(over="ignore"):
+    expect_data(
+        is_valid, f"{n} samples in {where}", len(words), "it is damaged, or of another cell"
+    )
+    with (
+        instead(DataError, f"The samples in {where} are no row of numbers", ValueError),
+        np.errstate(over="ignore"),
+    ):
         values = np.array([float(word) for word in words]).astype(np.float32)
     return as_trace(values.reshape(spec.channels, -1), spec)
 
@@ -329,9 +326,10 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
         }
         if exports and journal.sum not in exports and not any_model:
             wanted = "Expected a journal of a model that was exported from this store"
-            actual = f"{path} belongs to {journal.sum[:12]}…, which is none of its exports"
-            do = "name the store that it came from, or say --any-model if it is right"
-            raise DataError(f"{wanted}, {actual}; {do}.")
+            raise DataError(
+                f"{wanted}, {path} belongs to {journal.sum[:12]}…, which is none of its exports; "
+                "name the store that it came from, or say --any-model if it is right."
+            )
         lines = _with_known_outcomes(journal, policy.stops)
         parts = [(line.decision, line.trace, line.label) for line in lines]
         report = import_parts(opened, parts, spec, policy)

@@ -344,7 +344,9 @@ class DecisionModule(nn.Module):
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.numel() > 0 and can_fit_length(x.size(-1), self.samples, self.fit)
         if x.dim() != 2 or x.size(0) != self.channels or not fits:
-            wanted = f"{self.channels} x {self.samples} samples"
-            raise ValueError(f"Expected one trace of {wanted}, got shape {trace.size()}.")
+            raise ValueError(
+                f"Expected one trace of {self.channels} x {self.samples} samples, got shape "
+                f"{trace.size()}."
+            )
         x = x.to(torch.float32).contiguous()
         return x if x.size(1) == self.samples else fit_length(x, self.samples, self.fit)

@@ -138,8 +138,9 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     onnx = _import_package("onnx")
     target = Path(path)
     content = read_checked(target, key)
-    problem = f"{target} is not a dengine export in ONNX, it holds no {METADATA}"
-    with instead(ExportError, problem, Exception):  # protobuf's errors have no common base
+    with instead(
+        ExportError, f"{target} is not a dengine export in ONNX, it holds no {METADATA}", Exception
+    ):  # protobuf's errors have no common base
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
     return OnnxModel(content, check_schema(metadata, target))
@@ -189,8 +190,7 @@ class OnnxModel:
         self.session = runtime.InferenceSession(content, options, providers=providers)
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
-        warm = np.linspace(-1.0, 1.0, self.trace.channels * self.trace.samples)
-        self.decide(warm.reshape(self.trace.channels, self.trace.samples))
+        self.decide(golden_trace(self.trace))  # warms it up
 
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
@@ -311,8 +311,7 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
     messages up to WARNING, are off in the whole process, because torch names packages that it could
     use and need not. Raises ExportError if torch makes no program.
     """
-    ramp = torch.linspace(-1.0, 1.0, spec.channels * spec.samples)
-    example = (ramp.reshape(spec.channels, spec.samples),)
+    example = (torch.from_numpy(golden_trace(spec)),)
     options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
@@ -350,8 +349,10 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
         difference = abs(actual.lower - expected.lower) + abs(actual.upper - expected.upper)
         same_counts = actual.action == expected.action and difference <= BOUND_TOLERANCE
         if not is_near or n_moved > N_AT_EDGE or (n_moved == 0 and not same_counts):
-            problem = f"onnxruntime does not decide as the model does: {actual} for {expected}"
-            raise ExportError(f"{problem}; export torchscript.")
+            raise ExportError(
+                f"onnxruntime does not decide as the model does: {actual} for {expected}; export "
+                "torchscript."
+            )
 
 
 def _import_package(name: str) -> ModuleType:

@@ -77,11 +77,14 @@ def export_sources(folder: FilePath) -> Path:
         If it holds something or cannot be written.
     """
     target = Path(folder)
-    do = "choose a folder that is writable"
-    with instead(ExportError, f"Cannot write {target}", OSError, do=do):
+    with instead(
+        ExportError, f"Cannot write {target}", OSError, do="choose a folder that is writable"
+    ):
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            wanted = "Expected a new or an empty folder for the sources"
-            raise ExportError(f"{wanted}, {target} holds something; name another folder.")
+            raise ExportError(
+                f"Expected a new or an empty folder for the sources, {target} holds something; "
+                "name another folder."
+            )
         shutil.copytree(Path(__file__).parent / "cpp", target, dirs_exist_ok=True)
         (target / "VERSION").write_text(f"{__version__}\n", encoding="utf-8")
     return target
@@ -331,12 +334,19 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     content = read_checked(target, key)
     metadata = metadata_of(content, target)
     torch.set_num_threads(1)
-    problem = f"{target} has its checksum but is no loadable TorchScript"
-    with instead(ExportError, problem, RuntimeError):
+    with instead(
+        ExportError, f"{target} has its checksum but is no loadable TorchScript", RuntimeError
+    ):
         file = io.BytesIO(content)
         module = torch.jit.load(file, map_location="cpu").eval()  # type: ignore[no-untyped-call]
-    problem = f"{target} is not a dengine export: its description does not fit its module"
-    with instead(ExportError, problem, AttributeError, KeyError, TypeError, ValueError):
+    with instead(
+        ExportError,
+        f"{target} is not a dengine export: its description does not fit its module",
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+    ):
         # A copy runs the same compiled code; the module itself must not learn the golden trace.
         _check_golden(ExportedModel(copy.deepcopy(module), dict(metadata)), target)
         return ExportedModel(module, metadata)
@@ -356,5 +366,7 @@ def _check_golden(model: ExportedModel, path: Path) -> None:
         model.stop(trace)
     same_shape = embedding.shape == expected.shape
     if not same_shape or not np.allclose(embedding, expected, atol=TOLERANCE, rtol=TOLERANCE):
-        problem = f"{path} loads, but this machine does not reproduce its golden embedding"
-        raise ExportError(f"{problem}; export it anew here.")
+        raise ExportError(
+            f"{path} loads, but this machine does not reproduce its golden embedding; export it "
+            "anew here."
+        )

@@ -164,9 +164,9 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     if not matches and (item := store.decisions.get(part, trace=False)) is not None:
         matches = [item]
     if not matches:
-        actual = f"{shortened(part)}, which is unknown; `dengine history STORE` lists them"
         raise UnknownDecisionError(
-            f"Expected the number of a part that was decided on, or a decision's id, got {actual}."
+            "Expected the number of a part that was decided on, or a decision's id, got "
+            f"{shortened(part)}, which is unknown; `dengine history STORE` lists them."
         )
     if len(matches) > 1:
         ids = ", ".join(item.decision.id for item in reversed(matches))

@@ -10,8 +10,8 @@ and by the headers `Origin` and `Sec-Fetch-Site`, and refuses them.
 import asyncio
 import base64
 import hmac
-import logging
 import os
+import re
 import stat
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -25,11 +25,12 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import SettingError, instead
+from ..errors import SettingError, instead, log
 from .api import Refusal, problem_response
 
-log = logging.getLogger("dengine")
 MIN_TOKEN_LENGTH = 16  # characters
+# A secret, a role and the owner's name.
+TOKEN_LINE = re.compile(rf"([!-~]{{{MIN_TOKEN_LENGTH},}})(?:\s+(viewer|operator)(?:\s+(.+))?)?")
 MAX_CLIENTS = 1000  # whose wrong tokens are logged
 SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing
 RPC = "/RPC2"  # a robot that cannot send headers may append its token to this path
@@ -114,20 +115,16 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
             f"Expected a token file that only its owner may use, {file} has mode {mode:o}; "
             f"run: chmod 600 {file}"
         )
-    lines = [line.split() for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
-    tokens = tuple(Token(line[0], line[1:2] != ["viewer"], " ".join(line[2:])) for line in lines)
-    secrets = {
-        token.secret for token in tokens if token.secret.isascii() and token.secret.isprintable()
-    }
-    if not tokens or len(secrets) < len(tokens) or min(map(len, secrets)) < MIN_TOKEN_LENGTH:
+    lines = [line for line in text.decode("utf-8", "replace").splitlines() if line.strip()]
+    matches = [TOKEN_LINE.fullmatch(line.strip()) for line in lines]
+    tokens = tuple(
+        Token(match[1], match[2] != "viewer", match[3] or "") for match in matches if match
+    )
+    if not tokens or len({token.secret for token in tokens}) < len(lines):
         raise SettingError(
             f"Expected tokens of at least {MIN_TOKEN_LENGTH} ASCII characters in {file}, one per "
-            f"line and each once; make one: (umask 077; openssl rand -hex 24 > {file})"
-        )
-    if any(line[1:2] not in ([], ["viewer"], ["operator"]) for line in lines):
-        raise SettingError(
-            f"Expected viewer or operator, and then a name, after each token of {file}; "
-            "or the token alone."
+            "line and each once, alone or followed by viewer or operator and then a name; make "
+            f"one: (umask 077; openssl rand -hex 24 > {file})"
         )
     return tokens
 
@@ -251,9 +248,10 @@ class Guard:
         headers = Headers(scope=scope)
         host = headers.get("host")
         if not is_own_host(host, self.access.hosts):
-            names = "its IP address, localhost, or a name given by dengine serve --allow-host NAME"
             raise Refusal(
-                HTTPStatus.MISDIRECTED_REQUEST, f"Expected the server to be called by {names}."
+                HTTPStatus.MISDIRECTED_REQUEST,
+                "Expected the server to be called by its IP address, localhost, or a name given by "
+                "dengine serve --allow-host NAME.",
             )
         self._check_token(scope, headers)
         # Browsers say from which site a request comes. It must be this one, or no page at all.
@@ -287,10 +285,12 @@ class Guard:
         elif scope["path"] != "/healthz":
             if secret or "authorization" in headers:
                 self._log_wrong_token((scope.get("client") or ("", 0))[0])
-            how = "Authorization: Bearer TOKEN, or any user name with it as the password"
             challenge = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
             raise Refusal(
-                HTTPStatus.UNAUTHORIZED, f"Expected the server's token: {how}.", challenge
+                HTTPStatus.UNAUTHORIZED,
+                "Expected the server's token: Authorization: Bearer TOKEN, or any user name with "
+                "it as the password.",
+                challenge,
             )
 
     def _log_wrong_token(self, client: str) -> None:
@@ -321,8 +321,11 @@ def _limit_body(receive: Receive, access: Access) -> Receive:
             async with asyncio.timeout_at(deadline):
                 message = await receive()
         except TimeoutError:
-            text = f"Expected the request's body within {access.body_seconds:g} s."
-            raise Refusal(HTTPStatus.REQUEST_TIMEOUT, text, CLOSE) from None
+            raise Refusal(
+                HTTPStatus.REQUEST_TIMEOUT,
+                f"Expected the request's body within {access.body_seconds:g} s.",
+                CLOSE,
+            ) from None
         is_incomplete = bool(message.get("more_body", False))
         bytes_left -= len(message.get("body", b""))
         if bytes_left < 0:
@@ -334,11 +337,12 @@ def _limit_body(receive: Receive, access: Access) -> Receive:
 
 def _too_large(largest: int) -> Refusal:
     """Return the refusal of a body of more than `largest` bytes."""
-    text = (
+    return Refusal(
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
         f"Expected a request of at most {largest} bytes (dengine serve --largest), "
-        "got a larger one."
+        "got a larger one.",
+        CLOSE,
     )
-    return Refusal(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, text, CLOSE)
 
 
 def _with_headers(send: Send) -> Send:

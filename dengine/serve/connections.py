@@ -54,8 +54,10 @@ class Connection(AutoHTTPProtocol):
         super().connection_made(transport)
         self._start_timer()
         if len(self.connections) > MAX_CONNECTIONS:
-            detail = f"Expected at most {MAX_CONNECTIONS} connections at once; verify the part."
-            self._respond_and_close(HTTPStatus.SERVICE_UNAVAILABLE, detail)
+            self._respond_and_close(
+                HTTPStatus.SERVICE_UNAVAILABLE,
+                f"Expected at most {MAX_CONNECTIONS} connections at once; verify the part.",
+            )
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Stop the timer."""
@@ -76,8 +78,10 @@ class Connection(AutoHTTPProtocol):
             self._head_bytes = 0
             self._stop_timer()
         elif self._head_bytes > MAX_HEAD_BYTES:
-            detail = f"Expected the request's head to be at most {MAX_HEAD_BYTES} bytes."
-            self._respond_and_close(HTTPStatus.BAD_REQUEST, detail)
+            self._respond_and_close(
+                HTTPStatus.BAD_REQUEST,
+                f"Expected the request's head to be at most {MAX_HEAD_BYTES} bytes.",
+            )
         else:
             self._start_timer()
 

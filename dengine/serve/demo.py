@@ -5,7 +5,6 @@ outcome.
 """
 
 import asyncio
-import logging
 import uuid
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -14,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from ..cells.replay import ReplayCell
-from ..errors import BusyError
+from ..errors import BusyError, log
 from ..records import Action, Outcome
 from .service import CellService
 
-log = logging.getLogger("dengine")
 N_FAST = 150  # parts that are played without a pause, so that a model is soon ready
 CHECK_SHARE = 0.4  # of a cycle, after which the result of a verification is there
 POLL_SECONDS = 0.05  # between two looks at whether a retrain has ended

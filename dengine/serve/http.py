@@ -286,13 +286,16 @@ class HttpApi:
         def begin(engine: DataEngine, by: str) -> Changed:
             """Start the retrain, record as an event who asked for it, and return what changed."""
             if engine.state.is_retraining:
-                text = "A retrain is under way already; nothing changed."
-                return Changed("retrain", text, None, engine.version)
+                return Changed(
+                    "retrain",
+                    "A retrain is under way already; nothing changed.",
+                    None,
+                    engine.version,
+                )
             engine.release(by)
-            engine.store.events.put("retrain", "asked for by hand", author=by)
+            event = engine.store.events.put("retrain", "asked for by hand", author=by)
             engine.retrain(wait=False)
-            event = engine.store.events.newest(1)[-1]
-            return Changed("retrain", "The retrain has begun.", event.number, engine.version)
+            return Changed("retrain", "The retrain has begun.", event, engine.version)
 
         return await self._change(author, begin)
 
@@ -314,8 +317,11 @@ class HttpApi:
         by = _checked_author(author)
         source = await self.service.call(copy_model)
         content = await asyncio.to_thread(_zip_export, source)
-        text = f"version {source.model_version} was downloaded"
-        await self.service.call(lambda engine: engine.store.events.put("export", text, author=by))
+        await self.service.call(
+            lambda engine: engine.store.events.put(
+                "export", f"version {source.model_version} was downloaded", author=by
+            )
+        )
         name = f"model_{source.model_version}.zip"
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(content, media_type="application/zip", headers=headers)
@@ -524,10 +530,9 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
 
     It has the decision's trace, the band of good parts (None where there is none), up to `N_BADS`
     newest bad traces among the newest `N_LABELS` labels (none if their shape differs), and the
-    corrections of its label. Band and bad traces are rounded for a picture. Raises StoreError for
-    a damaged trace of the decision or of a neighbour; other damaged rows are left out, and an event
-    records that. Raises UnknownDecisionError without a decision, ReportConflictError if the part
-    has several.
+    corrections of its label. Raises StoreError for a damaged trace of the decision or of a
+    neighbour; other damaged rows are left out, and an event records that. Raises
+    UnknownDecisionError without a decision, ReportConflictError if the part has several.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -535,18 +540,11 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     bads = labelled.traces[labelled.labels == 0][-N_BADS:]
     if bads.shape[1:] != trace.shape:
         bads = np.zeros((0, *trace.shape))
-    # float64, because the range of float32 values can overflow.
-    finite = np.nan_to_num(trace, posinf=0.0, neginf=0.0).astype(np.float64)
-    digits = 4 - int(np.log10(np.ptp(finite) or 1.0))  # enough for a picture
-    arrays = {name: getattr(explanation.envelope, name, None) for name in ("low", "median", "high")}
-    rounded = {
-        name: None if values is None else np.round(values.astype(np.float64), digits)
-        for name, values in (arrays | {"bads": bads}).items()
-    }
+    band = {name: getattr(explanation.envelope, name, None) for name in ("low", "median", "high")}
     decision_id = explanation.decision.decision.id
     corrections = [item for item in store.corrections.after() if item.decision_id == decision_id]
     return response_fields(
-        "Explanation", explanation, trace=trace, corrections=corrections, **rounded
+        "Explanation", explanation, trace=trace, bads=bads, corrections=corrections, **band
     )
 
 

@@ -31,13 +31,12 @@ from asyncua.ua import VariantType
 from asyncua.ua.attribute_ids import AttributeIds
 from asyncua.ua.status_codes import StatusCodes
 
-from ..errors import DengineError, SettingError, as_options
+from ..errors import DengineError, SettingError, as_options, log
 from ..files import FilePath
 from .auth import host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
 from .service import CellService
 
-log = logging.getLogger("dengine")
 PORT = 4840
 MAX_MESSAGE = 1 << 20  # bytes, 250,000 samples
 CHUNK = 65535  # bytes of a part of a message
@@ -66,8 +65,8 @@ class Argument(NamedTuple):
 
     name: str
     type: VariantType
-    is_array: bool
     description: str
+    is_array: bool = False
 
 
 VARIABLES: Mapping[str, Variable] = {
@@ -101,33 +100,31 @@ VARIABLES: Mapping[str, Variable] = {
     "LastRefused": Variable(VariantType.String, "", "why the newest refused call was refused"),
 }
 DECIDE_ARGUMENTS = [
-    Argument("Trace", VariantType.Float, True, "samples, channel by channel"),
-    Argument("Channels", VariantType.UInt32, False, "1, or how many channels the trace has"),
+    Argument("Trace", VariantType.Float, "samples, channel by channel", is_array=True),
+    Argument("Channels", VariantType.UInt32, "1, or how many channels the trace has"),
     Argument(
         "Request",
         VariantType.String,
-        False,
         "an id of the caller's, a different one for each part; empty: a new one",
     ),
-    Argument("Part", VariantType.String, False, "the part's number; empty: none"),
+    Argument("Part", VariantType.String, "the part's number; empty: none"),
 ]
 DECIDE_RESULTS = [
-    Argument("Action", VariantType.Int32, False, "0 verify, 1 accept, 2 reject"),
-    Argument("Id", VariantType.String, False, "for Report; empty: nothing was recorded, verify"),
-    Argument("Reason", VariantType.String, False, "why, as in Reason; busy: the queue is full"),
-    Argument("Lower", VariantType.Double, False, "lower bound of the success probability"),
-    Argument("Upper", VariantType.Double, False, "upper bound of it"),
-    Argument("ModelVersion", VariantType.UInt32, False, "of the model that decided"),
+    Argument("Action", VariantType.Int32, "0 verify, 1 accept, 2 reject"),
+    Argument("Id", VariantType.String, "for Report; empty: nothing was recorded, verify"),
+    Argument("Reason", VariantType.String, "why, as in Reason; busy: the queue is full"),
+    Argument("Lower", VariantType.Double, "lower bound of the success probability"),
+    Argument("Upper", VariantType.Double, "upper bound of it"),
+    Argument("ModelVersion", VariantType.UInt32, "of the model that decided"),
 ]
 REPORT_ARGUMENTS = [
-    Argument("Id", VariantType.String, False, "as Decide returned it"),
-    Argument("Success", VariantType.Boolean, False, "True: good"),
+    Argument("Id", VariantType.String, "as Decide returned it"),
+    Argument("Success", VariantType.Boolean, "True: good"),
 ]
 REPORT_RESULTS = [
     Argument(
         "Kept",
         VariantType.Boolean,
-        False,
         "False: nothing under this id was recorded, or the server is busy",
     )
 ]

@@ -11,7 +11,6 @@ milliseconds.
 from __future__ import annotations
 
 import ctypes
-import logging
 import multiprocessing
 import os
 import pickle
@@ -29,11 +28,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from ..errors import log
+
 # Signals that ask a process to end; SIGBREAK is Ctrl-Break on Windows.
 END_SIGNALS = [
     number for number in signal.Signals if number.name in ("SIGINT", "SIGTERM", "SIGBREAK")
 ]
-log = logging.getLogger("dengine")
 NICENESS = 10  # decisions go first if cores are scarce
 PR_SET_PDEATHSIG = 1  # linux/prctl.h: send a signal when the parent ends
 T = TypeVar("T")

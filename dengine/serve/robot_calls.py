@@ -14,7 +14,6 @@ under a used id) are faults.
 """
 
 import asyncio
-import logging
 import uuid
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
@@ -31,13 +30,13 @@ from ..errors import (
     TraceError,
     UnknownDecisionError,
     expect,
+    log,
     shortened,
 )
 from ..records import ACTIONS, Action, Decision, TraceArray, as_id
 from .api import as_samples
 from .service import CellService
 
-log = logging.getLogger("dengine")
 RECORD_SECONDS = 1.0  # for a recording to be complete after the insertion
 MAX_PARTS = 8  # parts whose pieces of a trace are kept; the oldest is given up for one more
 MAX_SAMPLES = 200_000  # of all pieces of a part

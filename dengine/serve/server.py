@@ -25,7 +25,7 @@ import uvicorn
 
 from ..engine.engine import DataEngine
 from ..engine.garbage import frozen_objects
-from ..errors import SettingError, instead, without_password
+from ..errors import SettingError, instead, log, without_password
 from .auth import Access, host_in_url, is_loopback, read_tokens
 from .connections import Connection
 from .http import Beside, create_app
@@ -33,7 +33,6 @@ from .retraining import END_SIGNALS, RetrainingProcess
 from .robot_calls import Recorder
 from .service import CellService
 
-log = logging.getLogger("dengine")
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
 GRACE = 5  # seconds for requests under way when the server ends
 # Seconds after which a thread gives Python's lock to a waiting one. A robot may wait for either of

@@ -13,7 +13,6 @@ are built on this module.
 from __future__ import annotations
 
 import asyncio
-import logging
 import queue
 import threading
 import time
@@ -28,7 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from numpy.typing import ArrayLike
 
 from ..engine.engine import DataEngine
-from ..errors import BusyError, NotTakenError
+from ..errors import BusyError, NotTakenError, log
 from ..files import FilePath
 from ..history.status import NEWEST, Status, status
 from ..records import Decision, PartNumber, Reason, RetrainReport, as_id, as_success
@@ -38,7 +37,6 @@ from ..store.records import StoredDecision
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 CLOSING = "The server is closing: verify the part, and ask again when it is back."
 DEADLINE = 0.5  # seconds that a decision waits in the queue before its part is verified
@@ -302,8 +300,11 @@ class CellService:
                 return True, None
             retrain = engine.report(decision_id, label)
             if author:
-                text = f"decision {decision_id} was {'good' if label else 'bad'}"
-                engine.store.events.put("report", text, author=author)
+                engine.store.events.put(
+                    "report",
+                    f"decision {decision_id} was {'good' if label else 'bad'}",
+                    author=author,
+                )
             return False, retrain
 
         repeated, retrain = await self.call(work)

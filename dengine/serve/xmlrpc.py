@@ -7,7 +7,6 @@ XML: no document type, no entity, nothing from outside.
 """
 
 import asyncio
-import logging
 import xmlrpc.client
 from inspect import signature
 from typing import Any
@@ -17,13 +16,12 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 
-from ..errors import DengineError, ReportError, as_options
+from ..errors import DengineError, ReportError, as_options, log
 from .api import media_type
 from .auth import RPC
 from .robot_calls import Call, Recorder, RobotCalls, one_line
 from .service import CellService
 
-log = logging.getLogger("dengine")
 SMALL_BODY = 1 << 16  # bytes; a larger call is parsed in a thread
 TAGS = (
     "int",
@@ -90,8 +88,7 @@ def routes(service: CellService, recorder: Recorder | None = None) -> list[Route
         Another media type or a compressed body gets 415.
         """
         if media_type(request) not in ("text/xml", "application/xml"):
-            text = "Expected an XML-RPC call, Content-Type: text/xml.\n"
-            return PlainTextResponse(text, 415)
+            return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
         if request.headers.get("content-encoding", "identity") != "identity":
             return PlainTextResponse("Expected a call that is not compressed.\n", 415)
         xml = await call_method(calls, await request.body())
@@ -119,8 +116,10 @@ async def call_method(calls: dict[str, Call], body: bytes) -> bytes:
     try:
         signature(call).bind(*arguments)
     except TypeError as error:
-        text = f"Expected the arguments that {name} takes, got {len(arguments)}: {error}."
-        return fault(WRONG_ARGUMENTS, text)
+        return fault(
+            WRONG_ARGUMENTS,
+            f"Expected the arguments that {name} takes, got {len(arguments)}: {error}.",
+        )
     try:
         return xmlrpc.client.dumps((await call(*arguments),), methodresponse=True).encode()
     except DengineError as error:

@@ -20,10 +20,10 @@ from typing import Any
 import sqlalchemy as sa
 
 from ..errors import OutputError, StoreError, expect, instead
-from ..files import output_file
+from ..files import FilePath, output_file
 from .connections import reading
 from .journal import Journal, Record, journal_path, read_undrained
-from .records import CHUNK
+from .records import chunks
 from .schema import DECISION, LABEL, SETTING
 from .sql import SqlStore
 from .verification import CellHistory, verify_history
@@ -50,7 +50,7 @@ class BackupReport:
     without_journal: tuple[str, ...]
 
 
-def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> BackupReport:
+def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
     Engines may run meanwhile: everything that they had acknowledged when this was called is in the
@@ -77,9 +77,14 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
         If `out` exists, or cannot be written.
     """
     with reading(os.fspath(url)) as connection:
-        do = "pg_dump copies it, once the engines have ended: their journals lie on their machines"
         dialect = connection.dialect.name
-        expect(dialect == "sqlite", "a store in a file", dialect, do, StoreError)
+        expect(
+            dialect == "sqlite",
+            "a store in a file",
+            dialect,
+            "pg_dump copies it, once the engines have ended: their journals lie on their machines",
+            StoreError,
+        )
         cells = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.
@@ -103,9 +108,7 @@ def backup_store(url: str | os.PathLike[str], out: str | os.PathLike[str]) -> Ba
     return BackupReport(decisions, labels, sum(map(len, waiting.values())), without)
 
 
-def restore_store(
-    copy: str | os.PathLike[str], store: str | os.PathLike[str]
-) -> tuple[CellHistory, ...]:
+def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     """Copy a backup to the place of a store, on this or another machine, with a journal per cell.
 
     The journal names the newest ledger entry, so that the first engine knows that nothing is
@@ -131,8 +134,10 @@ def restore_store(
     """
     report = verify_history(os.fspath(copy))
     if not report.ok:
-        do = "see `dengine verify`, and take another copy"
-        raise StoreError(f"Expected a history as it was written in {copy}, found faults; {do}.")
+        raise StoreError(
+            f"Expected a history as it was written in {copy}, found faults; see `dengine verify`, "
+            "and take another copy."
+        )
     backup_store(copy, store)
     for cell in report.cells:
         path = journal_path(sa.URL.create("sqlite", database=os.fspath(store)), cell.cell_id)
@@ -162,8 +167,8 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
     if not records:
         return
     with SqlStore(str(file), cell) as store:
-        for begin in range(0, len(records), CHUNK):
-            store.apply_records(records[begin : begin + CHUNK])
+        for part in chunks(records):
+            store.apply_records(part)
 
 
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:

@@ -31,7 +31,7 @@ from .ledger import (
     newest_entry,
 )
 from .queries import Scope, join_product
-from .records import as_text, chunks
+from .records import Clock, EntryName, Row, as_text, chunks
 from .schema import CELL, DECISION, LEDGER, check_schema, lock, prepare_tables
 
 T = TypeVar("T")
@@ -83,10 +83,12 @@ def make_engine(url: str | None) -> sa.Engine:
             parsed = parsed.set(drivername="postgresql+psycopg")
         backend = parsed.get_backend_name()
         in_file = backend == "sqlite" and parsed.database not in (None, "", ":memory:")
-        expected = "a file, an SQLite file URL or a PostgreSQL URL"
-        do = "for a store that forgets use store=None"
         expect(
-            backend == "postgresql" or in_file, expected, parsed.render_as_string(), do, StoreError
+            backend == "postgresql" or in_file,
+            "a file, an SQLite file URL or a PostgreSQL URL",
+            parsed.render_as_string(),
+            "for a store that forgets use store=None",
+            StoreError,
         )
         if backend == "postgresql":
             return sa.create_engine(parsed, pool_pre_ping=True, connect_args=TIMEOUTS)
@@ -117,8 +119,10 @@ def _unusable_url(url: str, reason: str) -> StoreError:
 
     The message quotes only the part of the URL behind the last @, so that no password is in it.
     """
-    actual = f"{url.split('@')[-1]!r}: {reason}. For PostgreSQL: pip install 'dengine[postgres]'"
-    return StoreError(f"Expected a file or a database URL that can be used here, got {actual}.")
+    return StoreError(
+        f"Expected a file or a database URL that can be used here, got {url.split('@')[-1]!r}: "
+        f"{reason}. For PostgreSQL: pip install 'dengine[postgres]'."
+    )
 
 
 class CopyConnection(sqlite3.Connection):
@@ -265,9 +269,9 @@ def reading(url: str) -> Iterator[sa.Connection]:
         file = str(engine.url.database)
         # A `file:` name is a URI of SQLite's own.
         if sqlite and not (Path(file).is_file() or file.startswith("file:")):
-            do = "make a DataEngine with it, or let `dengine train` or `dengine run` make one"
             raise StoreError(
-                f"Expected a store that an engine has used, found no file {file}; {do}."
+                f"Expected a store that an engine has used, found no file {file}; make a "
+                "DataEngine with it, or let `dengine train` or `dengine run` make one."
             )
         with _store_errors("read", name), engine.connect() as connection:  # rolled back at the end
             connection.execution_options(**options)
@@ -338,7 +342,7 @@ class Database:
         self,
         url: str | None,
         cell_id: str,
-        clock: Callable[[], float],
+        clock: Clock,
         product: str | None,
     ) -> None:
         self.cell_id = cell_id
@@ -350,18 +354,19 @@ class Database:
         self._writing = threading.RLock()  # one write transaction at a time in this process
         self._commits = threading.local()  # of each thread: `is_wanted` of `commit_if`
         self._key = b"" if url is None else ledger_key()
-        self.newest_entry: tuple[int, str] | None = None
+        self.newest_entry: EntryName | None = None
         self.on_entry: Callable[[], object] = lambda: None
         self._engine = self._writer = make_engine(url)
         chain_writes(self._engine)
         self.url = self._engine.url  # its password included
         self.name = self.url.render_as_string(hide_password=True)
         self.scope = self._open(product)
-        in_file = self.url.get_backend_name() == "sqlite" and self.url.database is not None
-        file = sqlite_file(self.url) if in_file else None
-        # None: in memory, or a server
-        self._file = file if file is not None and file.is_file() else None
-        self._opened = None if self._file is None else self._file.stat()
+        # The file with what it was when it was opened. None: in memory, or a server.
+        self._file: tuple[Path, os.stat_result] | None = None
+        if self.url.get_backend_name() == "sqlite" and self.url.database is not None:
+            file = sqlite_file(self.url)
+            if file.is_file():
+                self._file = file, file.stat()
 
     def _open(self, product: str | None) -> Scope:
         """Create the tables or check them, enter the cell if it is new, and set `newest_entry`.
@@ -430,10 +435,11 @@ class Database:
 
         PostgreSQL and a store in memory are not checked.
         """
-        if self._file is None or self._opened is None:
+        if self._file is None:
             return
+        file, opened = self._file
         with suppress(OSError):
-            if os.path.samestat(self._file.stat(), self._opened):
+            if os.path.samestat(file.stat(), opened):
                 return
         raise FileNotFoundError("the file was deleted, moved or replaced while it was open")
 
@@ -452,8 +458,11 @@ class Database:
 
     def has_entry(self, number: int, digest: str) -> bool:
         """Return whether the cell's ledger has an entry with this number and hexadecimal digest."""
-        query = sa.select(LEDGER.c.digest).where(LEDGER.c.cell_id == self.cell_id)
-        rows = self.read(query.where(LEDGER.c.number == number))
+        rows = self.read(
+            sa.select(LEDGER.c.digest).where(
+                LEDGER.c.cell_id == self.cell_id, LEDGER.c.number == number
+            )
+        )
         return [row.digest.hex() for row in rows] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
@@ -535,9 +544,9 @@ class Database:
         key = int.from_bytes(digest[:8], "big", signed=True)
         taken = connection.execute("SELECT pg_try_advisory_lock(%s)", [key]).fetchone()[0]
         holder_query = (
-            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) "
-            "WHERE l.locktype = 'advisory' "
-            "AND (l.classid::bigint << 32) + l.objid::bigint = %s AND l.objsubid = 1 AND l.granted"
+            "SELECT a.application_name FROM pg_locks l JOIN pg_stat_activity a USING (pid) WHERE "
+            "l.locktype = 'advisory' AND (l.classid::bigint << 32) + l.objid::bigint = %s AND "
+            "l.objsubid = 1 AND l.granted"
         )
         holder = None if taken else connection.execute(holder_query, [key]).fetchone()
         connection.commit()
@@ -612,7 +621,7 @@ class Database:
     # Rows
 
     def insert(
-        self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Mapping[str, Any]]
+        self, connection: sa.Connection, column: sa.Column[Any], rows: Sequence[Row]
     ) -> list[int]:
         """Insert rows of this cell into a table, each with a number; return these numbers.
 

@@ -70,10 +70,9 @@ class CorrectionTable(CellTable):
             if version is not None:
                 stored = self._versions.insert(connection, version)
                 if stored != version["version"]:
-                    expected = f"version {version['version']} to be the next"
                     raise StoreError(
-                        f"Expected {expected}, a peer of the product stored {stored - 1} "
-                        "meanwhile; try it again."
+                        f"Expected version {version['version']} to be the next, a peer of the "
+                        f"product stored {stored - 1} meanwhile; try it again."
                     )
             if change.settings is not None:
                 self._settings.replace(connection, change.settings)
@@ -110,11 +109,10 @@ class CorrectionTable(CellTable):
         list of Correction
             Of all cells of the product.
         """
-        query = sa.select(*CORRECTION.c, LABEL.c.seq).select_from(
-            CORRECTION.join(LABEL, CORRECTION_OF_LABEL)
-        )
-        query = query.where(
-            self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after)
+        query = (
+            sa.select(*CORRECTION.c, LABEL.c.seq)
+            .select_from(CORRECTION.join(LABEL, CORRECTION_OF_LABEL))
+            .where(self._scope.shared(CORRECTION.c.cell_id), CORRECTION.c.number > int(after))
         )
         return [
             from_row(Correction, row._mapping)
@@ -161,7 +159,10 @@ class CorrectionTable(CellTable):
         None without a label. Ids that are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
-        query = sa.select(
-            *DECISION.c["id", "content_hash", "quarantined", "time"], *label
-        ).select_from(WITH_LABELS)
-        return self._database.rows_by_id(connection, query, ids)
+        return self._database.rows_by_id(
+            connection,
+            sa.select(*DECISION.c["id", "content_hash", "quarantined", "time"], *label).select_from(
+                WITH_LABELS
+            ),
+            ids,
+        )

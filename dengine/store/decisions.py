@@ -59,9 +59,11 @@ class DecisionTable(CellTable):
         if not rows:
             return None
         if trace and not is_intact(TRACE, rows[0][-len(TRACE.c) :]):
-            where = f"as it was stored in {self._database.name}, its bytes have changed"
-            do = "see `dengine verify`, and restore the store from a copy"
-            raise StoreError(f"Expected the trace of decision {decision_id!r} {where}; {do}.")
+            raise StoreError(
+                f"Expected the trace of decision {decision_id!r} as it was stored in "
+                f"{self._database.name}, its bytes have changed; see `dengine verify`, and restore "
+                "the store from a copy."
+            )
         return read_decision(rows[0])
 
     def ids(self) -> Iterator[Sequence[str]]:
@@ -119,12 +121,12 @@ class DecisionTable(CellTable):
             is_other = self._own(other) & (other.c.id == start_after)
             limit_number = sa.select(other.c.number).where(is_other).scalar_subquery()
             conditions.append(number < limit_number if newest else number > limit_number)
-        query = (
+        rows = self._read(
             past_query(self._database.cell_id)
             .where(*conditions)
             .order_by(number.desc() if newest else number)
+            .limit(limit)
         )
-        rows = self._read(query.limit(limit))
         return [read_decision(row) for row in (rows[::-1] if newest else rows)]
 
     def unreported_accepts(self, since_version: int = 0) -> list[str]:
@@ -172,13 +174,18 @@ class DecisionTable(CellTable):
 
         Those of quarantined traces, and those by a version before `since_version`, are left out.
         """
-        query = (
+        return (
             sa.select(*columns)
             .select_from(WITH_LABELS)
-            .where(DECISION.c.action == action.value, LABEL.c.seq.is_(None))
+            .where(
+                DECISION.c.action == action.value,
+                LABEL.c.seq.is_(None),
+                self._own(DECISION),
+                DECISION.c.quarantined == sa.false(),
+            )
+            .where(DECISION.c.model_version >= since_version)
+            .order_by(DECISION.c.number)
         )
-        query = query.where(self._own(DECISION), DECISION.c.quarantined == sa.false())
-        return query.where(DECISION.c.model_version >= since_version).order_by(DECISION.c.number)
 
     def overdue_to(self, within: int, since_version: int = 0) -> int:
         """Return the number of the newest decision that is old enough for its check to be overdue.
@@ -199,8 +206,12 @@ class DecisionTable(CellTable):
         -------
         int
         """
-        newest = sa.select(DECISION.c.number, DECISION.c.model_version).where(self._own(DECISION))
-        last = self._read(newest.order_by(DECISION.c.number.desc()).limit(1))
+        last = self._read(
+            sa.select(DECISION.c.number, DECISION.c.model_version)
+            .where(self._own(DECISION))
+            .order_by(DECISION.c.number.desc())
+            .limit(1)
+        )
         of_labels = sa.select(sa.func.max(LABEL.c.overdue_to)).where(self._own(LABEL))
         by_labels = self._read(of_labels)[0][0] or 0
         is_in_force = bool(last) and last[0].model_version >= since_version
@@ -246,8 +257,8 @@ class DecisionTable(CellTable):
             sa.select(*group, *times)
             .select_from(WITH_LABELS)
             .group_by(*columns, "aged", SUCCESS, SOURCE)
+            .where(self._own(DECISION), DECISION.c.model_version >= since_version)
         )
-        query = query.where(self._own(DECISION), DECISION.c.model_version >= since_version)
         rows = self._read(query if last is None else query.where(DECISION.c.number > newest - last))
         first, latest, label = (
             [row[i] for row in rows if row[i] is not None] for i in (-3, -2, -1)
@@ -301,8 +312,11 @@ class DecisionTable(CellTable):
         for group in tally.groups:
             sources[group.source] += group.n if group.success is not None else 0
         forgotten = tally.by("label")["forgotten"]
-        query = sa.select(sa.func.count(CORRECTION.c.decision_id.distinct()))
-        corrected = self._read(query.where(self._own(CORRECTION)))[0][0]
+        corrected = self._read(
+            sa.select(sa.func.count(CORRECTION.c.decision_id.distinct())).where(
+                self._own(CORRECTION)
+            )
+        )[0][0]
         return {
             "decisions": tally.count(),
             "actions": {action.value: actions[action] for action in Action},

@@ -5,7 +5,6 @@ than a time limit, even where the database does not answer. `JournalledStore` ha
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
@@ -15,16 +14,15 @@ from contextlib import suppress
 from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..errors import StoreError, listed
+from ..errors import StoreError, listed, log
 from .journal import Journal, Record, decode_record
 from .lookup import DecisionIndex
 from .recording import RETRY_SECONDS, Recorder
-from .records import DATA_LOST, LOSS_REMEDY
+from .records import DATA_LOST, LOSS_REMEDY, LabelNumbers
 
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 DRAIN_SECONDS = 0.25  # synced records wait so long for others before they are drained together
 LAG_SECONDS = 1.0  # a larger lag is a fault of the store
@@ -70,7 +68,7 @@ class Drainer:
         self._changed = recorder.changed
         self._wanted = 0  # up to this record somebody waits for the database
         self._error = ""
-        self._label_numbers: list[tuple[str, int]] = []  # of a product, not yet collected
+        self._label_numbers: LabelNumbers = []  # of a product, not yet collected
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._stopped = False
         self._thread = threading.Thread(target=self._run, name="dengine-store", daemon=True)
@@ -130,7 +128,7 @@ class Drainer:
             "try this again when it is back."
         )
 
-    def pop_label_numbers(self) -> list[tuple[str, int]]:
+    def pop_label_numbers(self) -> LabelNumbers:
         """Return the numbers of labels, as `Outbox.pop_label_numbers` says."""
         with self._changed:
             numbers = self._label_numbers

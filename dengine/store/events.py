@@ -2,13 +2,12 @@
 one.
 """
 
-import logging
 from collections.abc import Mapping
 from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import StoreError
+from ..errors import StoreError, log
 from .cell_table import CellTable
 from .records import (
     ACKNOWLEDGED,
@@ -23,8 +22,6 @@ from .records import (
 )
 from .schema import DECISION, EVENT
 
-log = logging.getLogger("dengine")
-
 
 class EventTable(CellTable):
     """Reads and writes the events of a cell.
@@ -34,8 +31,8 @@ class EventTable(CellTable):
 
     def put(
         self, kind: str, text: str, data: Mapping[str, Any] | None = None, author: str = ""
-    ) -> None:
-        """Commit an event with the present time.
+    ) -> int:
+        """Commit an event with the present time, and return its number.
 
         Parameters
         ----------
@@ -48,17 +45,19 @@ class EventTable(CellTable):
             For data that JSON does not have, and if the database fails.
         """
         event = new_event(kind, text, self._database.clock(), data, author)
-        self._database.write(
+        (number,) = self._database.write(
             lambda connection: self._database.insert(connection, EVENT.c.number, [to_row(event)])
         )
+        return number
 
     def record_damage(self, text: str) -> None:
         """Commit an event of kind "damaged", unless the cell has one with this text.
 
         If the store cannot be written, the text is logged instead, and nothing raised.
         """
-        query = sa.select(EVENT.c.number).where(self._own(EVENT))
-        query = query.where(EVENT.c.kind == "damaged", EVENT.c.text == as_text(text))
+        query = sa.select(EVENT.c.number).where(
+            self._own(EVENT), EVENT.c.kind == "damaged", EVENT.c.text == as_text(text)
+        )
         if not self._read(query.limit(1)):
             try:
                 self.put("damaged", text)
@@ -113,6 +112,10 @@ class EventTable(CellTable):
         is_decision = self._own(DECISION) & (DECISION.c.id == decision_id)
         decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
         kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
-        query = sa.select(EVENT).where(self._own(EVENT), kinds, EVENT.c.entry > decided)
-        rows = self._read(query.order_by(EVENT.c.number).limit(1))
+        rows = self._read(
+            sa.select(EVENT)
+            .where(self._own(EVENT), kinds, EVENT.c.entry > decided)
+            .order_by(EVENT.c.number)
+            .limit(1)
+        )
         return from_row(Event, rows[0]._mapping) if rows else None

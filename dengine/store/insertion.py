@@ -3,14 +3,13 @@ events. Records may come twice, and may contradict what is stored; nothing is gu
 lost: one that cannot be stored becomes an event, "dead letter". `SqlStore` has one.
 """
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import sqlalchemy as sa
 
-from ..errors import StoreError
+from ..errors import StoreError, log
 from .connections import ROW_ERRORS, Database
 from .corrections import CorrectionTable
 from .journal import Record
@@ -19,6 +18,7 @@ from .records import (
     FORGOTTEN,
     LATE_STOP,
     Event,
+    LabelNumbers,
     NewLabel,
     StoredDecision,
     as_text,
@@ -28,8 +28,6 @@ from .records import (
     trace_row,
 )
 from .schema import DECISION, EVENT, LABEL, TRACE
-
-log = logging.getLogger("dengine")
 
 
 @dataclass
@@ -67,7 +65,7 @@ class RecordInsertion:
         self._database = database
         self._corrections = corrections
 
-    def commit(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+    def commit(self, records: Sequence[Record]) -> LabelNumbers:
         """Commit records, as `SqlStore.apply_records` says.
 
         If the database refuses a value, the records are halved, each half in a transaction of its
@@ -85,9 +83,7 @@ class RecordInsertion:
         self._database.write(lambda connection: self._insert_events(connection, [], [text]))
         return []
 
-    def _insert(
-        self, connection: sa.Connection, records: Sequence[Record]
-    ) -> list[tuple[str, int]]:
+    def _insert(self, connection: sa.Connection, records: Sequence[Record]) -> LabelNumbers:
         """Insert what is not stored yet, without a commit.
 
         Return (decision id, number) of the labels that are stored now.

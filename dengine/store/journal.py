@@ -40,7 +40,17 @@ from typing import Any
 from ..errors import StoreError, instead
 from ..records import Decision
 from .owned_file import OwnedFile, open_plain, sync
-from .records import OF_DECISION, Event, NewLabel, StoredDecision, from_row, pack, to_row, unpack
+from .records import (
+    OF_DECISION,
+    EntryName,
+    Event,
+    NewLabel,
+    StoredDecision,
+    from_row,
+    pack,
+    to_row,
+    unpack,
+)
 
 # Length of a record's JSON text, before it; the samples of a trace or point follow it.
 LENGTH = struct.Struct("<I")
@@ -74,10 +84,12 @@ def encode_record(record: Record) -> bytes:
 
 def decode_record(blob: bytes) -> Record:
     """Return the record that `encode_record` wrote; raise StoreError for other bytes."""
-    do = "open the store with the dengine that wrote it"
     errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
     with instead(
-        StoreError, "Expected a record of a journal, got what cannot be read", *errors, do=do
+        StoreError,
+        "Expected a record of a journal, got what cannot be read",
+        *errors,
+        do="open the store with the dengine that wrote it",
     ):
         (length,) = LENGTH.unpack_from(blob)
         samples = blob[LENGTH.size + length :]
@@ -108,7 +120,7 @@ class Head:
         When it was written, in seconds since 1970.
     """
 
-    newest: tuple[int, str] | None = None
+    newest: EntryName | None = None
     n_drained: int = 0
     n_synced: int = 0
     digest: str = ""
@@ -160,7 +172,7 @@ class Journal:
         self.dropped = 0
         self.loss = ""
         self.head = read_head(path)
-        self.entries: list[tuple[int, str]] = []
+        self.entries: list[EntryName] = []
         self._head_file: FileIO | None = None  # opened when it is written first
         # Guards what header and head hold: two threads write them.
         self._describing = threading.RLock()
@@ -269,7 +281,7 @@ class Journal:
                 return
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
-    def save_newest_entry(self, newest: tuple[int, str] | None) -> None:
+    def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write the newest ledger entry and `drained_to` to the header and to the head.
 
         Nothing is synced: an older header is harmless, since the store ignores
@@ -576,9 +588,10 @@ def _unpack_fields(content: bytes) -> dict[str, Any]:
 
 def forked_error(pid: int, name: str) -> StoreError:
     """Return the StoreError for a forked process that uses what its parent `pid` opened."""
-    actual = f"its fork {os.getpid()}"
-    do = "open it after the fork, in the process that uses it"
-    return StoreError(f"Expected the process that opened {name}, {pid}, got {actual}; {do}.")
+    return StoreError(
+        f"Expected the process that opened {name}, {pid}, got its fork {os.getpid()}; open it "
+        "after the fork, in the process that uses it."
+    )
 
 
 def describe_process() -> str:
@@ -591,10 +604,7 @@ def describe_process() -> str:
 
 def owned_error(owner: str, name: str) -> StoreError:
     """Return the StoreError for an engine whose cell another engine owns; it names that owner."""
-    do = (
-        "close that engine first, ask its page or its HTTP where it is served, or give this "
-        "one a cell_id of its own"
-    )
     return StoreError(
-        f"Expected a cell that no other engine runs on, but {owner} owns {name}; {do}."
+        f"Expected a cell that no other engine runs on, but {owner} owns {name}; close that engine "
+        "first, ask its page or its HTTP where it is served, or give this one a cell_id of its own."
     )

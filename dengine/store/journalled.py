@@ -9,30 +9,26 @@ disk or the database does not answer. `lag` is how far the database is behind.
 
 from __future__ import annotations
 
-import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from numpy.typing import NDArray
-
-from ..errors import NotTakenError, StoreError
+from ..errors import NotTakenError, StoreError, log
 from ..records import RetrainReport
 from .draining import Drainer
 from .journal import HEADER, decode_record
 from .lookup import DecisionIndex
 from .outbox import Outbox
 from .recording import RETRY_SECONDS, Recorder
-from .records import DATA_LOST, NewLabel, StoredDecision
+from .records import DATA_LOST, Arrays, LabelNumbers, NewLabel, StoredDecision
 from .views import HistoryFilter
 
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 NO_LIMIT = 1e9  # seconds: never reached
 LOCK_SECONDS = 0.001  # a wait for the lock that counts as none
@@ -233,7 +229,7 @@ class JournalledStore(Outbox):
                 self._drainer.request()
             return self._index.has_undrained_labels
 
-    def pop_label_numbers(self) -> list[tuple[str, int]]:
+    def pop_label_numbers(self) -> LabelNumbers:
         return self._drainer.pop_label_numbers()
 
     # What the engine asks
@@ -294,7 +290,7 @@ class JournalledStore(Outbox):
         return self.wait_for_result(self._drainer.submit(call))
 
     def store_version(
-        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
+        self, report: RetrainReport, last_seq: int, state: Arrays | None
     ) -> Future[int]:
         return self._drainer.submit(lambda: self.store.versions.put(report, last_seq, state))
 

@@ -175,8 +175,11 @@ class LabelTable(CellTable):
         is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
             TRACE.c.decision_id == LABEL.c.decision_id
         )
-        query = sa.select(*TRACE.c, LABEL.c.seq).select_from(LABEL.join(TRACE, is_of_label))
-        query = query.where(scope.shared(LABEL.c.cell_id), TRAINS)
+        query = (
+            sa.select(*TRACE.c, LABEL.c.seq)
+            .select_from(LABEL.join(TRACE, is_of_label))
+            .where(scope.shared(LABEL.c.cell_id), TRAINS)
+        )
         first, last = (rows[0].seq, rows[-1].seq) if rows else (1, 0)
         query = query.where(LABEL.c.seq.between(first, last)).order_by(LABEL.c.seq)
         for row in connection.execute(query.execution_options(yield_per=CHUNK)):
@@ -220,9 +223,12 @@ class LabelTable(CellTable):
         list of PastLabel
             Corrections are not applied.
         """
-        query = sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
-        query = query.select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
-        query = query.where(self._own(LABEL), LABEL.c.seq > int(after)).order_by(LABEL.c.seq)
+        query = (
+            sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
+            .select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
+            .where(self._own(LABEL), LABEL.c.seq > int(after))
+            .order_by(LABEL.c.seq)
+        )
         rows = self._read(query if upto is None else query.where(LABEL.c.seq <= upto))
         damaged = {row.decision_id for row in rows if not is_intact(LABEL, row)}
         self._record_left_out(sorted(damaged), "label")
@@ -267,17 +273,19 @@ class LabelTable(CellTable):
         )
         # A label that does not know came right after its decision, as most do.
         known_overdue = sa.func.coalesce(LABEL.c.overdue_to, DECISION.c.number)
-        query = sa.select(*fields, known_overdue).select_from(
-            LABEL.join(DECISION, LABEL_OF_DECISION)
+        rows = self._read(
+            sa.select(*fields, known_overdue)
+            .select_from(LABEL.join(DECISION, LABEL_OF_DECISION))
+            .where(
+                self._own(LABEL),
+                TRAINS,
+                LABEL.c.seq > int(seq),
+                LABEL.c.source != Source.INSPECTION.value,
+                label != FORGOTTEN,
+                DECISION.c.model_version >= since_version,
+            )
+            .order_by(LABEL.c.seq)
         )
-        query = query.where(
-            self._own(LABEL),
-            TRAINS,
-            LABEL.c.seq > int(seq),
-            LABEL.c.source != Source.INSPECTION.value,
-        )
-        query = query.where(label != FORGOTTEN, DECISION.c.model_version >= since_version)
-        rows = self._read(query.order_by(LABEL.c.seq))
         overdue: deque[StoredDecision] = deque()
         if overdue_to:
             pending = self._decisions.pending(since_version)
@@ -304,9 +312,13 @@ class LabelTable(CellTable):
         int
             The sum of `silent`; labels of quarantined traces are left out.
         """
-        query = sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0))
-        query = query.where(self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version)
-        return int(self._read(query)[0][0])
+        return int(
+            self._read(
+                sa.select(sa.func.coalesce(sa.func.sum(LABEL.c.silent), 0)).where(
+                    self._own(LABEL), TRAINS, LABEL.c.model_version >= since_version
+                )
+            )[0][0]
+        )
 
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
         """Record as damage that the trace or label of some decisions was left out.
@@ -315,7 +327,7 @@ class LabelTable(CellTable):
         decisions.
         """
         if damaged:
-            names = f"decision {listed(damaged)}; see dengine verify"
             self._events.record_damage(
-                f"left out, since the {part} is not as it was stored: {names}"
+                f"left out, since the {part} is not as it was stored: "
+                f"decision {listed(damaged)}; see dengine verify"
             )

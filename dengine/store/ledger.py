@@ -25,7 +25,7 @@ import hmac
 import json
 import os
 import struct
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
 from itertools import groupby
@@ -35,6 +35,7 @@ import sqlalchemy as sa
 
 from ..errors import StoreError
 from ..files import read_key
+from .records import Clock, EntryName, Row
 from .schema import CHAINED, CORRECTION, LABEL, LEDGER, LEDGER_KEY, RESERVED, SETTING, VERSION
 
 KEY_VARIABLE = "DENGINE_LEDGER_KEY"  # of the environment: the file of the key of all ledgers
@@ -50,7 +51,7 @@ START = bytes(32)  # the digest before a cell's first entry
 NOT_SUMMED = {"sum", "state"}
 
 
-def row_sum(table: str, row: Mapping[str, Any]) -> bytes:
+def row_sum(table: str, row: Row) -> bytes:
     """Return the sum of a row: SHA-256 over the table's name and each value's name, type and bytes.
 
     It is the same on SQLite and PostgreSQL, as written and as read: true is 1 (SQLite has no
@@ -161,12 +162,11 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
             begun = "without a key"
         elif tag is None:
             begun = "with a key"
-        expected = (
-            f"a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} "
-            f"names{'' if key else ', none'}"
+        raise StoreError(
+            f"Expected a ledger of cell {cell_id!r} by the key that {KEY_VARIABLE} "
+            f"names{'' if key else ', none'}; it was begun, or made anew, {begun}: have it name "
+            "the file of the ledger's own key, or none."
         )
-        do = "have it name the file of the ledger's own key, or none"
-        raise StoreError(f"Expected {expected}; it was begun, or made anew, {begun}: {do}.")
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
@@ -174,8 +174,12 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
 
     The digest is 32 bytes, the chains are JSON. None if the cell has no entry.
     """
-    query = sa.select(*LEDGER.c["number", "digest", "chains"]).where(LEDGER.c.cell_id == cell_id)
-    return connection.execute(query.order_by(LEDGER.c.number.desc()).limit(1)).first()
+    return connection.execute(
+        sa.select(*LEDGER.c["number", "digest", "chains"])
+        .where(LEDGER.c.cell_id == cell_id)
+        .order_by(LEDGER.c.number.desc())
+        .limit(1)
+    ).first()
 
 
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
@@ -190,7 +194,7 @@ def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
     return digest.digest()
 
 
-def entry_digest(previous: bytes, head: Mapping[str, Any], key: bytes = b"") -> bytes:
+def entry_digest(previous: bytes, head: Row, key: bytes = b"") -> bytes:
     """Return the digest of a ledger entry over all its columns and the digest of the entry before.
 
     Parameters
@@ -262,7 +266,7 @@ class LedgerEntry:
         self._sums: dict[str, list[bytes]] = {}
         self.settings = False
 
-    def add_rows(self, table: str, rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    def add_rows(self, table: str, rows: Sequence[Row]) -> list[Row]:
         """Add the sums of rows that are about to be inserted into a table.
 
         Return copies of the rows with two more columns: `entry`, the number of this entry, and
@@ -274,7 +278,7 @@ class LedgerEntry:
         self._sums.setdefault(table, []).extend(row["sum"] for row in chained)
         return chained
 
-    def append(self, clock: Callable[[], float]) -> tuple[int, str] | None:
+    def append(self, clock: Clock) -> EntryName | None:
         """Insert the entry into the ledger, as the transaction's last step; this does not commit.
 
         Parameters
@@ -317,8 +321,9 @@ def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
 
     {} for an unknown cell.
     """
-    query = sa.select(SETTING.c.key, SETTING.c.value)
-    query = query.where(SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED))
+    query = sa.select(SETTING.c.key, SETTING.c.value).where(
+        SETTING.c.cell_id == cell_id, SETTING.c.key.not_in(RESERVED)
+    )
     return {row.key: row.value for row in connection.execute(query)}
 
 
@@ -369,8 +374,12 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
         check_key(connection, cell_id, key)
     except StoreError as error:
         return f"{error}"
-    query = sa.select(LEDGER).where(LEDGER.c.cell_id == cell_id)
-    rows = connection.execute(query.order_by(LEDGER.c.number.desc()).limit(2))
+    rows = connection.execute(
+        sa.select(LEDGER)
+        .where(LEDGER.c.cell_id == cell_id)
+        .order_by(LEDGER.c.number.desc())
+        .limit(2)
+    )
     newest, before = [*(dict(row._mapping) for row in rows), {}, {}][:2]
     previous = before.get("digest", START)
     if newest and entry_digest(previous, newest | {"digest": None}, key) != newest["digest"]:
@@ -402,10 +411,20 @@ def _find_table_error(
     number = IN_FORCE[name]
     table = number.table
     selected = table.c.cell_id == cell_id
-    entry = sa.select(table.c.entry).where(selected, number >= first).order_by(number).limit(1)
-    is_earlier = table.c.entry < sa.func.coalesce(entry.scalar_subquery(), 2**62)
-    earlier = sa.select(table.c.entry, number).where(selected, number < first, is_earlier)
-    before = connection.execute(earlier.order_by(number.desc()).limit(1)).first()
+    is_earlier = table.c.entry < sa.func.coalesce(
+        sa.select(table.c.entry)
+        .where(selected, number >= first)
+        .order_by(number)
+        .limit(1)
+        .scalar_subquery(),
+        2**62,
+    )
+    before = connection.execute(
+        sa.select(table.c.entry, number)
+        .where(selected, number < first, is_earlier)
+        .order_by(number.desc())
+        .limit(1)
+    ).first()
     chain = ""
     if before is not None:
         is_entry = (LEDGER.c.cell_id == cell_id) & (LEDGER.c.number == before.entry)
@@ -413,8 +432,11 @@ def _find_table_error(
         chain = _parse_chains(text or "").get(name, "")
         selected = selected & (number > before[1])
     selected &= table.c.entry.is_(None) | (table.c.entry <= last_entry)
-    query = sa.select(*(column for column in table.c if column.name != "state"))
-    rows = connection.execute(query.where(selected).order_by(number))
+    rows = connection.execute(
+        sa.select(*(column for column in table.c if column.name != "state"))
+        .where(selected)
+        .order_by(number)
+    )
     for _, group in groupby(rows, lambda row: row.entry):
         entry_rows = [dict(zip(rows.keys(), row, strict=True)) for row in group]
         if changed := [row for row in entry_rows if row_sum(name, row) != row["sum"]]:

@@ -6,17 +6,15 @@ never pays for that. An engine that only reads its store, a file or a server, al
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from numpy.typing import NDArray
-
 from ..records import RetrainReport
 from .journal import Record
 from .outbox import Outbox
-from .records import NewLabel, StoredDecision, check_state, chunks, new_event
+from .records import Arrays, NewLabel, StoredDecision, check_state, chunks, new_event
 
 if TYPE_CHECKING:
     from .sql import SqlStore
@@ -90,7 +88,7 @@ class MemoryStore(Outbox):
         return self._decisions.get(decision_id) or self.store.decisions.get(decision_id)
 
     def store_version(
-        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
+        self, report: RetrainReport, last_seq: int, state: Arrays | None
     ) -> Future[int]:
         """Keep a retrain with copies of its arrays; it is done when this returns.
 

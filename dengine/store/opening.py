@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from ..errors import StoreError, expect
+from ..files import FilePath
 from .journalled import JournalledStore
 from .memory import MemoryStore
 from .outbox import Outbox
@@ -25,7 +26,7 @@ from .records import CellAddress
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-    StoreLike = str | os.PathLike[str] | SqlStore
+    StoreLike = FilePath | SqlStore
 
 LONG_WAIT = 10.0  # seconds to wait for a store while no cell runs: the parameter `wait`
 

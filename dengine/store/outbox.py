@@ -6,26 +6,22 @@ makes the one that fits a store.
 
 from __future__ import annotations
 
-import logging
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from numpy.typing import NDArray
-
-from ..errors import StoreError
+from ..errors import StoreError, log
 from ..records import RetrainReport
 from .journal import forked_error
-from .records import NewLabel, StoredDecision
+from .records import Arrays, LabelNumbers, NewLabel, StoredDecision
 
 if TYPE_CHECKING:
     from .sql import SqlStore
 
-log = logging.getLogger("dengine")
 T = TypeVar("T")
 
 
@@ -263,7 +259,7 @@ class Outbox(ABC):
         """
         return False
 
-    def pop_label_numbers(self) -> list[tuple[str, int]]:
+    def pop_label_numbers(self) -> LabelNumbers:
         """Return (decision id, label number) of a product's labels that the store has numbered.
 
         They are those since the last call, in the order of their numbers. Empty without a product.
@@ -329,7 +325,7 @@ class Outbox(ABC):
 
     @abstractmethod
     def store_version(
-        self, report: RetrainReport, last_seq: int, state: Mapping[str, NDArray[Any]] | None
+        self, report: RetrainReport, last_seq: int, state: Arrays | None
     ) -> Future[int]:
         """Begin to commit a retrain, and return without waiting.
 

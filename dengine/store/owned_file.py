@@ -7,13 +7,11 @@ far behind all content, so that others can read the rest, and sets the offset fi
 ends with the process, however that ends.
 """
 
-import ctypes
 import errno
 import os
 import threading
 import weakref
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,23 +23,13 @@ def _lock_of_system() -> Callable[[int], object]:
 
     It does not wait: it raises BlockingIOError if another descriptor has the lock.
     """
-    exclusive_now = 2 | 4  # LOCK_EX and LOCK_NB, of every system that has flock
-    with suppress(ImportError):
-        from fcntl import flock
-
-        return lambda descriptor: flock(descriptor, exclusive_now)
-    with suppress(ImportError):
+    try:
+        import fcntl
+    except ImportError:
         import msvcrt
 
         return _lock_of_windows(msvcrt)
-    # For a Python that was built without either module.
-    flock_of_c = ctypes.CDLL(None, use_errno=True).flock
-
-    def lock(descriptor: int) -> None:
-        if flock_of_c(descriptor, exclusive_now):
-            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-
-    return lock
+    return lambda descriptor: fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _lock_of_windows(msvcrt: Any) -> Callable[[int], object]:

@@ -82,13 +82,10 @@ def check_peer_settings(
     if different:
         expected = ", ".join(f"{key} {peer_values[key]}" for key in different)
         actual = ", ".join(f"{key} {values[key]}" for key in different)
-        do = (
-            "cells that share labels share what embeds them: give the same, or name another product"
-        )
         raise SettingError(
             f"Expected the settings of product {product!r}, as cell {name!r} has them "
-            f"({expected}), "
-            f"got {actual}; {do}."
+            f"({expected}), got {actual}; cells that share labels share what embeds them: give the "
+            "same, or name another product."
         )
 
 
@@ -119,8 +116,11 @@ def list_cells(url: str) -> list[CellSummary]:
 
     Raise StoreError if it is no store. Nothing is written.
     """
-    accepted = sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))
-    accepted = accepted.where(VERSION.c.accepted == sa.true()).group_by(VERSION.c.cell_id)
+    accepted = (
+        sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))
+        .where(VERSION.c.accepted == sa.true())
+        .group_by(VERSION.c.cell_id)
+    )
     with reading(url) as connection:
         settings = connection.execute(sa.select(*SETTING.c["cell_id", "key", "value"])).all()
         decisions = _count_by_cell(connection, DECISION)

@@ -165,12 +165,11 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     label = connection.execute(
         sa.select(LABEL.c.seq).where(LABEL.c.cell_id == cell_id).limit(1)
     ).first()
-    do = "it has worked without a product: name a new cell, and bring its labels over by an import"
     expect(
         settings is None and label is None,
         f"a new cell for product {product!r}",
         cell_id,
-        do,
+        "it has worked without a product: name a new cell, and bring its labels over by an import",
         StoreError,
     )
     lock(connection, PRODUCT, product)
@@ -262,15 +261,16 @@ def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[A
     included. The rows are in no order.
     """
     label = corrected_label(corrected_to)
-    query = sa.select(LABEL.c.seq, label.label("success"), *LABEL.c["content_hash", "decision_id"])
-    return query.where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
+    return sa.select(
+        LABEL.c.seq, label.label("success"), *LABEL.c["content_hash", "decision_id"]
+    ).where(scope.shared(LABEL.c.cell_id), TRAINS, label != FORGOTTEN)
 
 
 def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
     """Return the scalar subquery for the number of a cell's newest decision, NULL if none."""
     decision = DECISION.alias("every")
-    query = sa.select(sa.func.max(decision.c.number)).where(decision.c.cell_id == cell_id)
-    return query.scalar_subquery()
+    of_cell = decision.c.cell_id == cell_id
+    return sa.select(sa.func.max(decision.c.number)).where(of_cell).scalar_subquery()
 
 
 def stretches_query(
@@ -326,5 +326,8 @@ def stretches_query(
         name = sa.func.rtrim(part, others)
     by_number = every.c.number - every.c.number % length
     by_time = sa.func.floor((every.c.time - start) / seconds) if seconds else by_number
-    query = query.add_columns(name).group_by(name if batch else by_time)
-    return query.order_by(sa.func.max(every.c.number))
+    return (
+        query.add_columns(name)
+        .group_by(name if batch else by_time)
+        .order_by(sa.func.max(every.c.number))
+    )

@@ -5,19 +5,17 @@ both.
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from ..errors import NotTakenError
+from ..errors import NotTakenError, log
 from .journal import Journal, LostJournalError, Record, encode_record
-from .records import StoredDecision, new_event
+from .records import Clock, StoredDecision, new_event
 
-log = logging.getLogger("dengine")
 BATCH_SECONDS = 0.05  # a record waits so long for others before they are written together
 RETRY_SECONDS = 1.0  # between two attempts after a failure
 LONG = 8 << 20  # bytes of a journal that is to be cleared
@@ -84,7 +82,7 @@ class Recorder:
         The journal is long, and is cleared if its records are drained at once.
     """
 
-    def __init__(self, journal: Journal, clock: Callable[[], float], limit: float) -> None:
+    def __init__(self, journal: Journal, clock: Clock, limit: float) -> None:
         self.synced: deque[Entry] = deque()
         self.n_recorded = 0
         self.n_synced = 0

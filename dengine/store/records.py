@@ -31,7 +31,7 @@ from ..errors import (
     instead,
     shortened,
 )
-from ..files import read_archive
+from ..files import FilePath, read_archive
 from ..records import Action, Decision, RetrainReport, Source
 
 # Kinds of events.
@@ -46,6 +46,12 @@ LOSS_REMEDY = (
     "--acknowledge."
 )
 T = TypeVar("T")
+Clock = Callable[[], float]  # returns the time, in seconds since 1970
+Row = dict[str, Any]  # the values of a row, by column
+State = dict[str, NDArray[Any]]  # the arrays of a version, by name
+Arrays = Mapping[str, NDArray[Any]]  # the same, only read
+LabelNumbers = list[tuple[str, int]]  # ids of decisions, with the numbers of their labels
+EntryName = tuple[int, str]  # number and digest, hexadecimal, of a ledger entry
 NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
 # line.
@@ -66,9 +72,11 @@ def _when(record: Any) -> datetime:
 
 def unknown_decision(decision_id: str) -> UnknownDecisionError:
     """Return the error for a report on a decision that the store does not hold."""
-    actual = f"{shortened(decision_id)}, which this cell's store does not hold"
-    do = "report the `Decision.id` that `decide` returned, to the same store and cell_id"
-    return UnknownDecisionError(f"Expected the id of a stored decision, got {actual}; {do}.")
+    return UnknownDecisionError(
+        f"Expected the id of a stored decision, got {shortened(decision_id)}, which this cell's "
+        "store does not hold; report the `Decision.id` that `decide` returned, to the same store "
+        "and cell_id."
+    )
 
 
 def already_reported(
@@ -96,18 +104,17 @@ def already_reported(
         if same
         else "if the first was wrong, look at how the part was checked"
     )
-    both = f"{stored} was reported first and stands, now came {new}"
     return ReportConflictError(
-        f"Expected one report a decision, got a second on {decision_id!r}: {both}; {advice}."
+        f"Expected one report a decision, got a second on {decision_id!r}: {stored} was reported "
+        f"first and stands, now came {new}; {advice}."
     )
 
 
 def nothing_to_correct(decision_id: str) -> ReportError:
     """Return the error for a correction of a decision that has no label."""
-    actual = f"{decision_id!r}, of which nothing was reported yet"
     return ReportError(
-        f"Expected a decision with a label, got {actual}; there is nothing to correct: report its "
-        "label."
+        f"Expected a decision with a label, got {decision_id!r}, of which nothing was reported "
+        "yet; there is nothing to correct: report its label."
     )
 
 
@@ -132,9 +139,7 @@ def as_text(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
 
 
-def check_state(
-    report: RetrainReport, state: Mapping[str, NDArray[Any]] | None
-) -> dict[str, NDArray[Any]] | None:
+def check_state(report: RetrainReport, state: Arrays | None) -> State | None:
     """Check a version's arrays and return copies of them, by name; None if there are none.
 
     Raise StoreError for an accepted version without arrays, and for an array of Python objects,
@@ -416,7 +421,7 @@ class Change:
     author: str = ""
     decisions: Sequence[str] = ()
     success: bool | None = None
-    version: tuple[RetrainReport, int, Mapping[str, NDArray[Any]]] | None = None
+    version: tuple[RetrainReport, int, Arrays] | None = None
     settings: Mapping[str, str] | None = None
 
 
@@ -470,10 +475,10 @@ class ModelVersion:
 
     version: int
     last_seq: int
-    state: dict[str, NDArray[Any]]
+    state: State
 
 
-def without_rule(state: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def without_rule(state: Arrays) -> State:
     """Return a version's arrays without those of its rule, which its own cell's outcomes set.
 
     They are left out by the prefixes of RULE; the mapping is not changed.
@@ -501,9 +506,7 @@ class CellAddress(str):
         return address
 
 
-def address(
-    store: str | os.PathLike[str], cell_id: str | None = None, product: str | None = None
-) -> str:
+def address(store: FilePath, cell_id: str | None = None, product: str | None = None) -> str:
     """Return a store's file or URL as text; a `CellAddress` if a cell or product is given.
 
     A product without a cell is that of the cell "cell".
@@ -540,7 +543,7 @@ def _plain_type(hint: Any) -> type:
     return _plain_type(plain.__value__) if hasattr(plain, "__value__") else plain
 
 
-def to_row(record: Any, *names: str) -> dict[str, Any]:
+def to_row(record: Any, *names: str) -> Row:
     """Return the fields of a record as columns of a row, by name; only `names` if they are given.
 
     Enumerations become text, tuples and dicts JSON, arrays packed float32.
@@ -582,9 +585,9 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
         )
     except (ValueError, TypeError) as error:
         name = getattr(record_type, "__name__", record_type)
-        do = "see `dengine verify`, and restore the store from a copy"
         raise StoreError(
-            f"Expected a row of {name} as it was written, got another: {error}; {do}."
+            f"Expected a row of {name} as it was written, got another: {error}; see `dengine "
+            "verify`, and restore the store from a copy."
         ) from error
 
 
@@ -612,12 +615,12 @@ def _from_column(value: Any, type_: type) -> Any:
     return readers.get(type_, type_)(value)
 
 
-def decision_row(item: StoredDecision) -> dict[str, Any]:
+def decision_row(item: StoredDecision) -> Row:
     """Return the row of the table `decision` for a decision, without its number."""
     return to_row(item.decision) | to_row(item, *OF_DECISION)
 
 
-def trace_row(item: StoredDecision) -> dict[str, Any]:
+def trace_row(item: StoredDecision) -> Row:
     """Return the row of the table `trace` for a decision's trace, packed as float32."""
     channels, samples = item.trace.shape
     return {
@@ -654,7 +657,7 @@ def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
     return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
 
 
-def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
+def to_npz(state: Arrays) -> bytes:
     """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
     Integers are compressed, of which a state repeats many; weights hardly get smaller. Raise
@@ -671,7 +674,7 @@ def to_npz(state: Mapping[str, NDArray[Any]]) -> bytes:
     return buffer.getvalue()
 
 
-def from_npz(blob: bytes, name: str) -> dict[str, NDArray[Any]]:
+def from_npz(blob: bytes, name: str) -> State:
     """Return the arrays that `to_npz` wrote, by name.
 
     Raise StoreError, which names the store `name`, for anything else and for a pickle.

@@ -14,7 +14,7 @@ they go into the journal first, and from there, by `apply_records`, into the dat
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 
 from ..errors import StoreError, expect
@@ -25,7 +25,7 @@ from .events import EventTable
 from .insertion import RecordInsertion
 from .journal import Journal, Record, journal_path
 from .labels import LabelTable
-from .records import KEEP
+from .records import KEEP, Clock, LabelNumbers
 from .settings import SettingTable
 from .versions import VersionTable
 
@@ -85,7 +85,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self,
         url: str | None = None,
         cell_id: str = "cell",
-        clock: Callable[[], float] = time.time,
+        clock: Clock = time.time,
         *,
         product: str | None = None,
         wait: float | None = None,
@@ -108,8 +108,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
             StoreError,
         )
         alone = product is None or url is not None
-        do = "name a file or a server, which its cells share"
-        expect(alone, "no product of a store in memory", product, do, StoreError)
+        expect(
+            alone,
+            "no product of a store in memory",
+            product,
+            "name a file or a server, which its cells share",
+            StoreError,
+        )
         self.wait = _checked_wait(wait)
         self.clock = clock
         self.database = Database(url if url is None else str(url), cell_id, clock, product)
@@ -156,7 +161,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self._journal = journal
         return journal
 
-    def apply_records(self, records: Sequence[Record]) -> list[tuple[str, int]]:
+    def apply_records(self, records: Sequence[Record]) -> LabelNumbers:
         """Commit records of a journal, in one transaction unless the database refuses a record.
 
         A record that is stored already and is the same counts as taken. A line stop of a part that
@@ -196,6 +201,11 @@ def _checked_wait(wait: float | None) -> float:
     seconds = math.nan
     with suppress(ValueError):
         seconds = float(value)
-    wanted = f"{WAIT_VARIABLE if wait is None else 'a wait'} above 0 seconds"
-    expect(0.0 < seconds < math.inf, wanted, value, f"{WAIT} is the default", StoreError)
+    expect(
+        0.0 < seconds < math.inf,
+        f"{WAIT_VARIABLE if wait is None else 'a wait'} above 0 seconds",
+        value,
+        f"{WAIT} is the default",
+        StoreError,
+    )
     return seconds

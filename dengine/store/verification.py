@@ -37,7 +37,7 @@ from .ledger import (
     rows_digest,
     state_sum,
 )
-from .records import CHUNK, LOSS_REMEDY, open_losses
+from .records import CHUNK, LOSS_REMEDY, EntryName, Row, open_losses
 from .schema import (
     CHAINED,
     DECISION,
@@ -211,7 +211,7 @@ def verify_history(
     return HistoryReport(tuple(cells), tuple(faults))
 
 
-def _inspect_journal(path: Path) -> tuple[list[tuple[int, str]], int | None, str]:
+def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
     """Return what a journal knows: ledger entries, number of records for its store, what it lost.
 
     If there is no journal, or it cannot be read, the entry is that of its head, the number None.
@@ -316,7 +316,7 @@ class CellCheck:
         """Return a fault of this cell."""
         return HistoryFault(self.cell_id, table, str(key), problem)
 
-    def _read_raw(self, table: str) -> Iterator[dict[str, Any]]:
+    def _read_raw(self, table: str) -> Iterator[Row]:
         """Yield the cell's rows of a table as dicts, with values as the driver returns them.
 
         SQLAlchemy converts nothing, so that damaged values can be read, too.
@@ -424,8 +424,11 @@ class CellCheck:
         key = table.c[KEY[table.name]]
         required_key = required.c[KEY[required.name]]
         is_pair = (required.c.cell_id == table.c.cell_id) & (required_key == key)
-        query = sa.select(key).select_from(table.outerjoin(required, is_pair))
-        query = query.where(table.c.cell_id == self.cell_id, required_key.is_(None))
+        query = (
+            sa.select(key)
+            .select_from(table.outerjoin(required, is_pair))
+            .where(table.c.cell_id == self.cell_id, required_key.is_(None))
+        )
         for id_ in self.connection.execute(query).scalars():
             yield self._fault(required.name, id_, f"is missing: a row of {table.name} is there")
 

@@ -2,12 +2,10 @@
 versions. `SqlStore` has one.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
-from numpy.typing import NDArray
 
 from ..errors import StoreError, instead
 from ..records import RetrainReport
@@ -17,7 +15,9 @@ from .events import EventTable
 from .ledger import state_sum
 from .queries import Scope
 from .records import (
+    Arrays,
     ModelVersion,
+    Row,
     StoredVersion,
     VersionError,
     check_state,
@@ -52,7 +52,7 @@ class VersionTable(CellTable):
         self,
         report: RetrainReport,
         last_seq: int,
-        state: Mapping[str, NDArray[Any]] | None,
+        state: Arrays | None,
         time: float | None = None,
     ) -> int:
         """Commit a retrain, and delete the states of older versions that are no longer kept.
@@ -86,9 +86,9 @@ class VersionTable(CellTable):
         self,
         report: RetrainReport,
         last_seq: int,
-        state: Mapping[str, NDArray[Any]] | None,
+        state: Arrays | None,
         now: float,
-    ) -> dict[str, Any]:
+    ) -> Row:
         """Return the row of a retrain for the table `model_version`, its arrays packed as npz.
 
         `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
@@ -103,7 +103,7 @@ class VersionTable(CellTable):
             "state_sum": state_sum(blob),
         } | to_row(report)
 
-    def insert(self, connection: sa.Connection, row: dict[str, Any]) -> int:
+    def insert(self, connection: sa.Connection, row: Row) -> int:
         """Insert the row of a retrain; return its version's number.
 
         For an accepted version this is the next number if a peer of the product has taken the given
@@ -194,10 +194,9 @@ class VersionTable(CellTable):
         if row.state is None or (
             row.state_sum is not None and state_sum(row.state) != row.state_sum
         ):
-            where = f"as it was stored in {self._database.name}, its bytes have changed"
             raise VersionError(
-                f"Expected the state of version {row.version} {where}; restore the store from "
-                "a copy."
+                f"Expected the state of version {row.version} as it was stored in "
+                f"{self._database.name}, its bytes have changed; restore the store from a copy."
             )
         with instead(VersionError, f"Version {row.version} cannot be read", StoreError):
             state = from_npz(row.state, self._database.name)
@@ -239,8 +238,8 @@ class VersionTable(CellTable):
 
         Its columns are retrain, version, and `kept`, whether the state is kept.
         """
-        query = sa.select(
-            *VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept")
+        return (
+            sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
+            .where(self._scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
+            .order_by(VERSION.c.retrain.desc())
         )
-        query = query.where(self._scope.shared(VERSION.c.cell_id), VERSION.c.accepted == sa.true())
-        return query.order_by(VERSION.c.retrain.desc())

@@ -29,7 +29,7 @@ from dengine import (
 from dengine.decision.members import SAFE_MODES
 from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError, OutputError
-from dengine.export import read_metadata
+from dengine.export.bundle import metadata_of, read_checked
 from dengine.export.decision import FIELDS, METHODS
 from dengine.folds import content_fold
 from dengine.records import ACTIONS, REASONS, Action, Reason
@@ -247,7 +247,7 @@ def test_the_file_says_what_it_is_without_being_loaded(
     audited: DataEngine, file: Path, monkeypatch
 ) -> None:
     monkeypatch.setattr(torch.jit, "load", lambda *a, **k: pytest.fail("the code was loaded"))
-    metadata = read_metadata(file)
+    metadata = metadata_of(read_checked(file), file)
     expected = {
         "schema": 2,
         "guarantee": "local",
@@ -345,7 +345,9 @@ FOREIGN: dict[str, tuple[Callable[[Path], Any], str]] = {
         "is not a dengine export",
     ),
     "a description alone": (
-        lambda path: zipped(path, "model/extra/dengine.json", json.dumps(read_metadata(path))),
+        lambda path: zipped(
+            path, "model/extra/dengine.json", json.dumps(metadata_of(read_checked(path), path))
+        ),
         "is no loadable TorchScript",
     ),
     **{

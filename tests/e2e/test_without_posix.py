@@ -1,8 +1,7 @@
 """Nobody runs Windows here: what it lacks is hidden from dengine's modules, which do their work
 without.
 
-`tests/support/without_posix` says what is hidden; there is a lock as Windows has it, or none of
-Python's own.
+`tests/support/without_posix` says what is hidden; there is a lock as Windows has it.
 """
 
 import json
@@ -54,7 +53,6 @@ SECOND = "import sys; from dengine import DataEngine; DataEngine.open(sys.argv[1
 @pytest.fixture(autouse=True)
 def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONPATH", HIDING)
-    monkeypatch.setenv("DENGINE_TEST_MSVCRT", "1")
 
 
 def python(*words: object, code: int = 0) -> str:
@@ -93,11 +91,7 @@ def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
     assert "passed" in text or "[100%]" in text
 
 
-@pytest.mark.parametrize("lock", ["0", "1"], ids=["no lock of Python's", "the lock of Windows"])
-def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(
-    tmp_path: Path, lock: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DENGINE_TEST_MSVCRT", lock)
+def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(tmp_path: Path) -> None:
     store = tmp_path / "engine.db"
     command = [sys.executable, "-c", REPORTING, str(store)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

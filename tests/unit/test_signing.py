@@ -10,8 +10,8 @@ import pytest
 import dengine.export.torchscript
 from dengine import Dataset, ModelPrediction, TraceSpec, export_torchscript, load_exported
 from dengine.errors import ExportError, OutputError
-from dengine.export import make_key, read_metadata
-from dengine.export.bundle import write_export
+from dengine.export import make_key
+from dengine.export.bundle import metadata_of, read_checked, write_export
 from tests.support.command_line import dengine as command
 
 
@@ -55,7 +55,7 @@ def test_the_signature_is_that_of_the_standard(
     assert (tmp_path / "model.ts.sig").read_text() == f"hmac-sha256:{expected}  model.ts\n"
     assert load_exported(file, key=key).trace == TraceSpec(40)
     again = load_exported(file, key=key).save(tmp_path / "saved.ts", key=key)
-    assert read_metadata(again, key=key)["references"] == 60
+    assert metadata_of(read_checked(again, key), again)["references"] == 60
 
 
 @pytest.mark.parametrize(

@@ -258,8 +258,8 @@ class UrCell(AbstractContextManager["UrCell"]):
             problem = waiting if is_playing else "its program does not run"
         if not problem:
             raise self._timeout_error("to send its state")
-        do = "start ur_cell.script of dengine/cells/ur, or your own program of its handshake, on it"
-        where = f"the robot at {self.recorder.stream.where}"
         raise CellError(
-            f"Expected {where} to be ready within {self.start_timeout:g} s, {problem}; {do}."
+            f"Expected the robot at {self.recorder.stream.where} to be ready within "
+            f"{self.start_timeout:g} s, {problem}; start ur_cell.script of dengine/cells/ur, or "
+            "your own program of its handshake, on it."
         )

@@ -70,12 +70,11 @@ class RtdeClient:
         outputs = tuple(
             dict.fromkeys(("timestamp", *(column.partition("[")[0] for column in columns)))
         )
-        do = "turn the robot on, and enable RTDE under Settings, Security, Services"
         with instead(
             CellError,
             f"Expected an RTDE controller at {self.where}, it cannot be reached",
             OSError,
-            do=do,
+            do="turn the robot on, and enable RTDE under Settings, Security, Services",
         ):
             self._socket = socket.create_connection((host, port), timeout)
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -91,9 +90,9 @@ class RtdeClient:
                 self._request(PackageType.OUTPUTS, named), outputs, "output"
             )
             if unknown := ", ".join(set(columns) - {*self._outputs.columns}):
-                number = "a number of the controller, as actual_q[5] or output_double_register_24"
                 raise SettingError(
-                    f"Expected a channel among {', '.join(CHANNELS)}, or {number}, got {unknown}."
+                    f"Expected a channel among {', '.join(CHANNELS)}, or a number of the "
+                    f"controller, as actual_q[5] or output_double_register_24, got {unknown}."
                 )
             if inputs:
                 self._inputs = read_recipe(

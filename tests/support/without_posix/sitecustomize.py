@@ -1,8 +1,7 @@
 """Hides from dengine's modules what Windows lacks, in a process and those that it starts, by
 PYTHONPATH.
 
-Libraries keep this system. DENGINE_TEST_MSVCRT=1: there is an `msvcrt`, whose `locking` fails as
-Windows' does.
+Libraries keep this system. There is an `msvcrt`, whose `locking` fails as Windows' does.
 """
 
 import builtins
@@ -50,9 +49,8 @@ def without(module: types.ModuleType, names: str) -> types.ModuleType:
 
 
 SEEN = {"os": without(os, HIDDEN["os"]), "signal": without(signal, HIDDEN["signal"])}
-if os.environ.get("DENGINE_TEST_MSVCRT") == "1":
-    SEEN["msvcrt"] = types.ModuleType("msvcrt")
-    SEEN["msvcrt"].__dict__.update(LK_NBLCK=2, locking=locking)
+SEEN["msvcrt"] = types.ModuleType("msvcrt")
+SEEN["msvcrt"].__dict__.update(LK_NBLCK=2, locking=locking)
 
 
 def import_hidden(
