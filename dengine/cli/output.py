@@ -10,12 +10,14 @@ import math
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from textwrap import fill
+from threading import Event, Thread
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
 Record = dict[str, Any]  # what `--json` prints, by name
 SCREEN_WIDTH = 80  # columns where no terminal says otherwise; every table fits them
+LINE_SECONDS = 30.0  # between two lines about progress where there is no terminal
 INTERRUPTED = 130  # exit code, as shells have it: 128 + SIGINT
 # The names of two flags, and the keys in click's context that hold whether they were given.
 JSON = "--json"
@@ -308,7 +311,9 @@ def certificate_record(certificate: "Certificate") -> Record:
 
 @contextmanager
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on stderr while the block runs; none beside `--json` or without terminal.
+    """Show a progress bar on stderr while the block runs; none beside `--json`.
+
+    Where stderr is no terminal, a line every 30 s says how far the work is.
 
     Parameters
     ----------
@@ -321,16 +326,59 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
     advance : callable
         `advance(n)` moves the bar by n steps.
     """
-    if as_json() or not sys.stderr.isatty():
+    if as_json():
         yield lambda n: None
         return
+    if not sys.stderr.isatty():
+        with _progress_lines(label, total) as advance:
+            yield advance
+        return
     from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(without_password(label), total=total)
         yield lambda n: bar.advance(task, n)
+
+
+@contextmanager
+def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """Write a line to stderr every `LINE_SECONDS` while the block runs, as `progress_bar` does."""
+    n_steps = 0
+    ended = Event()
+
+    def advance(n: int) -> None:
+        """Count n more steps."""
+        nonlocal n_steps
+        n_steps += n
+
+    def write_lines() -> None:
+        """Write until the block ends."""
+        begin = time.monotonic()
+        while not ended.wait(LINE_SECONDS):
+            seconds = format_duration(time.monotonic() - begin)
+            text = f"{label}: {n_steps:,} of {total or '?'} in {seconds}"
+            click.echo(without_password(text), err=True)
+
+    Thread(target=write_lines, daemon=True).start()
+    try:
+        yield advance
+    finally:
+        ended.set()
 
 
 class StepInterruptedError(Exception):

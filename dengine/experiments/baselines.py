@@ -12,7 +12,7 @@ them by name; the settings of a baseline are the keyword-only fields of its clas
 import math
 import warnings
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from importlib.util import find_spec
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import Policy
 from ..errors import SettingError, expect
-from ..records import ACTIONS
+from ..records import ACTIONS, is_number, is_whole
 from ..traces import as_traces
 
 Floats = NDArray[np.float64]
@@ -260,6 +260,7 @@ class AgreeingNeighbours(Baseline):
     k: int = 5
 
     def __post_init__(self) -> None:
+        expect(is_whole(self.k, 1, 2**31), "k to be an integer of at least 1", self.k)
         self.thresholds = (1.0, 0.0)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
@@ -354,6 +355,9 @@ class WilsonKernelDensity(Baseline):
     bandwidth: float | None = None
 
     def __post_init__(self) -> None:
+        value = self.bandwidth
+        is_valid = value is None or (is_number(value) and 0.0 < value < math.inf)
+        expect(is_valid, "bandwidth to be a number above 0", value)
         self._components = ScaledComponents(DIMENSIONS, whiten=True, seed=self.seed)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
@@ -452,6 +456,8 @@ class GaussianProcess(Baseline):
     amplitude: float = 3.0
 
     def __post_init__(self) -> None:
+        is_valid = is_number(self.amplitude) and 1.0 < self.amplitude < math.inf
+        expect(is_valid, "amplitude above 1", self.amplitude)
         self._components = ScaledComponents(self.n_components, whiten=False, seed=self.seed)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
@@ -581,6 +587,10 @@ class RocketSelective(Baseline):
         from sklearn.pipeline import make_pipeline
         from sklearn.preprocessing import StandardScaler
 
+        is_share = is_number(self.holdout) and 0.0 < self.holdout < 1.0
+        expect(is_share, "holdout to be a number above 0 and below 1", self.holdout)
+        is_count = is_whole(self.n_kernels, 84, 2**31)
+        expect(is_count, "n_kernels to be an integer of at least 84", self.n_kernels)
         features = MiniRocket(n_kernels=self.n_kernels, random_state=self.seed)
         # Compiles the features here, so that no training is timed with that.
         features.fit_transform(np.eye(20, dtype=np.float32)[:, None, :])
@@ -653,16 +663,21 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
     seed : int, default 0
         Of everything drawn.
     **params
-        The baseline's own settings; those left out have the defaults of its class, which are those
-        of the results. They are not checked.
+        The baseline's own settings; those left out have the defaults of its class.
 
     Raises
     ------
     SettingError
-        An unknown name, or a library that is not installed.
+        An unknown name or parameter, a value out of range (but `n_components` and `C`, which only
+        the training checks), or a library that is not installed.
     """
     require_baseline(name)
-    return BASELINES[name](policy, seed, **params)
+    kind = BASELINES[name]
+    names = [item.name for item in fields(kind) if item.kw_only]
+    if unknown := ", ".join(sorted(set(params) - set(names))):
+        parameters = ", ".join(names) or "none"
+        raise SettingError(f"The baseline {name} has no parameter {unknown}; it has {parameters}.")
+    return kind(policy, seed, **params)
 
 
 def require_baseline(name: str) -> None:

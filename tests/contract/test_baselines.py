@@ -117,9 +117,21 @@ def test_the_table_imports_nothing() -> None:
     )
 
 
-def test_an_unknown_baseline_is_named() -> None:
-    with pytest.raises(SettingError, match="baseline among knn, wskde"):
-        make_baseline("nope", LOOSE)
+@pytest.mark.parametrize(
+    ("name", "params", "words"),
+    [
+        ("nope", {}, "baseline among knn, wskde"),
+        ("knn", {"n": 3}, "baseline knn has no parameter n; it has k"),
+        ("knn", {"k": 0}, "k to be an integer of at least 1, got 0"),
+        ("wskde", {"bandwidth": -1.0}, "bandwidth to be a number above 0, got -1.0"),
+        ("gp", {"amplitude": 1.0}, "amplitude above 1, got 1.0"),
+    ],
+)
+def test_a_wrong_setting_is_named(name: str, params: dict[str, Any], words: str) -> None:
+    if name in BASELINES and BASELINES[name].library:
+        pytest.importorskip(BASELINES[name].library)
+    with pytest.raises(SettingError, match=words):
+        make_baseline(name, LOOSE, 0, **params)
 
 
 def test_neighbours_decide_only_where_all_k_agree() -> None:
