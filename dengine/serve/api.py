@@ -9,6 +9,7 @@ not finite.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cache, cached_property, reduce
@@ -63,6 +64,7 @@ DECODERS: Mapping[str, Callable[..., Any]] = {
     JSON: msgspec.json.decode,
     MSGPACK: msgspec.msgpack.decode,
 }
+STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # in JSON; a key is followed by a colon
 REF = "#/components/schemas/{name}"
 Samples = list[float | list[float | None] | None]
 
@@ -137,7 +139,7 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
     """Decode a request's JSON or MessagePack body into a struct.
 
     Raises Refusal: 415 for another media type, whose text also names `other_types`; 400 for a body
-    that cannot be decoded; 422 for wrong fields. Of a name that comes twice the last value counts.
+    that cannot be decoded, or has a name twice; 422 for wrong fields.
     """
     media = media_type(request)
     if media not in DECODERS:
@@ -157,7 +159,22 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
         raise Refusal(422, f"{text}.") from error
     except (ValueError, RecursionError) as error:
         raise Refusal(400, f"Expected {media}: {error}.") from error
+    # msgspec takes the last of two equal keys.
+    if _count_keys(media, body) != len(DECODERS[media](body, type=dict[str, msgspec.Raw])):
+        raise Refusal(400, "Expected each name once, got one twice.")
     return decoded
+
+
+def _count_keys(media: str, body: bytes) -> int:
+    """Return how many keys an encoded object has, repeated ones included.
+
+    `media` is JSON or MessagePack; the object's values must not be objects.
+    """
+    if media == JSON:
+        return sum(map(bool, STRINGS.findall(body)))
+    if body[0] < 0xDE:  # a fixmap: its size stands in the first byte
+        return body[0] & 0x0F
+    return int.from_bytes(body[1 : 3 if body[0] == 0xDE else 5])
 
 
 def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:

@@ -409,6 +409,7 @@ REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
     "nothing": (400, typed(b"", JSON)),
     "no UTF-8": (400, typed(b'{"trace": [1], "request": "\xff"}', JSON)),
     "NaN": (400, typed(b'{"trace": [NaN]}', JSON)),
+    "a name twice": (400, typed(b'{"trace": [1], "trace": [2]}', JSON)),
     "too deep": (422, typed(b'{"trace": ' + b"[" * 100_000, JSON)),
     "digits": (422, typed(b'{"trace": [' + b"1" * 5000 + b"]}", JSON)),
     "a list": (422, {"json": [1.0]}),
@@ -429,6 +430,7 @@ REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
     "no channels": (422, typed(b"1234", RAW, channels="0")),
     "an unknown query": (422, typed(b"1234", RAW, path="/etc")),
     "a query twice": (422, typed(b"1234", RAW, part=["1", "2"])),
+    "a name twice in MessagePack": (400, typed(b"\x82\xa5trace\x91\x01\xa5trace\x91\x02", MSGPACK)),
     "half of MessagePack": (400, typed(b"\x81\xa5tra", MSGPACK)),
 }
 
