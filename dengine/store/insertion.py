@@ -41,7 +41,7 @@ class SortedLabels:
     taken : dict of str to None
         Decisions that have the label, from now on or since before, in the order of the labels.
     late_stops : dict of str to None
-        Decisions whose label, "confirmed" by silence, is to be corrected to a failure.
+        Decisions whose label "confirmed" is to be corrected to a failure (`_is_late_stop`).
     problems : list of str
         Labels that contradict what is stored, in words.
     """
