@@ -328,7 +328,7 @@ class Outbox(ABC):
         """
 
     def evict_decision(self, decision_id: str) -> None:  # noqa: B027  # a default
-        """Drop a decision from memory, since it was corrected in the store."""
+        """Drop a decision from memory, so that it is read from the database again."""
 
     def call_store(self, call: Callable[[], T]) -> T:
         """Run a call of the store, and return its result within `limit` seconds.
