@@ -260,7 +260,10 @@ class Drainer:
             return self._calls.popleft() if self._calls else None
 
     def _note_error(self, error: Exception) -> None:
-        """Keep an error of the database for `fault`, and wake those who wait; log the first."""
+        """Keep an error of the database for `fault`, and wake those who wait.
+
+        It is logged only if the database has answered since the last one.
+        """
         with self._changed:
             if not self._error:
                 log.warning("labels wait in the journal beside the store: %s", error)

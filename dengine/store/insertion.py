@@ -107,9 +107,9 @@ class RecordInsertion:
     def _insert_decisions(
         self, connection: sa.Connection, decisions: Sequence[StoredDecision]
     ) -> list[str]:
-        """Insert the decisions that are not stored yet, with their traces.
+        """Insert the decisions that are not stored yet, with their traces; nothing is committed.
 
-        Return, in words, each whose id is stored with other values.
+        Return, in words, each whose id is stored with other values; these stay as they are stored.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)

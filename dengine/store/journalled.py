@@ -187,7 +187,12 @@ class JournalledStore(Outbox):
     # What the engine records
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
-        """As `Outbox.record_decision`; the disk counts as hanging if 10,000 records wait for it."""
+        """Record a decision in memory, for a thread to write, and return it with its number.
+
+        If its id has a decision in memory, that one is returned, and nothing is recorded. If 10,000
+        records wait for the disk, nothing is recorded either: `item` is returned as it came, and
+        `find_decision` raises StoreError for its id.
+        """
         id_ = item.decision.id
         with self._changed:
             first = self._index.recent.get(id_)
@@ -203,7 +208,12 @@ class JournalledStore(Outbox):
         return item
 
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
-        """As `Outbox.replace_decision`. Raise StoreError if the journal is damaged there."""
+        """Record a decision in the place of one that is not in the journal yet, and return it.
+
+        It keeps the first one's time, trace and number. If that is on disk by now, it is returned,
+        and nothing is recorded. Raise KeyError for an id that is neither in memory nor in the
+        journal.
+        """
         id_ = item.decision.id
         with self._changed:
             first, _ = self._index.find(id_)
@@ -216,6 +226,7 @@ class JournalledStore(Outbox):
         return item
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
+        """Record labels in memory, each with the present time and its decision's hash and time."""
         with self._changed:
             for item, label in labels:
                 label = self._completed(item, label)

@@ -100,7 +100,10 @@ class Outbox(ABC):
         self._note_integrity(self.store.database.check_integrity(self._window, since))
 
     def _note_integrity(self, error: str) -> None:
-        """Keep and log an integrity error, if it is the first; "" changes nothing."""
+        """Keep and log an integrity error, if it is the first; "" changes nothing.
+
+        From then on every part must be verified, until the store is opened again.
+        """
         if error and not self.integrity_error:
             self.integrity_error = (
                 f"{error}; see `dengine verify`, and restore the store from a copy."

@@ -503,6 +503,7 @@ class CellAddress(str):
     product: str | None
 
     def __new__(cls, url: str, cell_id: str, product: str | None = None) -> Self:
+        """Return a text equal to `url`, with cell and product as its attributes."""
         address = super().__new__(cls, url)
         address.cell_id = cell_id
         address.product = product

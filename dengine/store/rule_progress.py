@@ -62,7 +62,8 @@ def read_rule_progress(
     -------
     RuleProgress
         The newest label that the rule includes, and which decisions count as overdue. `last_seq` is
-        0 if there is no version, or if the rule must be rebuilt from all outcomes.
+        0 if there is no version, or if the rule must be rebuilt from all outcomes (see
+        `RuleProgress`).
     """
     state = {} if version is None else version.state
     overdue_to = max(
