@@ -128,7 +128,9 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     Raises
     ------
     StoreError
-        If `copy` is no store, or its history is not as it was written.
+        If `copy` is no store, or its history is not as it was written; if its ledger has another
+        key than the environment names; and if a journal cannot be made, when the store is there
+        already.
     OutputError
         If `store` exists, or cannot be written.
     """

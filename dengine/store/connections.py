@@ -518,7 +518,8 @@ class Database:
         """Lock the cell on a PostgreSQL server, and write from now on through that one connection.
 
         The lock lasts as long as the connection; a new connection locks again. Raise StoreError if
-        another engine has the lock; this `Database` can then still be used, without it.
+        another engine has the lock, or the database fails; this `Database` can then still be used,
+        without it.
         """
         # The name is shown to an engine that finds the cell locked.
         options = TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]}
@@ -598,7 +599,10 @@ class Database:
                     self._disconnect()
 
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
-        """Run a query in a read transaction of its own, and return all its rows."""
+        """Run a query in a read transaction of its own, and return all its rows.
+
+        `before_use` is called first. Raise StoreError if the database fails or is closed.
+        """
         with self.reading() as connection:
             return connection.execute(query).all()
 

@@ -45,19 +45,19 @@ class CorrectionTable(CellTable):
     def apply(self, change: Change) -> int:
         """Commit a person's change and its event in one transaction; return the event's number.
 
-        The change may correct or forget labels, store a version, and replace the settings. If one
-        part fails, nothing is written.
+        The change may correct labels, or have them forgotten (they count nowhere any more), store a
+        version, and replace the settings. If one part fails, nothing is written.
 
         Raises
         ------
         ReportError
             For a decision that is unknown or has no label.
         SettingError
-            If a peer's settings contradict the new ones.
+            If the settings of another cell of the product contradict the new ones.
         StoreError
             For data that JSON does not have, for a setting that is the store's own, for a version
-            without arrays, if a peer of the product stored a version meanwhile, and if the database
-            fails.
+            without arrays, if another cell of the product stored a version meanwhile, and if the
+            database fails.
         """
         now = float(self._database.clock())
         event = new_event(change.kind, change.text, now, change.data, change.author)

@@ -80,7 +80,7 @@ class Drainer:
 
     @property
     def lag(self) -> float:
-        """Age in seconds of the oldest record that is not drained; 0.0 if all are."""
+        """Age in seconds of the oldest record that the database lacks; 0.0 if none."""
         with self._changed:
             oldest = self._recorder.oldest
         return 0.0 if oldest is None else time.monotonic() - oldest
@@ -99,15 +99,20 @@ class Drainer:
         return f"no answer from the store for {lag:.1f} s."
 
     def request(self) -> None:
-        """Ask that everything recorded so far be synced and drained at once; do not wait."""
+        """Ask that everything recorded so far be synced and copied to the database at once.
+
+        It does not wait, and says nothing of the result.
+        """
         with self._changed:
             self._wanted = self._recorder.n_recorded
             self._recorder.request_sync()
 
     def drain(self) -> None:
-        """Wait until everything recorded so far is drained, as `Outbox.drain` says.
+        """Wait until the database has everything recorded so far, at most the limit.
 
-        If that takes too long, the store has a `fault` until it answers again.
+        Raise StoreError if that takes too long, or the store has a `fault`. The records stay in the
+        journal and are copied later. After a timeout the store has a `fault` until it answers
+        again.
         """
         with self._changed:
             if self.is_drained:
@@ -129,7 +134,7 @@ class Drainer:
         )
 
     def pop_label_numbers(self) -> LabelNumbers:
-        """Return the numbers of labels, as `Outbox.pop_label_numbers` says."""
+        """Return the label numbers since the last call, as `Outbox.pop_label_numbers` says."""
         with self._changed:
             numbers = self._label_numbers
             self._label_numbers = []
@@ -138,7 +143,7 @@ class Drainer:
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """Have the thread make a call, and return without waiting for it.
 
-        Records that are on disk by then are drained before, if the database takes them.
+        Records that are on disk by then are copied to the database before, if it takes them.
 
         Returns
         -------
@@ -148,7 +153,7 @@ class Drainer:
         Raises
         ------
         StoreError
-            If the store is unavailable.
+            If the store has a `fault` now; the call is then not made.
         """
         future: Future[T] = Future()
         with self._changed:
@@ -175,19 +180,26 @@ class Drainer:
         return future.result()
 
     def start(self) -> None:
-        """Start the thread, and have it drain before anybody else uses the store."""
+        """Start the thread, and have it drain before anybody else uses the store.
+
+        From then on the database's `before_use` is this object's.
+        """
         self._thread.start()
         self._store.database.before_use = self._drain_before_use
 
     def wait_for_store(self, seconds: float) -> None:
-        """Wait until everything is drained, or a fault shows that it will not be."""
+        """Wait until the database has every record, a fault shows that it will not, or time is up.
+
+        Nothing is returned or raised: `is_drained` says which.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self.is_drained or bool(self.fault), seconds)
 
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
-        It drains what is synced before, if the database takes it.
+        Before, it copies what is synced to the database, if that takes it, and makes the calls that
+        wait.
         """
         with self._changed:
             self._stopped = True
@@ -196,7 +208,7 @@ class Drainer:
         return not self._thread.is_alive()
 
     def _drain_before_use(self) -> None:
-        """Drain before the store is used directly, so that its user sees every record.
+        """Copy records to the database before it is used directly, so that all are seen.
 
         It waits at most `limit` seconds. If the store is unavailable, nothing is raised here. In
         the thread that drains, and once that was stopped, it does nothing.
@@ -230,7 +242,9 @@ class Drainer:
     def _wait_for_work(self) -> tuple[Future[Any], Callable[[], Any]] | None:
         """Wait until there is a call, or until there are records and it is time to drain them.
 
-        Return the oldest call, None if there is none.
+        Return the oldest call, None if there is none. It is time DRAIN_SECONDS after the first
+        record came, or at once if somebody waits for the database, the journal is long, or `stop`
+        was called.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._calls or self._recorder.synced or self._stopped)
@@ -246,7 +260,10 @@ class Drainer:
             return self._calls.popleft() if self._calls else None
 
     def _note_error(self, error: Exception) -> None:
-        """Keep an error of the database for `fault`, and wake those who wait; log the first."""
+        """Keep an error of the database for `fault`, and wake those who wait.
+
+        It is logged only if the database has answered since the last one.
+        """
         with self._changed:
             if not self._error:
                 log.warning("labels wait in the journal beside the store: %s", error)
@@ -254,9 +271,10 @@ class Drainer:
             self._changed.notify_all()
 
     def _drain_synced(self) -> None:
-        """Drain everything that is synced by now. Raise StoreError if the database refuses it.
+        """Copy everything that is synced by now to the database; then clear its last error.
 
         What is synced meanwhile waits for the next time, or each record would be a transaction.
+        Raise StoreError if the database refuses it.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:
@@ -268,8 +286,9 @@ class Drainer:
     def drain_chunk(self) -> None:
         """Commit the oldest synced records, at most DRAIN_CHUNK, in one transaction.
 
-        Decisions that were replaced are left out. Of records that are damaged on disk an event is
-        committed. Journal, counters and index are updated. Raise StoreError if the database refuses
+        Decisions that were replaced are left out. Records that are damaged on disk are taken from
+        memory and reported by an event; a decision that is in neither is lost, and that event is an
+        alarm. Journal, counters and index are updated. Raise StoreError if the database refuses
         records or event; nothing is updated then, and the next call commits the same records again.
         """
         with self._changed:
@@ -309,7 +328,10 @@ class Drainer:
             self._changed.notify_all()
 
     def report(self, kind: str, text: str) -> None:
-        """Log an error, and commit it to the store as an event, directly and not by the journal."""
+        """Log an error, and commit it to the store as an event, directly and not by the journal.
+
+        Raise StoreError if the database fails.
+        """
         log.error("%s: %s%s", kind, text, f" {LOSS_REMEDY}" if kind == DATA_LOST else "")
         self._store.events.put(kind, text)
 

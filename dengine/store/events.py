@@ -82,7 +82,9 @@ class EventTable(CellTable):
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
     def acknowledge_losses(self, author: str = "") -> None:
-        """End the alarm about lost data by an event; without an alarm nothing is written.
+        """End the alarm about lost data by an event ACKNOWLEDGED; without an alarm write nothing.
+
+        An event DATA_LOST is an alarm until a later ACKNOWLEDGED.
 
         Parameters
         ----------

@@ -41,7 +41,7 @@ class SortedLabels:
     taken : dict of str to None
         Decisions that have the label, from now on or since before, in the order of the labels.
     late_stops : dict of str to None
-        Decisions whose label, "confirmed" by silence, is to be corrected to a failure.
+        Decisions whose label "confirmed" is to be corrected to a failure (`_is_late_stop`).
     problems : list of str
         Labels that contradict what is stored, in words.
     """
@@ -69,7 +69,8 @@ class RecordInsertion:
         """Commit records, as `SqlStore.apply_records` says.
 
         If the database refuses a value, the records are halved, each half in a transaction of its
-        own, until the refused record is alone; that becomes a dead letter.
+        own, until the refused record is alone; that becomes a dead letter, an event that says what
+        was in it. Raise StoreError if the database fails otherwise.
         """
         try:
             return self._database.write(lambda connection: self._insert(connection, records))
@@ -84,9 +85,11 @@ class RecordInsertion:
         return []
 
     def _insert(self, connection: sa.Connection, records: Sequence[Record]) -> LabelNumbers:
-        """Insert what is not stored yet, without a commit.
+        """Insert into the tables what is not stored yet, without a commit.
 
-        Return (decision id, number) of the labels that are stored now.
+        A record that contradicts what is stored becomes an event, "dead letter"; a line stop of a
+        part that had counted as good (`_is_late_stop`) corrects its label. Return (decision id,
+        number) of the labels that are stored now, those of before included.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -104,9 +107,9 @@ class RecordInsertion:
     def _insert_decisions(
         self, connection: sa.Connection, decisions: Sequence[StoredDecision]
     ) -> list[str]:
-        """Insert the decisions that are not stored yet, with their traces.
+        """Insert the decisions that are not stored yet, with their traces; nothing is committed.
 
-        Return, in words, each whose id is stored with other values.
+        Return, in words, each whose id is stored with other values; these stay as they are stored.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
@@ -132,7 +135,11 @@ class RecordInsertion:
     def _insert_labels(
         self, connection: sa.Connection, labels: dict[str, NewLabel], stored: dict[str, Any]
     ) -> dict[str, int]:
-        """Insert new labels; return the numbers of these and of stored ones, by decision."""
+        """Insert new labels; return the numbers of these and of stored ones, by decision.
+
+        `stored` has the rows of `CorrectionTable.stored_labels`. A label is quarantined (kept out
+        of training) if its decision is.
+        """
         rows = [
             to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
             for label in labels.values()
@@ -144,8 +151,9 @@ class RecordInsertion:
     def _insert_events(
         self, connection: sa.Connection, events: Sequence[Event], problems: Sequence[str]
     ) -> None:
-        """Insert events that are not stored yet, by time, kind and text; and a dead letter for each
-        problem, which is also logged as an error.
+        """Insert events, and one "dead letter" for each problem, which is also logged as an error.
+
+        An event is left out if the cell has one with the same time, kind and text.
         """
         new = []
         if events:
@@ -160,7 +168,10 @@ class RecordInsertion:
         self._database.insert(connection, EVENT.c.number, [to_row(event) for event in new])
 
     def _correct_confirmation(self, connection: sa.Connection, decision_id: str) -> None:
-        """Correct to failure the label of a part that silence confirmed and that then stopped."""
+        """Correct a label to failure: the part had counted as good, and its line stop came later.
+
+        An event "late stop" is inserted with the correction; nothing is committed.
+        """
         text = (
             f"decision {as_text(decision_id)} counts as a failure, was a success: its stop came "
             "after its confirmation"
@@ -170,9 +181,13 @@ class RecordInsertion:
 
 
 def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLabels:
-    """Sort labels by what the store does with them.
+    """Sort labels by what the store does with them; nothing is written.
 
-    `stored` has, by decision, the rows of `CorrectionTable.stored_labels`.
+    The first label of a decision is new. One that repeats the success and source of the first
+    counts as taken, and changes nothing. A late stop (`_is_late_stop`) corrects the first, unless
+    that is corrected to a failure already. Any other second label, and one whose decision is not
+    stored or is another, is a problem. `stored` has, by decision, the rows of
+    `CorrectionTable.stored_labels`.
     """
     result = SortedLabels()
     for label in labels:
@@ -196,7 +211,8 @@ def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     """Return in words why the store cannot take a label; "" if it can.
 
     `row` is that of its decision, None if it is not stored; `first` is the label that the decision
-    has, None if it has none.
+    has, None if it has none. A label that repeats it is no problem, nor is a late stop
+    (`_is_late_stop`), unless a person had the first label forgotten.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"
@@ -210,7 +226,10 @@ def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
 
 
 def _is_late_stop(label: NewLabel, first: Any) -> bool:
-    """Return whether a label is the line stop of a part that silence had confirmed first."""
+    """Return whether a label reports a line stop of a part that had counted as good until then.
+
+    It had if `first`, its first label, is CONFIRMED: the next part came, and no stop was reported.
+    """
     return ((first.success, first.source), (label.success, label.source)) == LATE_STOP
 
 

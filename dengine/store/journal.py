@@ -284,9 +284,9 @@ class Journal:
     def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write the newest ledger entry and `drained_to` to the header and to the head.
 
-        Nothing is synced: an older header is harmless, since the store ignores
-        a record that it is given twice. Raise StoreError if the header cannot be written; a failure
-        of the head is ignored.
+        Nothing is synced: an older header is harmless, since the store ignores a record that it is
+        given twice. Raise StoreError if the header cannot be written; a failure of the head is
+        ignored.
         """
         with self._describing, _os_errors(self.path):
             self.head.newest = newest
@@ -321,7 +321,7 @@ class Journal:
     def reserve(self) -> None:
         """Reserve disk space for at least RESERVE bytes of records, and sync that.
 
-        On a full disk nothing is reserved, and no error raised.
+        On a full disk nothing is reserved, and no error raised; StoreError if the sync fails.
         """
         with _os_errors(self.path):
             self._file.reserve(HEADER + RESERVE)
@@ -386,8 +386,9 @@ class Journal:
     def _scan(self) -> None:
         """Read header, head and all undrained records, and set the attributes that describe them.
 
-        With a damaged header all records count as undrained. Nothing is written. Raise StoreError
-        if the file is no journal.
+        With a damaged header all records count as undrained. Damage and missing records are put
+        into `loss` and `dropped`, not raised. Nothing is written. Raise StoreError if the file is
+        no journal.
         """
         head = self.head
         fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
@@ -437,7 +438,7 @@ class Journal:
         self.head = Head(fields["newest"], n_drained, n_synced, newest, head.time)
 
     def _read_record(self, offset: int) -> bytes | None:
-        """Return the encoded record at an offset, without its frame.
+        """Return the encoded record at an offset, without its frame (length, CRC-32, digest).
 
         None if no record begins there, or if it is cut off or its CRC-32 differs.
         """
@@ -461,7 +462,7 @@ def _chain_digest(previous: bytes, record: bytes) -> bytes:
 
 
 def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
-    """Context manager that raises StoreError, with the journal's path, for an OSError."""
+    """Context manager that raises StoreError, with the path and advice, for an OSError in it."""
     do = "free some space there, or make its folder writable"
     do = do if owning else "read it as the user that its cell runs as"
     return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)

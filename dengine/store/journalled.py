@@ -86,9 +86,10 @@ class JournalledStore(Outbox):
     def _compare_with_ledger(self) -> None:
         """Check that the store's ledger has the entries that the journal and its head name.
 
-        If one is missing, the store was cut off or restored from an older copy: an event is stored,
-        and the journal is set to be drained from its beginning. An event is also stored if the
-        journal or its head is new though the store is not.
+        If one is missing, the store was cut off or restored from an older copy: an event DATA_LOST
+        (an alarm) is stored, and the journal is set to be copied to the database from its
+        beginning. An event is also stored if the journal or its head is new though the store is
+        not. Raise StoreError only if the database cannot be read or written.
         """
         journal = self._journal
         database = self.store.database
@@ -109,9 +110,12 @@ class JournalledStore(Outbox):
             )
 
     def _drain_leftovers(self) -> None:
-        """Drain what an earlier process left in the journal, and clear the journal.
+        """Copy to the database what an earlier process left in the journal, and clear the journal.
 
-        Damage in the journal, or records that it lacks, become an event, which is an alarm.
+        Records that are damaged or missing in the journal become an event DATA_LOST, which is an
+        alarm until a person acknowledges it. If a process was killed as it wrote a record, that is
+        cut off, and an event without an alarm says so. Raise StoreError if the database does not
+        take the records; they then stay in the journal.
         """
         newest = self.store.decisions.select(HistoryFilter(), limit=1)
         since = "".join(
@@ -134,9 +138,10 @@ class JournalledStore(Outbox):
         self._journal.clear()
 
     def _begin_check(self) -> None:
-        """Check the store's integrity; the result becomes `integrity_error`.
+        """Check the store's integrity; an error becomes `integrity_error`, and is logged.
 
         The check of the pages by SQLite is waited for only CHECK_SECONDS and goes on in a thread.
+        Raise StoreError if the database cannot be read.
         """
         check = threading.Thread(
             target=lambda: self._note_integrity(self.store.database.check_pages()), daemon=True
@@ -165,7 +170,7 @@ class JournalledStore(Outbox):
 
     @contextmanager
     def try_lock(self) -> Iterator[bool]:
-        """Context manager that tries to take the lock, and gives whether that succeeded.
+        """Context manager that tries to take the records' lock, and gives whether it has it.
 
         It waits at most a millisecond, and the block runs in either case. While the block holds the
         lock, the threads wait, and so do calls from other threads. The lock is released after the
@@ -182,6 +187,12 @@ class JournalledStore(Outbox):
     # What the engine records
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
+        """Record a decision in memory, for a thread to write, and return it with its number.
+
+        If its id has a decision in memory, that one is returned, and nothing is recorded. If 10,000
+        records wait for the disk, nothing is recorded either: `item` is returned as it came, and
+        `find_decision` raises StoreError for its id.
+        """
         id_ = item.decision.id
         with self._changed:
             first = self._index.recent.get(id_)
@@ -197,6 +208,12 @@ class JournalledStore(Outbox):
         return item
 
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
+        """Record a decision in the place of one that is not in the journal yet, and return it.
+
+        It keeps the first one's time, trace and number. If that is on disk by now, it is returned,
+        and nothing is recorded. Raise KeyError for an id that is neither in memory nor in the
+        journal.
+        """
         id_ = item.decision.id
         with self._changed:
             first, _ = self._index.find(id_)
@@ -209,6 +226,7 @@ class JournalledStore(Outbox):
         return item
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
+        """Record labels in memory, each with the present time and its decision's hash and time."""
         with self._changed:
             for item, label in labels:
                 label = self._completed(item, label)
@@ -224,6 +242,10 @@ class JournalledStore(Outbox):
         self._drainer.drain()
 
     def request_label_drain(self) -> bool:
+        """Return whether the database still lacks a label; if so, have all records copied there.
+
+        A thread copies them at once, and is not waited for.
+        """
         with self._changed:
             if self._index.has_undrained_labels:
                 self._drainer.request()
@@ -235,6 +257,13 @@ class JournalledStore(Outbox):
     # What the engine asks
 
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
+        """Return a decision with its label from memory, journal or database, or None if unknown.
+
+        With `unsynced` the label may be one that is not on disk yet. Raise StoreError if the
+        database is needed and does not answer within `limit` seconds, and for an id that was
+        answered by VERIFY without recording a decision, since it could not be looked up or the disk
+        hung.
+        """
         with self._changed:
             if decision_id in self._unrecorded:
                 raise StoreError(
@@ -250,6 +279,12 @@ class JournalledStore(Outbox):
         return item
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
+        """Return the decision that an id already has, with its label if that is on disk, else None.
+
+        Raise StoreError if the id cannot be looked up. It is then remembered as answered but
+        unrecorded: until a decision is recorded for it, `find_decision` raises StoreError, and only
+        this method looks it up again.
+        """
         with self._changed:
             self._unrecorded.discard(decision_id)
         try:
@@ -262,6 +297,8 @@ class JournalledStore(Outbox):
         """Read the ids of all decisions from the database into a Bloom filter in memory.
 
         It takes about a second for a million ids; the lock is held for a page of them at a time.
+        Once all are loaded, another call does nothing. Raise StoreError if the database cannot be
+        read.
         """
         if self._index.has_all_ids:
             return
@@ -319,16 +356,20 @@ class JournalledStore(Outbox):
             self._leave_store(can_close=seconds > 0.0)
 
     def _end_threads(self, seconds: float) -> bool:
-        """Have the threads end, and return whether both have, each within these seconds."""
+        """Mark this as closed, and end the threads, which first write once what waits for them.
+
+        Return whether recorder and drainer have both ended, each within these seconds.
+        """
         with self._changed:
             self._closed = True
         has_recorder_ended = self._recorder.stop(seconds)
         return self._drainer.stop(seconds) and has_recorder_ended
 
     def _leave_store(self, can_close: bool) -> None:
-        """Log that the journal holds what the database lacks; disconnect where the disk answers.
+        """Log that the journal holds what the database lacks.
 
-        Else the lease on the cell would outlive the engine.
+        If `can_close`, since the disk answers, disconnect and close the journal without waiting, so
+        that another engine can own the cell; else both stay open until the process ends.
         """
         log.warning(
             "the store was left, its journal %s holds what it lacks: %s",

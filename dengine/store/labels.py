@@ -72,8 +72,9 @@ class LabelTable(CellTable):
     ) -> LabelledTraces:
         """Return labelled traces for training, with corrected labels, oldest first.
 
-        Forgotten labels and quarantined traces are left out. So is a trace that is not as it was
-        stored, and an event with its decision's id is written to the store.
+        Labels that a person had forgotten, and those of quarantined traces, are left out. So is a
+        trace that is not as it was stored, and an event with its decision's id is written to the
+        store.
 
         Parameters
         ----------
@@ -252,10 +253,10 @@ class LabelTable(CellTable):
         since_version : int, default 0
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
-            Up to this decision number a check without a label is overdue; 0: none is. An overdue
-            check adds none, one or two outcomes (`overdue_outcomes`), whatever `seq` is. They are
-            inserted where the running engine updated the rule with them; every later label stores
-            that position.
+            Up to this decision number a check without a label is overdue, which counts as an error
+            until its label comes; 0: none is. An overdue check adds none, one or two outcomes
+            (`overdue_outcomes`), whatever `seq` is. They are inserted where the running engine
+            updated the rule with them; every later label stores that position.
 
         Returns
         -------

@@ -92,7 +92,10 @@ class DecisionIndex:
         self.has_all_ids = False
 
     def add(self, record: Record, entry: Entry) -> None:
-        """Add a record that was just recorded; an event, which has no id, changes nothing."""
+        """Add a record that was just recorded; an event, which has no id, changes nothing.
+
+        Of more than N_RECENT decisions in memory the oldest is dropped.
+        """
         if isinstance(record, StoredDecision):
             id_ = record.decision.id
             self.recent[id_] = record

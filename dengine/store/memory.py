@@ -50,7 +50,11 @@ class MemoryStore(Outbox):
         store.database.before_use = self._write
 
     def _write(self) -> None:
-        """Write what was recorded to the database: called before the store is used."""
+        """Write the versions and records that wait in memory to the database.
+
+        It is called before each use of the store, and when 40 versions wait. Raise StoreError if
+        the database cannot be written; what waited is then dropped.
+        """
         versions = self._versions
         records = self._unwritten
         self._versions = []
@@ -62,6 +66,7 @@ class MemoryStore(Outbox):
             self.store.apply_records(part)
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
+        """Keep a decision in memory, and return it with the next number; no id is looked up."""
         self.n_decisions += 1
         item = replace(item, number=self.n_decisions)
         self._unwritten.append(item)
@@ -73,6 +78,7 @@ class MemoryStore(Outbox):
         raise KeyError(item.decision.id)
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
+        """Keep labels in memory, each with the present time and its decision's hash and time."""
         for item, label in labels:
             label = self._completed(item, label)
             self._unwritten.append(label)
@@ -80,20 +86,31 @@ class MemoryStore(Outbox):
                 self._decisions[label.decision_id] = item.with_label(label)
 
     def record_event(self, kind: str, text: str) -> None:
+        """Keep an event in memory; an engine that only reads commits it to the database at once.
+
+        For that engine StoreError is raised if the database cannot be written.
+        """
         self._unwritten.append(new_event(kind, text, self.store.clock()))
         if self._reading:  # nobody may read the store again before it is closed
             self._write()
 
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
+        """Return a decision with its label, from memory or else from the database; None if unknown.
+
+        Before it asks the database, everything that waits in memory is written there. A label
+        counts as soon as it is recorded, so `unsynced` has no effect.
+        """
         return self._decisions.get(decision_id) or self.store.decisions.get(decision_id)
 
     def store_version(
         self, report: RetrainReport, last_seq: int, state: Arrays | None
     ) -> Future[int]:
-        """Keep a retrain with copies of its arrays; it is done when this returns.
+        """Keep a retrain with copies of its arrays in memory; the future that is returned is done.
 
-        It is written with the other records, or when 40 retrains wait: packing one takes as long as
-        many decisions.
+        Its result is the report's version number. The retrain is written to the database together
+        with the other records, when somebody uses the store, or when 40 retrains wait: packing one
+        takes as long as many decisions. Raise StoreError for an accepted version without arrays,
+        and for an array of Python objects.
         """
         self._versions.append((report, last_seq, check_state(report, state), self.store.clock()))
         if len(self._versions) == MAX_UNWRITTEN_VERSIONS:
@@ -103,6 +120,9 @@ class MemoryStore(Outbox):
         return future
 
     def close(self) -> None:
-        """End the use by this engine; a store in memory stays open, also for another engine."""
+        """End the use by this engine; a store in memory stays open, also for another engine.
+
+        A file or server, of which this engine only read, is disconnected.
+        """
         self._closed = True
         self.store.close()

@@ -102,7 +102,8 @@ def open_outbox(
     """Open the outbox by which an engine records and looks up, in the way that fits its store.
 
     A `JournalledStore` claims the cell, drains what an earlier process left in the journal, and
-    starts its threads. Closing the outbox closes the store.
+    starts its threads. Either outbox checks the store; what is not as it was written becomes its
+    `integrity_error`, and is not raised. Closing the outbox closes the store.
 
     Parameters
     ----------

@@ -28,8 +28,9 @@ T = TypeVar("T")
 class Outbox(ABC):
     """Records what an engine decides and learns, and asks its store for it.
 
-    Every `record_*` method returns at once; `sync` waits for the disk, `drain` for the database.
-    What is not abstract here is as for a store that is always at hand: nothing is waited for.
+    Every `record_*` method returns at once; `sync` waits for the disk, `drain` until the database
+    has taken ("drained") the records. What is not abstract here is as for a store that is always at
+    hand: nothing is waited for.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ class Outbox(ABC):
         return os.getpid() == self._pid and not self._closed
 
     def check_usable(self) -> None:
-        """Raise a StoreError if the engine is closed, only reads, or is of a parent process."""
+        """Raise a StoreError if the engine is closed, only reads, or was opened before a fork."""
         if os.getpid() != self._pid:
             raise forked_error(self._pid, "the engine")
         if self._closed:
@@ -88,7 +89,8 @@ class Outbox(ABC):
     def check_integrity(self, since: int | None = None) -> None:
         """Compare what the engine reads from the store with the ledger; set `integrity_error`.
 
-        The first error stays; nothing is returned.
+        A difference is logged, and only the first is kept. Raise StoreError only if the database
+        cannot be read.
 
         Parameters
         ----------
@@ -98,7 +100,10 @@ class Outbox(ABC):
         self._note_integrity(self.store.database.check_integrity(self._window, since))
 
     def _note_integrity(self, error: str) -> None:
-        """Keep and log an integrity error, if it is the first; "" changes nothing."""
+        """Keep and log an integrity error, if it is the first; "" changes nothing.
+
+        From then on every part must be verified, until the store is opened again.
+        """
         if error and not self.integrity_error:
             self.integrity_error = (
                 f"{error}; see `dengine verify`, and restore the store from a copy."
@@ -120,7 +125,7 @@ class Outbox(ABC):
 
     @property
     def lag(self) -> float:
-        """Age in seconds of the oldest record that is not drained; 0.0 if all are."""
+        """Age in seconds of the oldest record that the database lacks; 0.0 if none."""
         return 0.0
 
     @property
@@ -129,7 +134,7 @@ class Outbox(ABC):
         return True
 
     def try_lock(self) -> AbstractContextManager[bool]:
-        """Return a context manager that gives whether nothing has to be waited for in its block."""
+        """Return a context manager that gives True if its block need not wait; here always."""
         return nullcontext(True)
 
     # What the engine records
@@ -162,6 +167,11 @@ class Outbox(ABC):
         StoredDecision
             The new decision; or the first one, unchanged, if that is in the journal or the database
             by now.
+
+        Raises
+        ------
+        KeyError
+            If no decision with this id is in memory or in the journal.
         """
 
     def number_label(self) -> int:
@@ -175,7 +185,10 @@ class Outbox(ABC):
         return self._newest_label
 
     def _continue_numbers(self) -> None:
-        """Go on with the numbers of decisions and labels that the store holds."""
+        """Go on with the numbers of decisions and labels that the store holds.
+
+        In a product the store numbers the labels, so they are left at 0 here.
+        """
         self.n_decisions = self.store.decisions.newest_number()
         if self.store.product is None:
             self._newest_label = self.store.labels.newest()
@@ -193,7 +206,7 @@ class Outbox(ABC):
         """
 
     def _completed(self, item: StoredDecision, label: NewLabel) -> NewLabel:
-        """Return a label with the present time, and with hash and time of its decision."""
+        """Return a copy of a label with the present time, and its decision's hash and time."""
         hash_ = item.content_hash
         return replace(label, time=self.store.clock(), content_hash=hash_, decided=item.time)
 
@@ -220,11 +233,14 @@ class Outbox(ABC):
         Raises
         ------
         NotTakenError
-            If that takes too long, or fails. Recording the same again is harmless.
+            If that takes too long, or fails; never for a store in memory. Recording the same again
+            is harmless.
         """
 
     def drain(self) -> None:  # noqa: B027  # a default
         """Wait until the database has taken everything recorded so far, at most `limit` seconds.
+
+        In memory nothing is waited for.
 
         Raises
         ------
@@ -253,9 +269,9 @@ class Outbox(ABC):
             self.drain()
 
     def request_label_drain(self) -> bool:
-        """If any label is not drained, ask that everything be drained now; do not wait.
+        """If the database lacks a label, ask that all records be copied there now; do not wait.
 
-        Return whether any label is not drained.
+        Return whether it lacks one; in memory never.
         """
         return False
 
@@ -290,8 +306,8 @@ class Outbox(ABC):
         Raises
         ------
         StoreError
-            If the database is needed and unavailable, and if the id was answered without recording
-            a decision.
+            If the database is needed and unavailable, and if the id was answered by VERIFY without
+            recording a decision, since the disk hung or it could not be looked up.
         """
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
@@ -310,11 +326,12 @@ class Outbox(ABC):
     def load_ids(self) -> None:  # noqa: B027  # a default
         """Load the ids of all decisions, so that a new id is recognized without the database.
 
-        Another call does nothing. Raise StoreError if the database cannot be read.
+        Another call does nothing, nor does any for a store in memory. Raise StoreError if the
+        database cannot be read.
         """
 
     def evict_decision(self, decision_id: str) -> None:  # noqa: B027  # a default
-        """Drop a decision from memory, since it was corrected in the store."""
+        """Drop a decision from memory, so that it is read from the database again."""
 
     def call_store(self, call: Callable[[], T]) -> T:
         """Run a call of the store, and return its result within `limit` seconds.
@@ -359,7 +376,7 @@ class Outbox(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Write what can be written within seconds, and give the cell up.
+        """Write what can be written within seconds, and let another engine own the cell.
 
         A second call does nothing, nor does one in a forked process.
         """

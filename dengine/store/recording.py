@@ -49,7 +49,7 @@ class Entry:
         return self.end > 0
 
     def place(self, offset: int, end: int) -> None:
-        """Note where the record stands in the journal; a decision is not kept in memory."""
+        """Note where the record stands in the journal; a decision is then dropped from memory."""
         self.offset = offset
         self.end = end
         if self.decision_id:
@@ -126,7 +126,7 @@ class Recorder:
         return None
 
     def record(self, record: Record) -> Entry:
-        """Add a record in memory, and wake the thread that writes it."""
+        """Add a record in memory, wake the thread that writes it, and return its entry at once."""
         id_ = record.decision.id if isinstance(record, StoredDecision) else ""
         entry = Entry(record, id_)
         with self.changed:
@@ -141,9 +141,9 @@ class Recorder:
         self.record(new_event(kind, text, self._clock()))
 
     def adopt(self, record: Record, offset: int, end: int) -> Entry:
-        """Add a record that an earlier process left in the journal, where it stands there.
+        """Add a record that an earlier process left in the journal, as recorded and synced.
 
-        The thread must not have been started.
+        `offset` and `end` say where it stands there. The thread must not have been started.
         """
         entry = self.record(record)
         entry.place(offset, end)
@@ -158,7 +158,11 @@ class Recorder:
             self.changed.notify_all()
 
     def sync(self, seconds: float | None = None) -> None:
-        """Wait until everything recorded so far is synced, as `Outbox.sync` says."""
+        """Wait until everything recorded so far is synced, at most `seconds`, or the limit if None.
+
+        Raise NotTakenError if that takes longer, or a write fails meanwhile. The records stay, and
+        are tried again.
+        """
         limit = self._limit if seconds is None else seconds
         with self.changed:
             place = self.n_recorded
@@ -189,7 +193,8 @@ class Recorder:
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
-        It writes what waits before, once.
+        Before, it tries once to write what waits; if that fails, those records stay unwritten, and
+        nothing is raised.
         """
         with self.changed:
             self._stopped = True
@@ -226,10 +231,12 @@ class Recorder:
                     self.changed.wait(RETRY_SECONDS)
 
     def _write(self, batch: Sequence[Entry]) -> None:
-        """Append records to the journal, sync it, and hand them on as synced.
+        """Append a batch to the journal, sync it, and move it from `unwritten` to `synced`.
 
-        A long journal is cleared first if it is drained within BATCH_SECONDS. Raise StoreError if
-        the disk fails; the records then stay unwritten.
+        A journal of more than 8 MiB is cleared first, if the drainer copies the rest of it to the
+        database within BATCH_SECONDS. If the journal's file was deleted, moved or replaced, it is
+        created again, and an event says so. Raise StoreError if the disk fails; the entries then
+        stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
@@ -256,7 +263,11 @@ class Recorder:
             self.changed.notify_all()
 
     def _recreate(self, error: LostJournalError) -> None:
-        """Create a journal again whose file was lost, and record an event about it."""
+        """Create the journal again whose file was lost; log that, and record an event about it.
+
+        Records that the database lacks are copied into it. Raise StoreError if it cannot be
+        written.
+        """
         log.error("%s It is created again with what the store lacks.", error)
         with self.changed:  # nobody reads it or writes its header meanwhile
             self._journal.recreate()

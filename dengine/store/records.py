@@ -326,6 +326,9 @@ class OutcomeRecord(NamedTuple):
 def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     """Return the outcomes that a rule counts for a check that is overdue.
 
+    A check is overdue if its label has not come within the number of decisions that the policy
+    sets.
+
     Whatever the decision was, it counts as wrong: as a failure for the accept side if the part had
     evidence for success (lower > 0), then as a success for the reject side if it had evidence for
     failure (upper < 1). So there are none, one or two. Their `seq` is 0, the other side's bound is
@@ -500,6 +503,7 @@ class CellAddress(str):
     product: str | None
 
     def __new__(cls, url: str, cell_id: str, product: str | None = None) -> Self:
+        """Return a text equal to `url`, with cell and product as its attributes."""
         address = super().__new__(cls, url)
         address.cell_id = cell_id
         address.product = product

@@ -25,7 +25,7 @@ class RuleProgress:
         Number of the newest label that the rule includes. 0: the rule must be rebuilt from all
         outcomes, since a label was corrected meanwhile, a check is overdue (it counts as wrong
         until its label comes), the stored state is incomplete, or the version was made under an
-        earlier policy or by a peer.
+        earlier policy or by another cell of the product.
     overdue_to : int
         Number of the newest decision whose check was overdue.
     overdue_ids : frozenset of str
@@ -56,13 +56,14 @@ def read_rule_progress(
     within : int
         Number of later decisions after which a check without a label is overdue.
     policy_since : int
-        The first version since `within` is in force.
+        The first version under the present policy, which sets `within`.
 
     Returns
     -------
     RuleProgress
         The newest label that the rule includes, and which decisions count as overdue. `last_seq` is
-        0 if there is no version, or if the rule must be rebuilt from all outcomes.
+        0 if there is no version, or if the rule must be rebuilt from all outcomes (see
+        `RuleProgress`).
     """
     state = {} if version is None else version.state
     overdue_to = max(

@@ -27,17 +27,17 @@ class SettingTable(CellTable):
     def save(self, settings: Mapping[str, str]) -> None:
         """Commit new settings in the place of all present ones.
 
-        Raise SettingError if a peer's contradict them, and StoreError for a key that the store
-        itself keeps (`RESERVED`); then nothing is changed.
+        Raise SettingError if those of another cell of the product contradict them, and StoreError
+        for a key that the store itself keeps (`RESERVED`); then nothing is changed.
         """
         self._database.write(lambda connection: self.replace(connection, settings))
 
     def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
         """Replace the engine's settings of the cell in a write transaction; the store's own stay.
 
-        Raise StoreError for a setting that is the store's own (`RESERVED`), and SettingError if a
-        peer of the product would embed traces differently. The product stays locked until the
-        commit.
+        Raise StoreError for a setting that is the store's own (`RESERVED`), and SettingError if
+        another cell of the product would embed traces differently. The product stays locked until
+        the commit.
         """
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(

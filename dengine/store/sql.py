@@ -146,7 +146,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Raises
         ------
         StoreError
-            If another engine owns the cell, or the store cannot be written.
+            If another engine owns the cell, or the store or its journal cannot be written; nothing
+            stays claimed.
         """
         in_file = self.database.url.get_backend_name() == "sqlite"
         if in_file:
@@ -165,9 +166,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         """Commit records of a journal, in one transaction unless the database refuses a record.
 
         A record that is stored already and is the same counts as taken. A line stop of a part that
-        silence had confirmed corrects its label. Another decision with the same id, a label without
-        its decision, or any other second label becomes an event, "dead letter": which one is right
-        is never guessed. A record that the database refuses becomes one, too.
+        counted as good, since none had come before the next part, corrects its label. Another
+        decision with the same id, a label without its decision, or any other second label becomes
+        an event, "dead letter": which one is right is never guessed. A record that the database
+        refuses becomes one, too.
 
         Returns
         -------

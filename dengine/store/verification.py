@@ -331,8 +331,9 @@ class CellCheck:
     def _check_rows(self, table: str) -> Iterator[HistoryFault]:
         """Yield a fault for each row of a table, or version state, that was changed or not chained.
 
-        Keep the sums of all chained rows for `_check_ledger`, count `rows`, and call `on_rows`
-        after each CHUNK rows; `run` calls it for the rest.
+        A row is not chained if it has no ledger entry. Keep the sums of all others for
+        `_check_ledger`, count `rows`, and call `on_rows` after each CHUNK rows; `run` calls it for
+        the rest.
         """
         for row in self._read_raw(table):
             self.rows += 1

@@ -70,8 +70,8 @@ class VersionTable(CellTable):
         Returns
         -------
         int
-            The version's number. It is the report's, unless this one is accepted and a peer of the
-            product stored a version meanwhile: then the next.
+            The version's number. It is the report's, unless this one is accepted and another cell
+            of the product stored a version meanwhile: then the next.
 
         Raises
         ------
@@ -104,10 +104,10 @@ class VersionTable(CellTable):
         } | to_row(report)
 
     def insert(self, connection: sa.Connection, row: Row) -> int:
-        """Insert the row of a retrain; return its version's number.
+        """Insert the row of a retrain without a commit; return its version's number.
 
-        For an accepted version this is the next number if a peer of the product has taken the given
-        one; and states that `keeps_state` does not keep are deleted.
+        For an accepted version this is the next number if another cell of the product has taken the
+        given one; and the states that `keeps_state` does not keep are deleted.
         """
         number: int = row["version"]
         if (
@@ -139,8 +139,8 @@ class VersionTable(CellTable):
         Returns
         -------
         ModelVersion or None
-            None before the first, and if all that are kept are damaged. A peer's version is
-            returned without the state of its rule.
+            None before the first, and if all that are kept are damaged. The version of another cell
+            is returned without the state of its rule.
         """
         for i, row in enumerate(self._read(self._accepted_query())):
             if not row.kept and i > 0:
@@ -161,7 +161,7 @@ class VersionTable(CellTable):
         Returns
         -------
         ModelVersion
-            A peer's version is returned without the state of its rule.
+            The version of another cell is returned without the state of its rule.
 
         Raises
         ------
@@ -185,8 +185,8 @@ class VersionTable(CellTable):
     def _load_retrain(self, retrain: int) -> ModelVersion:
         """Return the version of a retrain with its arrays.
 
-        A peer's version is returned without the state of its rule, and with a `rule_last_seq` of 0.
-        Raise VersionError if the state is missing or damaged.
+        The version of another cell is returned without the state of its rule, and with a
+        `rule_last_seq` of 0. Raise VersionError if the state is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)

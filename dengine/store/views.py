@@ -52,6 +52,7 @@ class HistoryFilter:
     part: str | None = None
 
     def __post_init__(self) -> None:
+        """Convert words to enumerations; raise SettingError for a value that is not valid."""
         for name, enumeration in ENUMERATIONS.items():
             try:
                 if (value := getattr(self, name)) is not None:
