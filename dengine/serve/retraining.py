@@ -57,7 +57,9 @@ class RetrainingProcess(Executor):
         self._start()
 
     def _start(self) -> None:
-        """Start a process, and let it import what a retrain needs."""
+        """Start a process, and let it import what a retrain needs; set `ready` to the future of
+        that, and do not wait. The log says when it is ready.
+        """
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _prepare_process)
         other_processes = set(multiprocessing.active_children())
@@ -67,7 +69,11 @@ class RetrainingProcess(Executor):
         (self._process,) = set(multiprocessing.active_children()) - other_processes
 
     def restart(self) -> None:
-        """Kill the process, also at work, and start another; raises OSError where that fails."""
+        """Kill the process, also at work, and start another; raises OSError if that fails.
+
+        A call that was not done fails. It does not wait for the new process: `ready` is a new
+        future.
+        """
         self.shutdown(wait=False)
         self._start()
 

@@ -141,7 +141,10 @@ class ServerOptions:
 
     @property
     def access(self) -> Access:
-        """What the server allows.
+        """What the server allows; each access reads the token file again.
+
+        Beside `allow_hosts`, the address and this machine's name may be used to call a server that
+        other machines reach.
 
         Raises SettingError for a token file that cannot be used, and for an address that other
         machines can reach without one.
@@ -158,6 +161,9 @@ class ServerOptions:
     def started_beside(self, access: Access) -> list[Beside]:
         """Return the OPC UA server, as `create_app` starts it, in a list; an empty one if it is
         off.
+
+        The operators' tokens are its passwords; a viewer's token is none, since whoever may read
+        over OPC UA may also call.
         """
         if self.opcua is None:
             return []
