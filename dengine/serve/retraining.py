@@ -71,8 +71,8 @@ class RetrainingProcess(Executor):
     def restart(self) -> None:
         """Kill the process, also at work, and start another; raises OSError if that fails.
 
-        A call that was not done fails. It does not wait for the new process: `ready` is a new
-        future.
+        Calls that are not done fail. It returns before the new process is ready, for which `ready`
+        is a new future.
         """
         self.shutdown(wait=False)
         self._start()
@@ -125,6 +125,9 @@ class _SharedPickle:
         self._value = value
 
     def __reduce__(self) -> tuple[Any, ...]:
+        """Return what unpickles the value; write its arrays to a new file, which is closed with
+        this object.
+        """
         arrays: list[pickle.PickleBuffer] = []
         take_out = arrays.append if hasattr(os, "memfd_create") else None
         pickled = pickle.dumps(self._value, 5, buffer_callback=take_out)
