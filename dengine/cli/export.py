@@ -75,7 +75,8 @@ def export(
     STORE is the engine's store, as given to `dengine train` or `dengine run`; the cell may run
     meanwhile, and an event records the export. Before the first retrain there is nothing to export,
     and the exit code is 1. --make-key and --cpp need neither STORE nor --out; with these, the new
-    key signs FILE too. Whoever has the key can check an exported file, and can also sign one.
+    key signs FILE too, so that --key is refused beside --make-key. Whoever has the key can check an
+    exported file, and can also sign one.
     """
     if (store is None) is not (out is None) or not (store or new_key or cpp):
         raise click.UsageError(

@@ -312,7 +312,9 @@ def certificate_record(certificate: "Certificate") -> Record:
 
 @contextmanager
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on stderr while the block runs; none beside `--json` or without terminal.
+    """Show a progress bar on stderr while the block runs; it vanishes at the end.
+
+    None is shown beside `--json` or without a terminal; `advance` does nothing then.
 
     Parameters
     ----------

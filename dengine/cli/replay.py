@@ -416,8 +416,8 @@ def _replay_files(
 ) -> Iterator[tuple[str, Any]]:
     """Yield (file name, content) of what `--out` keeps.
 
-    These are the CSV of all replays, their curves, and a map of the first replay of each contender
-    that embeds.
+    These are the CSV of all replays, their curves, and a map of the first replay of each recipe; a
+    baseline embeds no traces and has none.
     """
     import numpy as np
 
@@ -438,8 +438,8 @@ def _replay_files(
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
-    """Return a label for a replay in figures: its contender and the settings that vary in the
-    frame, with commas between.
+    """Return a label for a replay in figures: the name of its recipe or baseline, and the settings
+    that vary in the frame, with commas between.
     """
     policy = replay.recipe.policy
     settings = {
@@ -525,9 +525,10 @@ def costs(
     Shows what a part of your recordings costs under the policies that pay most, and where
     everything is verified; and says how certain that is, and how to set the policy. If none pays,
     or may pay, the choice is to verify everything, and no policy to set is named. It tries levels
-    of LB, the --lower-bound, around break-even, and the guarantees pooled and cost. All costs are
-    in one unit, such as seconds of production or money. Ctrl-C, or an error in a replay, ends it
-    and shows what was finished, if at least two shuffles were.
+    of LB, the --lower-bound, around break-even, where accepting costs as much as verifying, and the
+    guarantees pooled and cost. All costs are in one unit, such as seconds of production or money.
+    Ctrl-C, or an error in a replay, ends it and shows what was finished, if at least two shuffles
+    were.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of

@@ -418,8 +418,8 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
     imported. If a line was changed or is missing, the lines before it are imported and the others
     are set aside, with exit code 1. A file that is no journal, has a line that cannot be read, or
-    belongs to another model is refused as a whole. The verb is refused while an engine runs on the
-    cell.
+    belongs to another model (unless --any-model) is refused as a whole. The verb is refused while
+    an engine runs on the cell.
     """
     from ..export.cell_journal import import_journal
 

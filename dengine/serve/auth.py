@@ -316,8 +316,8 @@ def _limit_body(receive: Receive, access: Access) -> Receive:
     deadline = asyncio.get_running_loop().time() + access.body_seconds
 
     async def receive_body() -> Message:
-        """Return the next message; count the body's bytes and raise Refusal for too many or too
-        late.
+        """Return the next message; count the body's bytes and raise Refusal for too many (413) or
+        too late ones (408).
         """
         nonlocal bytes_left, is_incomplete
         if not is_incomplete:  # the next message says that the client disconnected, at any time

@@ -50,7 +50,9 @@ class Connection(AutoHTTPProtocol):
     def connection_made(  # type: ignore[override]  # as of uvicorn's
         self, transport: asyncio.Transport
     ) -> None:
-        """Start the time of the first head; or respond 503 and close if there are too many."""
+        """Start the time of the first head; or respond 503 and close if there are more than
+        `MAX_CONNECTIONS`.
+        """
         super().connection_made(transport)
         self._start_timer()
         if len(self.connections) > MAX_CONNECTIONS:

@@ -179,8 +179,8 @@ class HttpApi:
         with that id gets 409, and a trace of a wrong shape 422.
 
         A body of bytes has the other fields in the query. A decision that is not begun before the
-        deadline is VERIFY, late; one that the store cannot take VERIFY, no_store. 503: the queue is
-        full or the server is closing, nothing was recorded, verify the part.
+        deadline is VERIFY, late; one that the store cannot take is VERIFY, no_store. 503: the queue
+        is full or the server is closing, nothing was recorded, verify the part.
         """
         samples = api.as_samples(trace, channels)
         response = await self.service.decide(samples, request, part)
@@ -436,13 +436,15 @@ class HttpApi:
         return response_fields("Versions", versions=versions)
 
     async def events(self, limit: Limit = 20) -> Json:
-        """Return the events beside decisions and who caused them, newest first."""
+        """Return the newest events, such as changes by hand, safe modes and faults, and who caused
+        them, newest first.
+        """
         events = await self.service.read(lambda store: store.events.newest(limit))
         return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
         """Server-sent events: hello with the server's version, changed after changes, tick after a
-        silence.
+        silence. They end when the server ends.
         """
 
         async def event_stream() -> AsyncIterator[str]:

@@ -101,8 +101,9 @@ class RobotCalls:
         insertion.
 
         The newest `MAX_PARTS` parts may have pieces of a trace at once; an older part must begin
-        again. A recorder that fails is logged, and `decide_recorded` then verifies the part.
-        Without a recorder only the pieces are begun.
+        again. The recorder records the newest part alone: a recording of an earlier one that was
+        not decided on is dropped. A recorder that fails is logged, and `decide_recorded` then
+        verifies the part. Without a recorder only the pieces are begun.
 
         Parameters
         ----------
@@ -207,8 +208,9 @@ class RobotCalls:
         """Decide on the pieces that `add` took of a part's trace; return a struct as `decide`.
 
         A part that has a decision gets it again. A new decision with an id drops the pieces; after
-        a VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
-        without pieces or for a trace, and ReportError for an id, that the engine does not take.
+        a VERIFY with an empty id, for instance if the queue is full, they stay, so that the call
+        can be repeated. Raises TraceError without pieces or for a trace, and ReportError for an id,
+        that the engine does not take.
         """
         if (stored := await self._find(request)) is not None:
             return stored

@@ -281,7 +281,8 @@ class CellServer(uvicorn.Server):
 
         The first one is logged, ends the listening to changes and lets uvicorn finish; a second
         SIGINT makes it wait no longer. uvicorn would raise the signals again after the end, which
-        would change the exit code. In another thread than the main one nothing is handled.
+        would change the exit code. After the block the earlier handlers act again. In another
+        thread than the main one nothing is handled.
         """
         # Python delivers signals to the main thread alone.
         if threading.current_thread() is not threading.main_thread():
