@@ -42,8 +42,8 @@ from .store import (
 class Verbs(click.Group):
     """A group of verbs that prints an expected error as one line on stderr.
 
-    The exit code is then 1, or 2 for an error that another option avoids. Any other exception
-    passes with its traceback.
+    The exit code is then 1, or 2 for an error that the option `--allow-import` avoids. Any other
+    exception passes with its traceback.
     """
 
     def main(self, *args: Any, **options: Any) -> Any:
@@ -58,12 +58,15 @@ class Verbs(click.Group):
         return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a verb and return its result; raise its expected errors as `click.ClickException`.
+        """Run a verb and return its result; raise its expected errors as `click.ClickException`,
+        exit code 1.
 
-        Expected are DengineError, OSError (but BrokenPipeError) and UnicodeError. Passwords in the
-        messages are masked, also in click's own. The current folder is added to the end of
-        `sys.path`, so that `module:Class` is found there. Ctrl-C ends the process with exit code
-        130.
+        Expected are DengineError, OSError (but BrokenPipeError, which passes) and UnicodeError. An
+        ImportRefusedError, which `--allow-import` avoids, becomes `click.UsageError`, exit code 2.
+        A message is put on one line, and names the options of the command line in place of Python's
+        arguments. Passwords in it are masked, also in click's own messages. The current folder is
+        added to the end of `sys.path`, so that `module:Class` is found there. Ctrl-C ends the
+        process with exit code 130.
         """
         folder = str(Path.cwd())
         if folder not in sys.path:

@@ -221,8 +221,10 @@ def train(
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
     is stored, but never trained on. A store that has been used has its own recipe and seed: leave
     them out, others are refused. Files are brought to the length of its traces. If nothing is new
-    and a version answers, nothing is trained. If the new version is not used, the exit code is 1.
-    Ctrl-C keeps what was imported; the same command continues there.
+    and a version answers, nothing is trained. If training needs more time than the recipe's budget,
+    several retrains follow each other. If the new version is not used, or steps are missing at the
+    end since the budget is too short for one, the exit code is 1. Ctrl-C keeps what was imported;
+    the same command continues there.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

@@ -100,10 +100,10 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
     STORE is the file or URL of an engine's store. The options choose which decisions; --events adds
-    the retrains and events between them. In the table good and bad are the labels that were
-    counted, bound is the interval of the success rate that follows from them, v is the version of
-    the model, and label is what the part turned out to be. `dengine explain` tells more about one
-    decision.
+    the retrains and events since the first of them, or since --since. In the table good and bad are
+    the labels that were counted, bound is the interval of the success rate that follows from them,
+    v is the version of the model, and label is what the part turned out to be. `dengine explain`
+    tells more about one decision.
     """
     from ..history.status import history as read_history
     from ..history.status import read_retrains_and_events
@@ -133,13 +133,13 @@ def _label_text(stored: StoredDecision) -> str:
 
 
 def _model_text(stored: StoredDecision) -> str:
-    """Return what the model alone would have done, "" where that was done."""
+    """Return what the model alone would have done, "" if that is what was done."""
     predicted = stored.decision.predicted
     return "" if predicted is stored.decision.action else predicted.value
 
 
 def _bound_text(stored: StoredDecision) -> str:
-    """Return the interval of the success rate, "-" where there is none."""
+    """Return the interval of the success rate as text, "-" if there is none."""
     text = f"{stored.decision.lower:.2f}-{stored.decision.upper:.2f}"
     return text.replace("nan-nan", "-")
 
@@ -218,9 +218,10 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     """Explain why a decision came out as it did.
 
     The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
-    by the word last. Counts, bound and action are shown as they were recorded. Neighbours are
-    searched again with the version that decided, if the store still has it. The picture shows the
-    trace with its neighbours and with the band that holds 95 % of the known successes.
+    by the word last. The number of a part with several decisions beside rejects is refused, with
+    their ids and exit code 1. Counts, bound and action are shown as they were recorded. Neighbours
+    are searched again with the version that decided, if the store still has it. The picture shows
+    the trace with its neighbours and with the band that holds 95 % of the known successes.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture

@@ -56,14 +56,18 @@ explain_option = _context_flag(EXPLAIN, "Explain the columns below the table.")
 
 
 def legend_or_hint(legend: str) -> str:
-    """Return the legend of a table if `--explain` was given, else a line that names that flag."""
+    """Return the legend of a table if the running verb was given `--explain`, else a line that
+    names that flag.
+    """
     if click.get_current_context().meta.get(EXPLAIN):
         return legend
     return "--explain says what the columns mean."
 
 
 def as_json() -> bool:
-    """Return whether the running verb was given `--json`; then it prints nothing else."""
+    """Return whether the running verb was given `--json`, and prints nothing but JSON; False
+    outside of a verb.
+    """
     context = click.get_current_context(silent=True)
     return context is not None and bool(context.meta.get(JSON))
 
@@ -311,9 +315,10 @@ def certificate_record(certificate: "Certificate") -> Record:
 
 @contextmanager
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar on stderr while the block runs; none beside `--json`.
+    """Show a progress bar on stderr while the block runs; it vanishes at the end.
 
-    Where stderr is no terminal, a line every 30 s says how far the work is.
+    Where stderr is no terminal, a line every 30 s says how far the work is. Beside `--json` nothing
+    is shown, and `advance` does nothing.
 
     Parameters
     ----------
@@ -437,7 +442,9 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
 
 
 def exit_interrupted(*lines: str) -> NoReturn:
-    """Print lines to stderr that say what was kept, and end the process with exit code 130."""
+    """Print lines to stderr that say what was kept, and end the running verb, and so the process,
+    with exit code 130; passwords are masked.
+    """
     for line in lines:
         click.echo(without_password(line), err=True)
     click.get_current_context().exit(INTERRUPTED)

@@ -102,7 +102,7 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
     """Play the tasks with a progress bar; return the finished replays and the time they took.
 
     Ctrl-C or an error ends the work and raises nothing: those that were finished until then are
-    returned.
+    returned, with the error, which the caller passes to `_end`.
     """
     from ..experiments.grid import iterate_replays
 
@@ -131,9 +131,10 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
-    """End the process if an error or Ctrl-C interrupted it; the text says what is shown.
+    """End the verb if an error or Ctrl-C interrupted its replays; for None do nothing.
 
-    Raises the error, without the text if nothing is shown; after Ctrl-C the exit code is 130.
+    After Ctrl-C the text, which says what is shown, is printed to stderr, and the exit code is 130.
+    Any other error is raised; before that the text is printed, too, if something is shown.
     """
     if isinstance(error, KeyboardInterrupt):
         exit_interrupted(text)
@@ -238,8 +239,8 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
     Shows what was decided and how much of it was wrong, over all shuffles, and whether the accepted
-    parts kept to LB. --out writes a CSV file and pictures. Ctrl-C shows the replays that were
-    finished.
+    parts kept to LB, the --lower-bound. --out writes a CSV file and pictures. Ctrl-C, or an error
+    in a replay, ends it and shows the replays that were finished.
     """
     _replay_and_print([choice.make_contender()], {"confirms": [confirm]}, **played)
 
@@ -284,9 +285,10 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Methods are reducers and baselines, under one policy or a grid of policies. Each is shown as by
-    `dengine replay`. umap-learn takes much longer than the others. Ctrl-C shows the replays that
-    were finished.
+    Methods are reducers and baselines, under one policy or a grid of policies: a setting is given
+    as one value, such as --alpha, or as a list to try, such as --alphas, not both. Each is shown as
+    by `dengine replay`. umap-learn takes much longer than the others. Ctrl-C, or an error in a
+    replay, ends it and shows the replays that were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -330,8 +332,8 @@ def _replay_and_print(
 ) -> None:
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
 
-    After Ctrl-C the finished replays are shown, if there are some, and the process ends with exit
-    code 130.
+    After Ctrl-C or an error the finished replays are shown, if there are some. Then the process
+    ends with exit code 130, or the error is raised.
     """
     from ..experiments import tables
     from ..experiments.grid import grid_tasks
@@ -407,8 +409,8 @@ def _replay_files(
 ) -> Iterator[tuple[str, Any]]:
     """Yield (file name, content) of what `--out` keeps.
 
-    These are the CSV of all replays, their curves, and a map of the first replay of each contender
-    that embeds.
+    These are the CSV of all replays, their curves, and a map of the first replay of each recipe; a
+    baseline embeds no traces and has none.
     """
     import numpy as np
 
@@ -429,8 +431,8 @@ def _replay_files(
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
-    """Return a label for a replay in figures: its contender and the settings that vary in the
-    frame, with commas between.
+    """Return a label for a replay in figures: the name of its recipe or baseline, and the settings
+    that vary in the frame, with commas between.
     """
     policy = replay.recipe.policy
     settings = {
@@ -514,9 +516,12 @@ def costs(
     """Find the policy that pays by three prices.
 
     Shows what a part of your recordings costs under the policies that pay most, and where
-    everything is verified; and says how certain that is, and how to set the policy. It tries levels
-    of LB around break-even, and the guarantees pooled and cost. All costs are in one unit, such as
-    seconds of production or money. Ctrl-C shows what was finished.
+    everything is verified; and says how certain that is, and how to set the policy. If none pays,
+    or may pay, the choice is to verify everything, and no policy to set is named. It tries levels
+    of LB, the --lower-bound, around break-even, where accepting costs as much as verifying, and the
+    guarantees pooled and cost. All costs are in one unit, such as seconds of production or money.
+    Ctrl-C, or an error in a replay, ends it and shows what was finished, if at least two shuffles
+    were.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of
@@ -537,7 +542,9 @@ def costs(
     error: BaseException | None = None
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
-        """Play tasks with a progress bar; return those that were finished."""
+        """Play tasks with a progress bar; return the finished replays, and keep what interrupted
+        them in `error`.
+        """
         nonlocal error
         played = _play_tasks(dataset, tasks, stream)
         error = played.error
@@ -582,7 +589,10 @@ def costs(
 
 
 def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
-    """Return the sentences below the table of a cost curve."""
+    """Return the sentences below the table of a cost curve: what was chosen, and how that depends
+    on the prices; repeated recordings, policies that the first shuffles left behind, and those not
+    tried.
+    """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset
 
@@ -599,7 +609,7 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
 
 
 def _as_flags(settings: Options) -> str:
-    """Return settings of a policy as options of the command line."""
+    """Return settings of a policy as options of the command line, in one text: --alpha 0.1 ..."""
     texts = {
         name: ",".join(f"{price:g}" for price in value) if name == "prices" else str(value)
         for name, value in settings.items()

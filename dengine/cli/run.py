@@ -124,7 +124,8 @@ def run(
     traces look like nothing known, every part is verified until fresh evidence shows otherwise:
     safe mode. --shadow stays in force in the store, until `dengine policy STORE --shadow off`. At
     the end a table shows what was decided, what was wrong and what was saved. Ctrl-C or SIGTERM
-    ends the run after the current cycle and shows what was done; a second one ends it at once.
+    ends the run after the current cycle and shows what was done; a second one ends it at once. If
+    the cell fails, what was done is shown, too, and the exit code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")
@@ -182,8 +183,9 @@ def run(
 def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
     """Let the engine drive the cell with a progress bar, and return what was done.
 
-    It ends after `cycles`, at Ctrl-C or SIGTERM, or when the cell fails, whose error is returned
-    and not raised. When safe mode begins or ends, a line is printed to stderr, unless `--json`.
+    It ends after `cycles`, at Ctrl-C or SIGTERM, or when the cell fails, whose CellError is
+    returned and not raised; other errors are raised. When safe mode begins or ends, a line is
+    printed to stderr, unless `--json`.
     """
     from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 
@@ -224,13 +226,14 @@ def _simulated_cell(
     """Return what makes the simulated cell.
 
     Its seed, which grows with the decisions in the store and differs between the cells of a
-    product, gives parts that the store has not seen. A verification takes `check_seconds` of
-    simulated time.
+    product, which share labels, gives parts that the store has not seen. A verification takes
+    `check_seconds` of simulated time.
     """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
+        """Return the simulated cell for this engine's store, and its name."""
         store = engine.store
         # Another seed for a resumed run: the same parts again would be counted twice.
         seed = engine.seed + store.decisions.counts()["decisions"]
@@ -251,7 +254,8 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     played before.
 
     Played before are parts whose trace has a label of this cell in the store, and its newest
-    accepted part without a report. SettingError is raised where fewer parts than `cycles` are left.
+    accepted part without a report. The recording is loaded at once. Making the cell raises
+    SettingError if fewer parts than `cycles` are left.
     """
     import numpy as np
 
@@ -261,6 +265,9 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     dataset = source.load()
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
+        """Return the rest of the recording as a cell, and its name; SettingError if too few parts
+        are left.
+        """
         store = engine.store
         # By the content of the traces: the store's own hash is one number for a part that comes
         # twice.
@@ -403,8 +410,9 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
 def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
     """Return a table row, title -> cell, for the counts of a stretch of cycles.
 
-    Columns that say nothing in the whole run, whose counts are `total`, are left out: parts outside
-    a window, and parts per hour.
+    Two columns are left out if they say nothing in the whole run, whose counts are `total`: parts
+    outside the force limits, if there were none, and good parts per hour, if the cell tells no
+    time.
     """
     cells = {
         "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",

@@ -138,9 +138,10 @@ def serve(
     """Answer robots, controllers and people.
 
     Continues with its store, or starts a new one, and retrains in a separate process. It runs until
-    SIGTERM or Ctrl-C, which end it in order: requests in line are answered, and everything known is
-    written. --demo plays recorded parts as a robot would, in a new --store, or without one in a
-    store that is forgotten, with a deadline of 5 s or more. Without --token-file, programs on the
+    SIGTERM or Ctrl-C, which end it in order, with exit code 0: requests in line are answered, and
+    everything known is written. --shadow stays in force in the store, until `dengine policy STORE
+    --shadow off`. --demo plays recorded parts as a robot would, in a new --store, or without one in
+    a store that is forgotten, with a deadline of 5 s or more. Without --token-file, programs on the
     same machine need no token. Other machines reach it only with --host, which needs --token-file,
     and should have --cert and --key. --samples, --rate-hz, --unit, --channels and --fit are the
     contract of traces; without them a new store takes the form of its first trace, whose rate and
@@ -200,8 +201,8 @@ def _open_engine(
 ) -> "DataEngine":
     """Open the engine that the server drives, or create it with its store, and return it.
 
-    It logs when safe mode begins or ends. With `shadow` the shadow mode is turned on, and the store
-    keeps that.
+    The engine logs when safe mode begins or ends. With `shadow` the shadow mode is turned on, and
+    the store keeps that.
     """
     from ..engine.engine import DataEngine
     from ..serve.server import log_safe_mode

@@ -94,7 +94,7 @@ def status(store: str, last: int, check_seconds: float) -> None:
 def _overview_table(store: str, report: "Status") -> Any:
     """Return a rich Table of counts and shares, a row for each, false accepts first.
 
-    It has a column for the newest decisions and one for all.
+    It has a column for the newest decisions and one for all since the store was made.
     """
     spans = (report.newest, report.ever)
     names = [field.name for field in fields(report.ever)]

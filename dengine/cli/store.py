@@ -69,8 +69,9 @@ def _change_and_print(
     """Open the store's engine, let `change` change it for the author, and print what changed.
 
     `change` returns a `Changed`, which says so in words; the other arguments are `store_options`.
-    The engine is closed before that is printed. The JSON document also has the policy and the
-    certificate after the change.
+    The engine is closed before that is printed. If nothing changed, that is printed. Raises
+    StoreError if another engine owns the cell, as while it runs, and what `change` raises. The JSON
+    document also has the policy and the certificate after the change.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -98,8 +99,9 @@ def report(part: str, label: str, **changing: Any) -> None:
     The part is named by its number, if it has one decision beside rejects, or by that decision's
     id. An accepted part that was bad is a line stop; a rejected one that was examined afterwards is
     an inspection, and the engine trains on its label. An event records it. The same label again
-    changes nothing. A wrong label is put right by `dengine correct`. A store that names a reducer
-    or rule of your own, module:Class, needs --allow-import.
+    changes nothing. Another label than the reported one is refused with exit code 1, unless it is a
+    line stop; `dengine correct` puts a wrong one right. The verb is refused while an engine runs on
+    the cell. A store that names a reducer or rule of your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -132,7 +134,9 @@ def correct(part: str, label: str, **changing: Any) -> None:
 
     The part is named as for `dengine report`. From now on its decision counts with the corrected
     label. The label as it was reported stays in the store, and so does the decision; the correction
-    is a later row. A correction makes a forgotten label count again.
+    is a later row. A correction makes a forgotten label count again. A label that counts so already
+    changes nothing; a decision without a label is refused. The verb is refused while an engine runs
+    on the cell.
     """
     from ..history.explain import find_decision_id
 
@@ -152,7 +156,9 @@ def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
     """Leave labels out of everything that is learned and counted.
 
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings a label
-    back. If one of the decisions is unknown or has no label, none is forgotten.
+    back. If one of the decisions is unknown or has no label, none is forgotten. A pinned version
+    that was trained with one of them is released. The verb is refused while an engine runs on the
+    cell.
     """
     _change_and_print(
         lambda engine, author: engine.forget(*decisions, author=author, reason=reason), **changing
@@ -166,7 +172,9 @@ def rollback(version: int, **changing: Any) -> None:
     """Use an earlier model version again, as a new version.
 
     Labels that came since are among its references, and corrections count. It is pinned: no
-    automatic retrain replaces it, until `dengine release` or `dengine retrain`.
+    automatic retrain replaces it, until `dengine release` or `dengine retrain`, or until a label
+    that it was trained with is forgotten. A version that is not kept is refused with the numbers of
+    those that are. The verb is refused while an engine runs on the cell.
     """
     _change_and_print(lambda engine, author: engine.rollback(version, author), **changing)
 
@@ -174,7 +182,10 @@ def rollback(version: int, **changing: Any) -> None:
 @verb("dengine release engine.db")
 @store_options
 def release(**changing: Any) -> None:
-    """Let retrains replace a pinned version again."""
+    """Let retrains replace a version again that `dengine rollback` pinned.
+
+    If none is pinned, nothing changes. The verb is refused while an engine runs on the cell.
+    """
     _change_and_print(lambda engine, author: engine.release(author), **changing)
 
 
@@ -188,10 +199,12 @@ def release(**changing: Any) -> None:
 def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:
     """Show the policy in force, or change it.
 
-    What is not given stays as it is. Earlier decisions keep their bounds. The certificate starts
-    again after any change; the rule forgets what it learned after one of the tolerance, such as
-    --alpha, for one that is chosen after the data was seen needs fresh evidence. Shadow mode lasts
-    over restarts; `dengine status` counts what the model would have done, and how much was wrong.
+    Without options it is shown, while an engine may run; a change is refused while an engine runs
+    on the cell. What is not given stays as it is. Earlier decisions keep their bounds. The
+    certificate starts again after any change; the rule forgets what it learned after one of the
+    tolerance, such as --alpha, for one that is chosen after the data was seen needs fresh evidence.
+    Shadow mode lasts over restarts; `dengine status` counts what the model would have done, and how
+    much was wrong.
     """
     if settings:
         _change_and_print(
@@ -218,7 +231,8 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels as they count.
 
     An event records it. The new version replaces a pinned one, too. A candidate that fails its gate
-    is dropped, the previous version stays in use, and the exit code is 1.
+    is dropped, the previous version stays in use, and the exit code is 1. The verb is refused while
+    an engine runs on the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -279,9 +293,10 @@ def verify(
 ) -> None:
     """Check that a store's history is what was written.
 
-    Every row is compared with its checksum, and every entry of the ledger with its rows. What was
-    changed, is missing or was never chained is listed, with exit code 1, and so is data that was
-    lost. Nothing is written but for --acknowledge, and engines may run meanwhile.
+    Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
+    the rows, with its rows. What was changed, is missing or is in no entry is listed, with exit
+    code 1, and so is data that was lost. Nothing is written but for --acknowledge, and engines may
+    run meanwhile.
     """
     from ..store.sql import SqlStore
     from ..store.verification import verify_history
@@ -342,7 +357,8 @@ def backup(store: str, out: Path) -> None:
 
     The copy is one file with all cells and with the contents of the journals that lie beside the
     store, which a plain copy of the file lacks. It can be opened, and checked by `dengine verify`,
-    wherever it is.
+    wherever it is. A store in PostgreSQL is refused (pg_dump copies it), and so is an --out that
+    exists.
     """
     from ..store.backup import backup_store
 
@@ -371,9 +387,10 @@ def backup(store: str, out: Path) -> None:
 def restore(copy: str, store: Path) -> None:
     """Put a backup in the place of a store.
 
-    COPY is what `dengine backup` wrote, on this or another machine. It is checked first. Beside the
-    store each cell gets a journal that knows its newest entry; one that is there stays, and the
-    first engine takes from it what the copy lacks.
+    COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if it is
+    not as it was written, or --store exists, it is refused with exit code 1. Beside the store each
+    cell gets a journal that knows its newest entry; one that is there stays, and the first engine
+    takes from it what the copy lacks.
     """
     from ..store.backup import restore_store
 
@@ -400,7 +417,9 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
 
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
     imported. If a line was changed or is missing, the lines before it are imported and the others
-    are set aside, with exit code 1.
+    are set aside, with exit code 1. A file that is no journal, has a line that cannot be read, or
+    belongs to another model (unless --any-model) is refused as a whole. The verb is refused while
+    an engine runs on the cell.
     """
     from ..export.cell_journal import import_journal
 

@@ -107,8 +107,9 @@ def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[St
     """Return a msgspec struct type with a field for each parameter of a handler but **keywords.
 
     A parameter with a default may be left out of a request. So may the `optional_fields`, given as
-    types by name; they are UNSET then. Unknown fields are refused. In a request the parameter `id_`
-    is named `id`. The handler's docstring is the type's.
+    types by name; they are UNSET then. Unknown fields are refused. Underscores at the end of a
+    parameter's name are left out in a request: `id_` is `id` there. The handler's docstring is the
+    type's.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
@@ -131,7 +132,9 @@ def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[St
 
 
 def media_type(request: Request) -> str:
-    """Return the media type of a request's body without parameters; "" without one."""
+    """Return the media type of a request's body in lower case, without parameters; "" if the
+    request names none.
+    """
     return request.headers.get("content-type", "").partition(";")[0].strip().lower()
 
 
@@ -207,7 +210,8 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
     Returns
     -------
     array of float32
-        Of shape (channels, T) from bytes and nested lists, (T,) from a flat list.
+        Of shape (channels, T) from bytes and nested lists, (T,) from a flat list. From bytes it is
+        a view of them, which cannot be written to.
 
     Raises
     ------
@@ -245,7 +249,9 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
 def _look_like_float64(words: NDArray[np.float32]) -> bool:
     """Return whether float32 words are more likely halves of float64 numbers, low half first.
 
-    The low halves are then the ends of fractions: bits at random, or zeros. False for fewer than
+    The low halves are then the ends of fractions: bits at random, or zeros. So it is True if all of
+    them are zero and some high half is not, or if at least `LARGE_SHARE` of all words are low
+    halves more than `LARGE_FACTOR` times as large as the largest high half. False for fewer than
     `MIN_WORDS` words and for an odd number.
     """
     if len(words) % 2 or len(words) < MIN_WORDS:
@@ -269,7 +275,8 @@ def _response_type(
     """Make the struct type of a response, named `name`.
 
     It has the record's fields with their types as in JSON, except those in `without`, and the
-    fields of `more`, types by name. Its description is `about` and the record's docstring.
+    fields of `more`, types by name, which replace the record's. Its description is `about` and the
+    record's docstring.
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
@@ -420,8 +427,8 @@ RESPONSES = {
 def response_fields(name: str, record: object = None, **more: Any) -> Json:
     """Return the fields of the response type `name` as a dict for JSON.
 
-    Their values come from `more`, else from the record; fields without a value, and values without
-    a field, are left out.
+    Their values come from `more`, as they are, else from the record, as `to_jsonable` converts it;
+    fields without a value, and values without a field, are left out.
     """
     values = (to_jsonable(record) or {}) | more
     return {key: values[key] for key in RESPONSES[name].__struct_fields__ if key in values}

@@ -150,8 +150,8 @@ def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
     """Return whether a request's `Host` header names this server.
 
     It must be localhost, any IP address, or one of `names`, in upper or lower case, with or without
-    a port. A web page whose own name was made to resolve to this machine (DNS rebinding) sends
-    another name.
+    a port. A header that is missing or malformed does not name it. A web page whose own name was
+    made to resolve to this machine (DNS rebinding) sends another name.
     """
     if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
         return False
@@ -223,7 +223,11 @@ class Guard:
         self._named: set[str] = set()  # clients whose wrong token was logged
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass an allowed request on to the application, or answer it with the refusal."""
+        """Pass an allowed request on to the application, or answer it with the refusal.
+
+        What is no HTTP request, like the application's start and end, passes unchecked. The body of
+        an allowed request is limited while the application reads it, by `_limit_body`.
+        """
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -239,11 +243,12 @@ class Guard:
             await self.app(scope, _limit_body(receive, self.access), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
-        """Raise Refusal for a request that is not allowed; else note its token for the handlers.
+        """Raise Refusal for a request that is not allowed; else set its token as `CURRENT_TOKEN`,
+        for the handlers.
 
-        In this order it checks the host name (421), the token (`_check_token`), the site that a
-        change comes from (403), and the announced length of the body (413). A token in the path is
-        removed from the scope.
+        In this order it checks the host name (421), the token (`_check_token`), the site whose web
+        page sends a request that may change something (403), and the announced length of the body
+        (413). A token in the path is removed from the scope.
         """
         headers = Headers(scope=scope)
         host = headers.get("host")
@@ -311,8 +316,8 @@ def _limit_body(receive: Receive, access: Access) -> Receive:
     deadline = asyncio.get_running_loop().time() + access.body_seconds
 
     async def receive_body() -> Message:
-        """Return the next message; count the body's bytes and raise Refusal for too many or too
-        late.
+        """Return the next message; count the body's bytes and raise Refusal for too many (413) or
+        too late ones (408).
         """
         nonlocal bytes_left, is_incomplete
         if not is_incomplete:  # the next message says that the client disconnected, at any time

@@ -50,7 +50,9 @@ class Connection(AutoHTTPProtocol):
     def connection_made(  # type: ignore[override]  # as of uvicorn's
         self, transport: asyncio.Transport
     ) -> None:
-        """Start the time of the first head; or respond 503 and close if there are too many."""
+        """Start the time of the first head; or respond 503 and close if there are more than
+        `MAX_CONNECTIONS`.
+        """
         super().connection_made(transport)
         self._start_timer()
         if len(self.connections) > MAX_CONNECTIONS:
@@ -60,7 +62,7 @@ class Connection(AutoHTTPProtocol):
             )
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Stop the timer."""
+        """Stop the timer of the head, since the connection has ended."""
         self._stop_timer()
         super().connection_lost(exc)
 
@@ -89,7 +91,7 @@ class Connection(AutoHTTPProtocol):
         """Note that the client sends no more; respond 400 if it stopped in the middle of a head.
 
         Returns True while a request is being answered, so that asyncio keeps the connection open
-        for the response.
+        for the response; False lets asyncio close it.
         """
         self._client_finished = True
         if self._head_bytes:
@@ -103,7 +105,9 @@ class Connection(AutoHTTPProtocol):
             self.transport.close()
 
     def send_400_response(self, msg: str) -> None:
-        """Respond to bytes that are not HTTP."""
+        """Respond 400 to bytes that are not HTTP, and close the connection; uvicorn's `msg` is not
+        sent.
+        """
         self._respond_and_close(HTTPStatus.BAD_REQUEST, "Expected an HTTP/1.1 request.")
 
     def _respond_and_close(self, status: HTTPStatus, detail: str) -> None:

@@ -57,8 +57,9 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
 
     Reported are the recorded results of verified parts, and failures of accepted ones. The first
     `N_FAST` parts have no pause, but each waits for a retrain under way; the later ones come at
-    `speed` parts per second. A part, or a report, for which the queue is full is left out. Any
-    other exception is logged and ends the demonstration, not the server.
+    `speed` parts per second. A part, or a report, for which the queue is full is left out. A log
+    line says when all parts were played. Any other exception is logged and ends the demonstration,
+    not the server.
     """
     loop = asyncio.get_running_loop()
     run = uuid.uuid4().hex[:8]

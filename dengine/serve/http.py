@@ -176,11 +176,11 @@ class HttpApi:
         channels: Annotated[int, Meta(ge=1, le=99_999, description="Of bytes.")] = 1,
     ) -> Json:
         """Decide on a trace. The same trace and request id get the same decision; another trace
-        with that id gets 409.
+        with that id gets 409, and a trace of a wrong shape 422.
 
         A body of bytes has the other fields in the query. A decision that is not begun before the
-        deadline is VERIFY, late; one that the store cannot take VERIFY, no_store. 503: the queue is
-        full or the server is closing, nothing was recorded, verify the part.
+        deadline is VERIFY, late; one that the store cannot take is VERIFY, no_store. 503: the queue
+        is full or the server is closing, nothing was recorded, verify the part.
         """
         samples = api.as_samples(trace, channels)
         response = await self.service.decide(samples, request, part)
@@ -204,8 +204,8 @@ class HttpApi:
         """Report the outcome of a part. The label is on disk when the response comes.
 
         The same report twice is no error, a different one is 409; but `false` for an accepted part
-        that counts as good is a late line stop, and corrects that. With an author, or a token that
-        has a name, a new label is an event, too.
+        that counts as good is a late line stop, and corrects that. An unknown id or part is 404.
+        With an author, or a token that has a name, a new label is an event, too.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -231,7 +231,8 @@ class HttpApi:
     ) -> Json:
         """Correct a label, from the next decision on, and return what changed.
 
-        What was reported stays on record. A forgotten label counts again.
+        What was reported stays on record. A forgotten label counts again. If the label counts so
+        already, nothing changes. 404: an unknown id or part; 422: it has no label.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -246,7 +247,8 @@ class HttpApi:
     ) -> Json:
         """Leave labels out of training and of all counts, and return what changed.
 
-        /correct takes one in again. If one id is unknown, or has no label, none is forgotten.
+        /correct takes one in again. If one id is unknown (404), or has no label (422), none is
+        forgotten. A pinned version that was trained with one of them is released.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -259,18 +261,22 @@ class HttpApi:
         author: Author = "",
     ) -> Json:
         """Let an earlier version of the model decide again, as a new version, and pin it: no
-        automatic retrain replaces it, until /release or /retrain.
+        automatic retrain replaces it, until /release or /retrain, or until /forget of a label that
+        it was trained with. 404: a version that is not kept.
         """
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
 
     async def release(self, author: Author = "") -> Json:
-        """Let retrains replace a pinned version again."""
+        """Let retrains replace a version again that /rollback pinned; if none is pinned, nothing
+        changes.
+        """
         return await self._change(author, lambda engine, by: engine.release(by))
 
     async def policy(self, author: Author = "", **changes: Any) -> Json:
         """Change settings of the policy, from the next decision on; shadow verifies every part.
 
-        Settings that are left out stay as they are. Many changes start the decision rule anew.
+        Settings that are left out stay as they are. Many changes start the decision rule anew, so
+        that it learns from later parts only. 422: a value that a setting cannot have.
         """
         return await self._change(
             author, lambda engine, by: engine.set_policy(engine.policy.changed(**changes), by)
@@ -280,7 +286,8 @@ class HttpApi:
         """Begin a retrain, which is an event, and do not wait for its end; it replaces a pinned
         version, too.
 
-        If one is under way, the response says so, and nothing is begun or recorded.
+        If one is under way, the response says so, and nothing is begun or recorded. Whether the new
+        version was taken stands in /versions afterwards.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -347,7 +354,7 @@ class HttpApi:
         id_: Id,
         trace: Annotated[bool, Meta(description="Include its samples.")] = False,
     ) -> Json:
-        """Return one decision with its label."""
+        """Return one decision with its label; 404 for an unknown id."""
         stored = await self._find(id_)
         return response_fields("Decision", stored, trace=stored.trace if trace else None)
 
@@ -364,8 +371,8 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return decisions without their traces, newest first, and in `older` where the next page
-        begins, null without one.
+        """Return decisions without their traces, newest first, and in `older` the id that `before`
+        takes for the next page, null if none are left. An unknown `before` is 404.
 
         since and until are times in seconds since 1970; the first is included, the last is not.
         predicted is what the model alone would have done. part is a part's number.
@@ -384,7 +391,9 @@ class HttpApi:
     async def explanation(
         self, id_: Annotated[str, Meta(description="Of the decision, or its part's number.")]
     ) -> Json:
-        """Explain a decision, with its trace, the band of good parts, and the newest bad parts."""
+        """Explain a decision, with its trace, the band of good parts, and the newest bad parts.
+        404: an unknown id or part; 409: a part with several decisions.
+        """
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
     async def course(
@@ -394,7 +403,8 @@ class HttpApi:
         modes meanwhile.
 
         A stretch is a shift, a batch, or without these a share of the decisions, 20 or more, the
-        newest perhaps fewer. The newest 120 stretches are returned.
+        newest perhaps fewer. The newest 120 stretches are returned. 422: hours below one second,
+        unless 0.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,
@@ -426,13 +436,15 @@ class HttpApi:
         return response_fields("Versions", versions=versions)
 
     async def events(self, limit: Limit = 20) -> Json:
-        """Return the events beside decisions and who caused them, newest first."""
+        """Return the newest events, such as changes by hand, safe modes and faults, and who caused
+        them, newest first.
+        """
         events = await self.service.read(lambda store: store.events.newest(limit))
         return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
         """Server-sent events: hello with the server's version, changed after changes, tick after a
-        silence.
+        silence. They end when the server ends.
         """
 
         async def event_stream() -> AsyncIterator[str]:
@@ -487,7 +499,8 @@ class HttpApi:
         `Changed`.
 
         The result is in the form of the response. Raises Refusal for an author that
-        `_checked_author` does not take.
+        `_checked_author` does not take, BusyError if the queue is full or the service is closing,
+        and what `work` raises.
         """
         by = _checked_author(author)
         changed = await self.service.call(lambda engine: work(engine, by))
@@ -514,8 +527,9 @@ def _read_newest(
 ) -> list[StoredDecision]:
     """Return up to `limit` decisions that `where` selects, newest first, without their traces.
 
-    With `before` only those older than the decision of this id; none if it is unknown. With
-    `unlabelled` only verified ones whose label was never reported; a forgotten label was.
+    With `before` only those older than the decision of this id; the list is empty if the id is
+    unknown. With `unlabelled` only verified ones whose label was never reported, whatever `where`
+    says of action and label; a forgotten label was reported.
     """
     if unlabelled:
         where = replace(where, action=Action.VERIFY, label="none")

@@ -155,8 +155,8 @@ class TokenUsers(UserManager):
     ) -> User | None:
         """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        None without a certificate where the server encrypts, and for a wrong user name or token,
-        where it has tokens.
+        It is None without a certificate if the server encrypts, and for a wrong user name or token
+        if it has tokens.
         """
         if self._encrypted and not certificate:
             return None
@@ -323,7 +323,13 @@ class AddressSpace:
         return [result[key] for key in ("action", "id", "reason", "lower", "upper", "version")]
 
     async def report(self, decision_id: str, success: bool) -> list[Any]:
-        """Report an outcome, and return `REPORT_RESULTS`."""
+        """Report an outcome, True for good; return a list of one bool, whether the label is on
+        disk.
+
+        It is False for an unknown or empty id, and if the report cannot be stored now. Raises
+        ReportError for a report that contradicts an earlier one, unless it is a line stop after a
+        confirmation.
+        """
         return [await self._calls.report(decision_id, success)]
 
     async def follow_changes(self) -> None:
@@ -356,8 +362,8 @@ class AddressSpace:
     async def write_status(self, status: Mapping[str, Any]) -> None:
         """Write a status, as `RobotCalls.status` returns it, into the variables.
 
-        If the text of the alarm has changed since the last call, send an event, also where it is
-        empty and an alarm has ended.
+        If the text of the alarm has changed since the last call, send an event; an empty text sends
+        the event that the alarm has ended.
         """
         for name, variable in VARIABLES.items():
             if variable.key:

@@ -57,7 +57,9 @@ class RetrainingProcess(Executor):
         self._start()
 
     def _start(self) -> None:
-        """Start a process, and let it import what a retrain needs."""
+        """Start a process, and let it import what a retrain needs; set `ready` to the future of
+        that, and do not wait. The log says when it is ready.
+        """
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _prepare_process)
         other_processes = set(multiprocessing.active_children())
@@ -67,7 +69,11 @@ class RetrainingProcess(Executor):
         (self._process,) = set(multiprocessing.active_children()) - other_processes
 
     def restart(self) -> None:
-        """Kill the process, also at work, and start another; raises OSError where that fails."""
+        """Kill the process, also at work, and start another; raises OSError if that fails.
+
+        Calls that are not done fail. It returns before the new process is ready, for which `ready`
+        is a new future.
+        """
         self.shutdown(wait=False)
         self._start()
 
@@ -119,6 +125,9 @@ class _SharedPickle:
         self._value = value
 
     def __reduce__(self) -> tuple[Any, ...]:
+        """Return what unpickles the value; write its arrays to a new file, which is closed with
+        this object.
+        """
         arrays: list[pickle.PickleBuffer] = []
         take_out = arrays.append if hasattr(os, "memfd_create") else None
         pickled = pickle.dumps(self._value, 5, buffer_callback=take_out)

@@ -97,11 +97,13 @@ class RobotCalls:
         return {name: getattr(self, name) for name in CALLS}
 
     async def begin(self, request: Any = "") -> str:
-        """Begin a new part: forget pieces of its trace, and have the recorder wait for its
+        """Begin a new part: forget what `add` took of its trace, and have the recorder wait for its
         insertion.
 
-        The newest `MAX_PARTS` parts may have pieces at once. A recorder that fails is logged, and
-        `decide_recorded` then verifies the part. Without a recorder only the pieces are begun.
+        The newest `MAX_PARTS` parts may have pieces of a trace at once; an older part must begin
+        again. The recorder records the newest part alone: a recording of an earlier one that was
+        not decided on is dropped. A recorder that fails is logged, and `decide_recorded` then
+        verifies the part. Without a recorder only the pieces are begun.
 
         Parameters
         ----------
@@ -203,11 +205,12 @@ class RobotCalls:
         return await self.decide_array(as_samples(trace), request, part)
 
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
-        """Decide on the pieces of a part's trace; return action, id, reason, bounds and version.
+        """Decide on the pieces that `add` took of a part's trace; return a struct as `decide`.
 
         A part that has a decision gets it again. A new decision with an id drops the pieces; after
-        a VERIFY with an empty id they stay, so that the call can be repeated. Raises TraceError
-        without pieces or for a trace, and ReportError for an id, that the engine does not take.
+        a VERIFY with an empty id, for instance if the queue is full, they stay, so that the call
+        can be repeated. Raises TraceError without pieces or for a trace, and ReportError for an id,
+        that the engine does not take.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -277,15 +280,19 @@ class RobotCalls:
             return result
 
     async def action(self, trace: Any, request: Any, part: Any = "") -> int:
-        """Return only the action of `decide`, for a controller without structs."""
+        """Return only the action of `decide` (0 verify, 1 accept, 2 reject), for a controller
+        without structs.
+
+        `report` needs the id, which is therefore the caller's own.
+        """
         return int((await self.decide(trace, request, part))["action"])
 
     async def action_added(self, request: Any, part: Any = "") -> int:
-        """Return only the action of `decide_added`."""
+        """Return only the action of `decide_added`: 0 verify, 1 accept, 2 reject."""
         return int((await self.decide_added(request, part))["action"])
 
     async def action_recorded(self, request: Any, part: Any = "") -> int:
-        """Return only the action of `decide_recorded`."""
+        """Return only the action of `decide_recorded`: 0 verify, 1 accept, 2 reject."""
         return int((await self.decide_recorded(request, part))["action"])
 
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:

@@ -141,7 +141,10 @@ class ServerOptions:
 
     @property
     def access(self) -> Access:
-        """What the server allows.
+        """What the server allows; each access reads the token file again.
+
+        Beside `allow_hosts`, the address and this machine's name may be used to call a server that
+        other machines reach.
 
         Raises SettingError for a token file that cannot be used, and for an address that other
         machines can reach without one.
@@ -158,6 +161,9 @@ class ServerOptions:
     def started_beside(self, access: Access) -> list[Beside]:
         """Return the OPC UA server, as `create_app` starts it, in a list; an empty one if it is
         off.
+
+        The operators' tokens are its passwords; a viewer's token is none, since whoever may read
+        over OPC UA may also call.
         """
         if self.opcua is None:
             return []
@@ -275,7 +281,8 @@ class CellServer(uvicorn.Server):
 
         The first one is logged, ends the listening to changes and lets uvicorn finish; a second
         SIGINT makes it wait no longer. uvicorn would raise the signals again after the end, which
-        would change the exit code. In another thread than the main one nothing is handled.
+        would change the exit code. After the block the earlier handlers act again. In another
+        thread than the main one nothing is handled.
         """
         # Python delivers signals to the main thread alone.
         if threading.current_thread() is not threading.main_thread():

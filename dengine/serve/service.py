@@ -193,7 +193,8 @@ class CellService:
     async def decide(
         self, trace: ArrayLike, request: str | None = None, part: PartNumber = None
     ) -> ServiceResponse:
-        """Decide on a trace, in the engine's thread or, where nothing has to wait, at once.
+        """Decide on a trace, in the engine's thread or, if nothing has to wait, at once in this
+        one.
 
         Parameters
         ----------
@@ -217,7 +218,8 @@ class CellService:
         Raises
         ------
         TraceError
-            For a wrong shape, a part's number that is none, or an id that belongs to another trace.
+            For a wrong shape, a first trace of less than 10 samples, a part's number that is none,
+            or an id that belongs to another trace.
         ReportError
             For an id that is no id.
         StoreError
@@ -355,7 +357,9 @@ class CellService:
         return await asyncio.to_thread(work, self.read_store)
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Return the status, as `DataEngine.status`; the engine's thread only flushes for it."""
+        """Return the status, as `DataEngine.status`; the engine's thread only flushes for it.
+        Raises BusyError and StoreError like `read`.
+        """
         stored = await self.read(lambda store: status(store, last, watching))
         return self.engine.state.complete(stored)
 
@@ -436,7 +440,9 @@ class CellService:
         return job.future
 
     def _notify_observers(self, response: T) -> T:
-        """Pass a response or a retrain to all observers, log a retrain, and return the argument."""
+        """Pass a response or a retrain to all observers, log a retrain, and return the argument.
+        What an observer raises is raised.
+        """
         # Decisions and reports are in the store: only a retrain needs a line of the log.
         if isinstance(response, RetrainReport):
             log.info(
