@@ -86,8 +86,9 @@ class RadiusNeighbours(nn.Module):
         action : int
             0 verify, 1 accept, 2 reject.
         lower, upper : float
-            Bound on the success probability, from the counts; if `scored`, both are the mean of the
-            first axis over the K spaces, and the action follows from it.
+            Bound on the success probability, from the counts. If `scored`, both are the mean of the
+            first axis over the K spaces, drawn towards 1/2 by the rule's `prior_labels` (`fade`),
+            and the action follows from it.
         n_success, n_failure : int
             Labels within the radius; several of one part may count as fewer.
         """

@@ -72,10 +72,12 @@ class Peers:
         return self._clock() - self._asked >= NEWS_SECONDS
 
     def fetch_news(self) -> tuple[ProductNews, bool]:
-        """Ask the store for what is new in the product: labels, a version, corrections.
+        """Ask the store for what is new in the product, the cells that share labels and versions.
+
+        That is labels, a version, corrections.
 
         Returns the news, with at most `MOST` labels after the training window's newest, this cell's
-        among them, and whether it names a newer version than the one that answers; one that could
+        among them, and whether it names a newer version than the one in force; one that could
         not be taken over does not count. Where there is a new version or label, the store is
         checked, which may set the outbox's `integrity_error`. Raises StoreError where the store
         gives no answer in time.

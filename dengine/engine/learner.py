@@ -367,10 +367,11 @@ class Learner:
     # A candidate
 
     def _advance(self, candidate: Candidate, to_the_end: bool) -> None:
-        """Bring the candidate a step further, or with `to_the_end` through all steps.
+        """Bring the candidate, a trained version that does not answer yet, a step further.
 
-        A candidate that cannot be stored is dropped. One that is stored waits for a later call
-        where the newest labels cannot be stored; that is logged.
+        With `to_the_end` it takes all steps of `_see_through`. A candidate that cannot be stored is
+        dropped. A candidate that is stored waits for a later call if the newest labels cannot be
+        stored, which is logged.
         """
         candidate.begin_work()
         try:

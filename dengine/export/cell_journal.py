@@ -96,8 +96,9 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
 
     Rejected parts, and verified ones without a label, are left out. An accepted part whose label
     came late is there twice. The first line whose checksum does not fit, and all lines after it,
-    are set aside without an error; `set_aside` says so, or that the journal lacks lines that
-    FILE.head knows of. A warning is logged if FILE.head is missing.
+    are set aside without an error; `set_aside` says so, or that lines are missing at the end, which
+    FILE.head (the number of lines and the last checksum) tells. If FILE.head is missing or cannot
+    be read, a warning is logged.
 
     Parameters
     ----------

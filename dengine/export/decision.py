@@ -250,7 +250,8 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make an earlier decision, as a journal has it, the pending one again.
 
-        A pending accept is settled first, another pending decision forgotten. The trace (T,) or
+        A pending accept is settled first (`settle`: learned as good, or counted as unreported);
+        another pending decision is forgotten. The trace (T,) or
         (C, T) is embedded anew, with the fields of the decision as they are given; `part` is a
         hash, 0 if unknown, and `predicted` follows from the others. A faulty trace leaves none
         pending. Raises ValueError, compiled torch.jit.Error, for another shape.

@@ -203,11 +203,10 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 
 
 def _as_key(value: object) -> object:
-    """Return what a function or a container among the attributes is compared by, else None.
+    """Return what `structure_of` compares of a module's attribute; None if it makes no difference.
 
-    That is the function itself, since another may get its address later, or the type of a list,
-    tuple or dict with its items: of a constant its text, of a tensor its shape. TorchScript does
-    not take anything else.
+    That is a function itself (not its address, which another may get later), or the type of a list,
+    tuple or dict with its items: of a constant its text, of a tensor its shape.
     """
     if isinstance(value, FUNCTIONS):
         return value

@@ -253,7 +253,10 @@ class ConvReducer(TorchReducer):
         return super().get_state() | rocket
 
     def set_state(self, state: Arrays) -> Self:
-        """As `TorchReducer.set_state`, with `rocket_`; StoreError for a state without one."""
+        """As `TorchReducer.set_state`, also for the inner reducer `rocket_`.
+
+        Raises StoreError for a state without one, as an older conv stored it.
+        """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone
             raise incompatible_model_error("conv has no rocket beside its network")

@@ -374,8 +374,10 @@ class RobotCalls:
         }
 
     async def _find(self, request: Any) -> Struct | None:
-        """Return the struct of the decision that a request has; None without one, or if it cannot
-        be read. Raises ReportError for an id that is no id.
+        """Return a request's decision as the struct that the robot gets.
+
+        None if there is none, or if the store is busy or fails. Raises ReportError for an id that
+        is none.
         """
         try:
             stored = await self._service.find(as_id(request))

@@ -218,11 +218,12 @@ class Drainer:
                 self.drain()
 
     def _run(self) -> None:
-        """Drain synced records and make submitted calls until stopped.
+        """Copy synced records to the database and make submitted calls, until stopped.
 
-        Before a call everything synced is drained, if the database takes it; the call is made in
+        Before a call everything synced is copied, if the database takes it; the call is made in
         either case. An error of the database is logged once and kept for `fault`; a second later
-        the database is tried again.
+        the database is tried again. Once stopped, it ends when all waiting calls are made and the
+        synced records are copied, or the database refuses them.
         """
         while True:
             call = self._wait_for_work()
