@@ -526,10 +526,9 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
 
     The estimate rests on the reported outcomes of the unaudited parts if all of them are known;
     under `stops="all"` (every bad part stops the line) if any is, without those that are still
-    open. Otherwise it
-    rests on the audits, whose coin knows no outcome, so that they speak for all parts. Line stops
-    count besides the audits: the lower end is at least the one that follows if all other parts were
-    good, and the upper end at least the share of line stops.
+    open. Otherwise it rests on the audits, whose coin knows no outcome, so that they speak for all
+    parts. Line stops count besides the audits: the lower end is at least the one that follows if
+    all other parts were good, and the upper end at least the share of line stops.
 
     Parameters
     ----------
