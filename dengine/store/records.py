@@ -32,7 +32,7 @@ from ..errors import (
     shortened,
 )
 from ..files import FilePath, read_archive
-from ..records import Action, Decision, RetrainReport, Source, TraceArray
+from ..records import Action, Arrays, Decision, RetrainReport, Source, State, TraceArray
 
 # Kinds of events.
 SAFE_MODE_BEGAN = "safe mode"
@@ -48,8 +48,6 @@ LOSS_REMEDY = (
 T = TypeVar("T")
 Clock = Callable[[], float]  # returns the time, in seconds since 1970
 Row = dict[str, Any]  # the values of a row, by column
-State = dict[str, NDArray[Any]]  # the arrays of a version, by name
-Arrays = Mapping[str, NDArray[Any]]  # the same, only read
 LabelNumbers = list[tuple[str, int]]  # ids of decisions, with the numbers of their labels
 EntryName = tuple[int, str]  # number and digest, hexadecimal, of a ledger entry
 NO_TRACE: TraceArray = np.zeros((0, 0), dtype=np.float32)
