@@ -20,6 +20,8 @@ from .errors import ReportError, SettingError, StoreError, expect, instead, shor
 
 PartNumber = str | int | None  # as a caller gives it
 TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
+State = dict[str, NDArray[Any]]  # arrays of a version of the model, by name
+Arrays = Mapping[str, NDArray[Any]]  # the same, only read
 
 
 def is_whole(value: Any, least: int, most: int) -> bool:

@@ -255,16 +255,6 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
         raise click.ClickException(f"The retrain was {report.reason}.")
 
 
-NO_JOURNAL = (
-    "The journal of cell {} is not here: its records are not in this check, and it does not show "
-    "if the newest entries were cut off. A copy that dengine backup made lacks nothing."
-)
-WAITING = (
-    "The journal of cell {} holds {:,} records that are not in the store yet; its engine, or the "
-    "next one, moves them there."
-)
-
-
 @verb("dengine verify engine.db")
 @click.argument("store", metavar="STORE")
 @click.option("--cell", metavar="ID", help="Check this cell alone.  [default: all cells]")
@@ -324,9 +314,16 @@ def _verification_lines(report: HistoryReport) -> list[str]:
             f"{digest}"
         )
         if cell.waiting is None:
-            lines.append(NO_JOURNAL.format(cell.cell_id))
+            lines.append(
+                f"The journal of cell {cell.cell_id} is not here: its records are not in this "
+                "check, and it does not show if the newest entries were cut off. A copy that "
+                "dengine backup made lacks nothing."
+            )
         elif cell.waiting:
-            lines.append(WAITING.format(cell.cell_id, cell.waiting))
+            lines.append(
+                f"The journal of cell {cell.cell_id} holds {cell.waiting:,} records that are not "
+                "in the store yet; its engine, or the next one, moves them there."
+            )
     for fault in report.faults[:MOST_FAULTS]:
         cell_text = fault.cell_id and f"cell {fault.cell_id}:"
         where = " ".join(filter(None, (cell_text, fault.table, fault.key)))

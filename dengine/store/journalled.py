@@ -17,13 +17,13 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from ..errors import NotTakenError, StoreError, log
-from ..records import RetrainReport
+from ..records import Arrays, RetrainReport
 from .draining import Drainer
 from .journal import HEADER, decode_record
 from .lookup import DecisionIndex
 from .outbox import Outbox
 from .recording import RETRY_SECONDS, Recorder
-from .records import DATA_LOST, Arrays, LabelNumbers, NewLabel, StoredDecision
+from .records import DATA_LOST, LabelNumbers, NewLabel, StoredDecision
 from .views import HistoryFilter
 
 if TYPE_CHECKING:

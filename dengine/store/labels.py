@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
-from numpy.typing import NDArray
 
 from ..errors import StoreError, listed
-from ..records import Reason, Source
+from ..records import Reason, Source, TraceArray
 from .cell_table import CellTable
 from .connections import Database
 from .decisions import DecisionTable
@@ -172,7 +171,7 @@ class LabelTable(CellTable):
         shapes, or a label is not 0 or 1.
         """
         labels = {row.seq: row for row in rows}  # the forgotten are not among them
-        traces: dict[int, NDArray[np.float32]] = {}
+        traces: dict[int, TraceArray] = {}
         is_of_label = (TRACE.c.cell_id == LABEL.c.cell_id) & (
             TRACE.c.decision_id == LABEL.c.decision_id
         )

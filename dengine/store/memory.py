@@ -11,10 +11,10 @@ from concurrent.futures import Future
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..records import RetrainReport
+from ..records import Arrays, RetrainReport
 from .journal import Record
 from .outbox import Outbox
-from .records import Arrays, NewLabel, StoredDecision, check_state, chunks, new_event
+from .records import NewLabel, StoredDecision, check_state, chunks, new_event
 
 if TYPE_CHECKING:
     from .sql import SqlStore

@@ -15,9 +15,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from ..errors import StoreError, log
-from ..records import RetrainReport
+from ..records import Arrays, RetrainReport
 from .journal import forked_error
-from .records import Arrays, LabelNumbers, NewLabel, StoredDecision
+from .records import LabelNumbers, NewLabel, StoredDecision
 
 if TYPE_CHECKING:
     from .sql import SqlStore

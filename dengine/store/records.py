@@ -32,7 +32,7 @@ from ..errors import (
     shortened,
 )
 from ..files import FilePath, read_archive
-from ..records import Action, Decision, RetrainReport, Source
+from ..records import Action, Arrays, Decision, RetrainReport, Source, State, TraceArray
 
 # Kinds of events.
 SAFE_MODE_BEGAN = "safe mode"
@@ -48,11 +48,9 @@ LOSS_REMEDY = (
 T = TypeVar("T")
 Clock = Callable[[], float]  # returns the time, in seconds since 1970
 Row = dict[str, Any]  # the values of a row, by column
-State = dict[str, NDArray[Any]]  # the arrays of a version, by name
-Arrays = Mapping[str, NDArray[Any]]  # the same, only read
 LabelNumbers = list[tuple[str, int]]  # ids of decisions, with the numbers of their labels
 EntryName = tuple[int, str]  # number and digest, hexadecimal, of a ledger entry
-NO_TRACE: NDArray[np.float32] = np.zeros((0, 0), dtype=np.float32)
+NO_TRACE: TraceArray = np.zeros((0, 0), dtype=np.float32)
 # The first label and a second one that replaces it: silence confirmed the part, then it stopped the
 # line.
 LATE_STOP = (True, Source.CONFIRMED), (False, Source.STOP)
@@ -227,7 +225,7 @@ class StoredDecision:
     """
 
     decision: Decision = field(metadata={"flat": True})
-    trace: NDArray[np.float32] = field(repr=False, compare=False, metadata={"apart": True})
+    trace: TraceArray = field(repr=False, compare=False, metadata={"apart": True})
     content_hash: int
     quarantined: bool
     time: float = 0.0
@@ -268,7 +266,7 @@ class LabelledTraces:
     """
 
     seq: NDArray[np.int64]
-    traces: NDArray[np.float32]
+    traces: TraceArray
     labels: NDArray[np.int8]
     hashes: NDArray[np.int64]
 

@@ -8,14 +8,13 @@ import numpy as np
 import sqlalchemy as sa
 
 from ..errors import StoreError, instead
-from ..records import RetrainReport
+from ..records import Arrays, RetrainReport
 from .cell_table import CellTable
 from .connections import Database
 from .events import EventTable
 from .ledger import state_sum
 from .queries import Scope
 from .records import (
-    Arrays,
     ModelVersion,
     Row,
     StoredVersion,
