@@ -201,9 +201,10 @@ class EngineSettings:
         """
         if model is None:
             reducer = self.recipe.reducer
-            described = None if isinstance(reducer, str) else describe_estimator(reducer)
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
-            return replace(self, described=described), untrained
+            if isinstance(reducer, str):  # a stored description of an object that has a name stays
+                return self, untrained
+            return replace(self, described=describe_estimator(reducer)), untrained
         template = as_engine_model(model)
         # The numbers of a ModelPrediction count; those of a baseline are its author's affair.
         settings = replace(
