@@ -303,6 +303,8 @@ class History:
         if self._owed:
             cell, id_, good = self._owed.pop(int(step.u[0] * len(self._owed)))
             self._report(cell, id_, good, "late reports")
+            # Until the store has the label of a check that was overdue, its absence counts as well.
+            self.engines[cell].flush()
 
     def _report_again(self, step: Step) -> None:
         """A second report of the same label is refused."""
