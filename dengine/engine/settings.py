@@ -200,11 +200,10 @@ class EngineSettings:
         that lacks a method of `Model`.
         """
         if model is None:
-            reducer = self.recipe.reducer
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
-            if isinstance(reducer, str):  # a stored description of an object that has a name stays
+            if isinstance(self.recipe.reducer, str):  # a store may describe an object of that name
                 return self, untrained
-            return replace(self, described=describe_estimator(reducer)), untrained
+            return replace(self, described=describe_estimator(self.recipe.reducer)), untrained
         template = as_engine_model(model)
         # The numbers of a ModelPrediction count; those of a baseline are its author's affair.
         settings = replace(
