@@ -27,7 +27,7 @@ from ..rules.implementation import Rules, log_certificate
 from .directions import MEMORY, mean_difference
 from .hashing import fold, hash_of_part, hash_of_trace, is_audited
 from .histories import Case, Diary
-from .ledger import DECIDED, OVERDUE, TOLD, Ledger, Moment, Part
+from .ledger import TOLD, Ledger, Moment, Part
 
 CODES = {"verify": 0, "accept": 1, "reject": 2}
 RADIUS = 0.4
@@ -168,7 +168,6 @@ class Recount:
 
     def check_labels(self) -> None:
         """Each report is one label, as it was reported, and there is no other label."""
-        policy = self.case.policy
         self.expect("labels", "without a decision", self.ledger.labels_without_decision, 0)
         reports = dict(self.diary.reports)
         corrections = sorted(
@@ -202,7 +201,6 @@ class Recount:
             parts.sort(key=lambda part: part.learned(self.ledger.end))
             numbers = [part.label["seq"] for part in parts if part.label is not None]
             self.expect("labels", "order", numbers, sorted(set(numbers)))
-        assert policy.shadow is False
 
     @staticmethod
     def _source(part: Part, good: bool) -> str:
@@ -567,6 +565,3 @@ class RuleReplay:
                 Known(part.overdue, row["id"], 0.0, row["upper"], True, 0, as_reject, inclusion)
             )
         return known
-
-
-assert DECIDED < OVERDUE < TOLD
