@@ -1,4 +1,4 @@
-"""The null test: 200 shuffles of labels, and 40 of each planted leak.
+"""The null test: 200 shuffles of labels, and 20 of each planted leak.
 
     python -m tests.slow.proof.null --out out/null
 
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/null"), help="finished shuffles")
     parser.add_argument("--docs", type=Path, help="folder for null_proof.csv; by default --out")
     parser.add_argument("--shuffles", type=int, default=200)
-    parser.add_argument("--leaking", type=int, default=40, help="shuffles of each leak")
+    parser.add_argument("--leaking", type=int, default=20, help="shuffles of each leak")
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / f"shuffles-{digest_of_source()}.csv"
