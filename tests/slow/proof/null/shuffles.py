@@ -14,8 +14,11 @@ place of every trace in the space of this fold. Folds are computed by `engine.ha
 
 **z.** Within a fold the labels of the parts are in random order, whatever the labels of the other
 folds are. So the sum of label times score, where the score of a part comes from its own reference
-points, has mean 0 and a known variance, and z has mean 0. A space that saw the labels which are
-counted in it gives them scores that agree with them, and z grows.
+points, has mean 0, and its variance is known given these. A space that saw the labels which are
+counted in it gives them scores that agree with them, and the sum grows. z is the sum of all folds
+by the root of the sum of their variances. It leans below 0 where the scores are trained: labels of a
+fold that agree with those of the others make the scores of the others vary more. So it is recorded
+beside the others, and proves nothing by itself.
 
 **Certain.** Decisions that the model alone would have made without a check at alpha 0.1, LB 90 %.
 
