@@ -90,6 +90,8 @@ docs: $(VENV)/.dev
 proof: $(VENV)/.dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.slow.proof --out $(OUT)/proof --repeats $(REPEATS) --jobs 2
 	cp $(OUT)/proof/proof.csv docs/explanation/
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.slow.proof.engine --out $(OUT)/engine --docs docs/explanation --jobs 2
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.slow.proof.null --out $(OUT)/null --docs docs/explanation
 
 # All figures of the documentation, at one commit: some fourteen hours, in parts that continue where they were killed. SCREW names the
 # screw-driving set, an .npz file; . .ci/postgres.sh starts the server that the faults need.

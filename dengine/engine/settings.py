@@ -207,10 +207,10 @@ class EngineSettings:
         object that lacks a method of `Model`.
         """
         if model is None:
-            reducer = self.recipe.reducer
-            described = None if isinstance(reducer, str) else describe_estimator(reducer)
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
-            return replace(self, described=described), untrained
+            if isinstance(self.recipe.reducer, str):  # a store may describe an object of that name
+                return self, untrained
+            return replace(self, described=describe_estimator(self.recipe.reducer)), untrained
         template = as_engine_model(model)
         # The numbers of a ModelPrediction count; those of a baseline are its author's affair.
         settings = replace(

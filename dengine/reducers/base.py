@@ -407,7 +407,7 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     Returns
     -------
     array of float32, shape (K,)
-        1 where a fold has no points, or points without a finite spread above 0.
+        1 where a fold has no points, or points without a finite spread above rounding.
     """
     scale = np.ones(n_spaces, dtype=np.float32)
     for k in range(n_spaces):
@@ -420,7 +420,9 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
             inside = inside[is_near]
         if len(inside):
             rms = float(np.sqrt(((inside - inside.mean(axis=0)) ** 2).sum(axis=1).mean()))
-            scale[k] = rms if np.isfinite(rms) and rms > 1e-12 else 1.0
+            # The mean of equal points may differ from them by rounding.
+            rounding = 1e-12 + 1e-6 * float(np.abs(inside).max())
+            scale[k] = rms if np.isfinite(rms) and rms > rounding else 1.0
     return scale
 
 

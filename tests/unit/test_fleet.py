@@ -5,7 +5,7 @@ mixed.
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -559,3 +559,20 @@ def test_a_cell_that_is_not_there_is_refused_and_not_made(
     assert done.exit_code == 1
     assert "it holds cell-7" in done.output
     assert [cell.cell_id for cell in list_cells(url)] == ["cell-7"]
+
+
+@pytest.mark.parametrize("has_decided", [True, False])
+def test_a_cell_that_was_given_a_reducer_object_saves_its_settings_again_after_a_restart(
+    fleet: Fleet, parts: Dataset, has_decided: bool
+) -> None:
+    # Its peers' settings have the object's description, which its own must keep.
+    cells = [fleet.engine(name, recipe=Recipe(PCA(n_components=2))) for name in "ab"]
+    if has_decided:
+        cells[1].decide(parts.X[0])
+    cells[1].close()
+    cells[0].decide(parts.X[1])  # sets the contract of traces, if the other cell has not
+    second = DataEngine.open(fleet.store("b"), reducer=PCA(n_components=2))
+    fleet.opened.append(second)
+    second.set_policy(replace(second.policy, alpha=0.1))
+    assert second.trace == cells[0].trace
+    assert second.policy.alpha == 0.1
