@@ -22,6 +22,7 @@ from dengine import (
 from dengine.decision.decider import DecisionConditions, trace_gate
 from dengine.folds import content_fold, content_hash
 from dengine.records import ACTIONS, REASONS
+from dengine.reducers.base import space_scale
 
 
 def classifier(**changes) -> WilsonRadiusClassifier:
@@ -169,3 +170,13 @@ def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_ar
             assert decision.lower == pytest.approx(1 / (1 + np.exp(-logit)), abs=1e-5)
         assert decision.lower <= decision.upper
         engine.report(decision.id, True)
+
+
+def test_the_scale_of_copies_of_one_trace_is_1_whatever_their_mean_rounds_to() -> None:
+    values = np.random.default_rng(0).uniform(-50.0, 50.0, (200, 2)).astype(np.float32)
+    for point in values:
+        points = np.stack([point, point, point, point + np.float32(1e4)])  # the last is an outlier
+        assert space_scale(points, np.zeros(4, np.int64), 1) == 1.0
+    apart = values * np.float32(1e-4)
+    scale = space_scale(apart, np.zeros(200, np.int64), 1)
+    assert scale == pytest.approx(np.sqrt(apart.var(axis=0).sum()), rel=1e-4)

@@ -78,7 +78,7 @@ def wilson(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
 
 
 def radius_of(points: Floats, outlier: float = 50.0) -> float:
-    """Return the root mean square radius of points without outliers; 1 if they have none.
+    """Return the root mean square radius of points without outliers; 1 if it is none but rounding.
 
     An outlier is so many times as far from the median point as the median of them.
     """
@@ -91,7 +91,7 @@ def radius_of(points: Floats, outlier: float = 50.0) -> float:
     if not len(points):
         return 1.0
     radius = math.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean())
-    return radius if radius > 1e-12 else 1.0
+    return radius if radius > 1e-12 + 1e-6 * np.abs(points).max() else 1.0
 
 
 def certified(n: int, n_bad: int, alpha: float, propensity: float) -> float:
