@@ -10,7 +10,7 @@ import click
 
 from ..errors import SettingError
 from . import options
-from .options import FILE, TRACE, RecipeChoice
+from .options import FILE, FOLDER, TRACE, RecipeChoice
 from .run import host_and_port
 
 if TYPE_CHECKING:
@@ -39,6 +39,10 @@ _LARGEST = "Largest request body, in bytes."
 _XMLRPC = "XML-RPC at /RPC2, for robot programs."
 _OPCUA = "Port of OPC UA, for PLC and SCADA, usually 4840.  [default: off]"
 _ROBOT = "Record the force of this Universal Robots controller, for XML-RPC."
+_DEPLOY = (
+    "Only write examples into this new folder: systemd service, container file, Grafana dashboard, "
+    "Prometheus alerts."
+)
 _SHADOW = "Verify every part; what the model would have done is only recorded."
 
 
@@ -86,6 +90,7 @@ _SHADOW = "Verify every part; what the model would have done is only recorded."
     show_default=True,
     help="When the robot records.",
 )
+@click.option("--deploy", type=FOLDER, help=_DEPLOY)
 @options.allow_import_option
 @options.new_seed_option
 @options.recipe_options
@@ -98,6 +103,7 @@ def serve(
     allow_import: bool,
     robot: str | None,
     trigger: str,
+    deploy: Path | None,
     trace_options: options.Options,
     seed: int | None,
     **settings: Any,
@@ -113,6 +119,15 @@ def serve(
     contract of traces; without them a new store takes the form of its first trace, whose rate and
     unit are unknown, or with --robot 1000 samples at 500 Hz.
     """
+    if deploy is not None:
+        from shutil import copytree
+
+        from ..files import new_folder
+
+        with new_folder(deploy) as folder:
+            copytree(Path(__file__).parents[1] / "serve" / "deploy", folder, dirs_exist_ok=True)
+        click.echo(f"Wrote {deploy}; {deploy / 'README.md'} says what each file is for.")
+        return
     options.require_modules("the server", "serve", *MODULES)
     if settings["opcua"]:
         options.require_modules("OPC UA", "opcua", "asyncua")
