@@ -124,8 +124,8 @@ def serve(
 
         from ..files import new_folder
 
-        with new_folder(deploy) as folder:
-            copytree(Path(__file__).parents[1] / "serve" / "deploy", folder, dirs_exist_ok=True)
+        with new_folder(deploy) as target:
+            copytree(Path(__file__).parents[1] / "serve" / "deploy", target, dirs_exist_ok=True)
         click.echo(f"Wrote {deploy}; {deploy / 'README.md'} says what each file is for.")
         return
     options.require_modules("the server", "serve", *MODULES)

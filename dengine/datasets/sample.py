@@ -11,8 +11,10 @@ from .loading import load_dataset
 
 FORCE = "FZ_Base"
 # Of a UR controller, three for each of NOISE, their standard deviations in N, Nm, m and rad.
-COLUMNS = ("FX_Base", "FY_Base", FORCE, "MuX_Base", "MuY_Base", "MuZ_Base")
-COLUMNS += ("TCP_X", "TCP_Y", "TCP_Z", "TCP_RX", "TCP_RY", "TCP_RZ")
+COLUMNS = [
+    *("FX_Base", "FY_Base", FORCE, "MuX_Base", "MuY_Base", "MuZ_Base"),
+    *("TCP_X", "TCP_Y", "TCP_Z", "TCP_RX", "TCP_RY", "TCP_RZ"),
+]
 NOISE = (0.4, 0.02, 2e-5, 1e-4)
 CYCLE_SECONDS = 12.0  # from one recording to the next
 
@@ -61,5 +63,5 @@ def record(force: NDArray[np.float32], rng: np.random.Generator) -> pd.DataFrame
     rest = rng.normal(tail.mean(), tail.std(), max(0, n_rows - len(force)))
     values = rng.normal(0.0, np.repeat(NOISE, 3), (n_rows, len(COLUMNS)))
     seconds = pd.Index(np.arange(n_rows) / 500, name="Timestamp")
-    frame = pd.DataFrame(values, seconds, [*COLUMNS])
+    frame = pd.DataFrame(values, seconds, COLUMNS)
     return frame.assign(**{FORCE: np.concatenate([force, rest])[:n_rows]})
