@@ -102,10 +102,10 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
     """
     notes = description.notes
     questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]
-    record = {"data": source.data, "description": description.to_toml()}
+    text = description.to_toml()
     print_result(
-        {**record, "open": description.open_keys},
-        description.to_toml(),
+        {"data": source.data, "description": text, "open": description.open_keys},
+        text,
         f"Wrote {path}." if path else "",
         "Still open, so nothing was read; state each with --set KEY=VALUE:",
         *questions,

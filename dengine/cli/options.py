@@ -520,13 +520,6 @@ def parse_stated(items: Iterable[str]) -> dict[str, Any]:
     return stated
 
 
-def _data_choice(
-    data: str, description: Path | None, stated: tuple[str, ...], **options: Any
-) -> DataChoice:
-    """Return the choice of a data set from the values of `--data` and of its options."""
-    return DataChoice(data, description, parse_stated(stated), drop_none(**options))
-
-
 def data_options(
     default: str | None = "insertion", argument: bool = False, live: bool = False
 ) -> Option:
@@ -547,14 +540,17 @@ def data_options(
     metavar = "NAME|FILE|FOLDER"
     if argument:
         data = click.argument("data", metavar=metavar)
-    elif default is None:
-        data = click.option("--data", metavar=metavar, help=_DATA, required=True)
     else:
-        data = click.option(
-            "--data", metavar=metavar, help=_DATA, default=default, show_default=True
-        )
+        given: dict[str, Any] = {"required": True} if default is None else {"default": default}
+        data = click.option("--data", metavar=metavar, help=_DATA, show_default=True, **given)
     more = LIVE | TRIGGER if live else {}
-    return bundle_options("source", _data_choice, {"data": data} | DATA | more)
+    return bundle_options(
+        "source",
+        lambda data, description, stated, **given: DataChoice(
+            data, description, parse_stated(stated), drop_none(**given)
+        ),
+        {"data": data} | DATA | more,
+    )
 
 
 def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:

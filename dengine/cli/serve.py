@@ -125,8 +125,8 @@ def serve(
         from ..files import new_folder
 
         with new_folder(deploy) as target:
-            copytree(Path(__file__).parents[1] / "serve" / "deploy", target, dirs_exist_ok=True)
-        click.echo(f"Wrote {deploy}; {deploy / 'README.md'} says what each file is for.")
+            copytree(Path(__file__).parents[1] / "serve/deploy", target, dirs_exist_ok=True)
+        click.echo(f"Wrote {deploy}; its README.md says what each file is for.")
         return
     options.require_modules("the server", "serve", *MODULES)
     if settings["opcua"]:

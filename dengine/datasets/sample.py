@@ -11,10 +11,8 @@ from .loading import load_dataset
 
 FORCE = "FZ_Base"
 # Of a UR controller, three for each of NOISE, their standard deviations in N, Nm, m and rad.
-COLUMNS = [
-    *("FX_Base", "FY_Base", FORCE, "MuX_Base", "MuY_Base", "MuZ_Base"),
-    *("TCP_X", "TCP_Y", "TCP_Z", "TCP_RX", "TCP_RY", "TCP_RZ"),
-]
+COLUMNS = ["FX_Base", "FY_Base", FORCE, "MuX_Base", "MuY_Base", "MuZ_Base"]
+COLUMNS += ["TCP_X", "TCP_Y", "TCP_Z", "TCP_RX", "TCP_RY", "TCP_RZ"]
 NOISE = (0.4, 0.02, 2e-5, 1e-4)
 CYCLE_SECONDS = 12.0  # from one recording to the next
 

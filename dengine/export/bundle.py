@@ -69,17 +69,14 @@ def make_key(path: FilePath) -> Path:
     """
     target = Path(path)
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    try:
-        with os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file:
-            file.write(secrets.token_hex(32) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except FileExistsError as error:
-        problem = f"{target} is there already, and files may be signed with it"
-        raise ExportError(f"{problem}; name a new one.") from error
-    except OSError as error:
-        problem = f"Cannot write {target}: {error.strerror}"
-        raise ExportError(f"{problem}; choose a folder that exists and is writable.") from error
+    do = "name a new file in a folder that is writable; files may be signed with an old key"
+    with (
+        instead(ExportError, f"Cannot write {target}", OSError, do=do),
+        os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file,
+    ):
+        file.write(secrets.token_hex(32) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
     return target
 
 
@@ -371,15 +368,10 @@ def _read(path: Path, most: int = -1) -> bytes:
 
     Raises ExportError if it is missing or cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            return file.read(most)
-    except FileNotFoundError as error:
-        problem = f"{error.filename} is missing"
-        do = "an export is a file and its .sha256, copied together"
-        raise ExportError(f"{problem}; {do}.") from error
-    except (OSError, ValueError) as error:
-        raise ExportError(f"{path} cannot be read: {error}.") from error
+    do = "an export is a file and its .sha256, copied together"
+    problem = f"{path} cannot be read"
+    with instead(ExportError, problem, OSError, ValueError, do=do), path.open("rb") as file:
+        return file.read(most)
 
 
 def metadata_of(content: bytes, path: Path) -> Metadata:

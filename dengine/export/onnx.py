@@ -185,8 +185,7 @@ class OnnxModel:
         self.session = runtime.InferenceSession(content, options, providers=providers)
         self.metadata = metadata
         self.trace = TraceSpec(**metadata["trace"])
-        warm = np.linspace(-1.0, 1.0, self.trace.channels * self.trace.samples)
-        self.decide(warm.reshape(self.trace.channels, self.trace.samples))
+        self.decide(golden_trace(self.trace))
 
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
@@ -194,16 +193,9 @@ class OnnxModel:
         Another T is fitted as the contract's `fit` says. Raises TraceError for a wrong shape.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
-        action, reason, lower, upper, n_success, n_failure, z = outputs
-        return ExportedDecision(
-            ACTIONS[int(action)],
-            REASONS[int(reason)],
-            float(lower),
-            float(upper),
-            int(n_success),
-            int(n_failure),
-            z,
-        )
+        action, reason, *counted, z = outputs
+        numbers = (value.item() for value in counted)
+        return ExportedDecision._make((ACTIONS[action], REASONS[reason], *numbers, z))
 
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
         """Decide on each trace of (n, T) or (n, C, T); as `decide`."""
@@ -305,8 +297,7 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
     messages up to WARNING, are off in the whole process, because torch names packages that it could
     use and need not. Raises ExportError if torch makes no program.
     """
-    ramp = torch.linspace(-1.0, 1.0, spec.channels * spec.samples)
-    example = (ramp.reshape(spec.channels, spec.samples),)
+    example = (torch.from_numpy(golden_trace(spec)),)
     options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)
