@@ -248,6 +248,12 @@ def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_fol
         type_page(REPO / page, desk)
 
 
+def test_the_readme_shows_what_the_demo_types() -> None:
+    (demo,) = re.findall(r"\$\(RUN\) (.*)", (REPO / "Makefile").read_text("utf-8"))
+    readme = PAGES[0].read_text("utf-8")
+    assert f"\ndengine {demo.replace('$(OUT)', 'out')}\n" in readme
+
+
 def test_each_page_has_stores_and_folders_of_its_own() -> None:
     written = r"[\w./-]+\.db\b|(?<=--out )(?!recordings\b|screw_driving)\S+|(?<=--keep )\S+"  # two are made alike by several
     names = {
