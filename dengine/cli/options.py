@@ -541,8 +541,8 @@ def data_options(
     if argument:
         data = click.argument("data", metavar=metavar)
     else:
-        given: dict[str, Any] = {"required": True} if default is None else {"default": default}
-        data = click.option("--data", metavar=metavar, help=_DATA, show_default=True, **given)
+        need: dict[str, Any] = {"required": True} if default is None else {"default": default}
+        data = click.option("--data", metavar=metavar, help=_DATA, show_default=True, **need)
     more = LIVE | TRIGGER if live else {}
     return bundle_options(
         "source",

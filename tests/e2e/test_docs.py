@@ -41,6 +41,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data recordings": "--repeats 1 --cycles 80",
     "dengine replay --data numbered.npz": "--cycles 80",
     "dengine train --data insertion": "--data small.npz",
+    "dengine train --data recordings": "--reducer pca",
     "python training/benchmark_cycle.py": "--data small.npz --replays 1 --repeats 1 --umap-repeats 0",
     "python training/benchmark_scale.py": "--data small.npz --sizes 80 --repeats 1",
     "python -m tests.slow.proof --only null": "--repeats 2",
