@@ -11,16 +11,6 @@ from .options import FILE, FOLDER, verb
 from .output import Record, format_size, print_result
 
 EXPORTERS = ("torchscript", "onnx")
-_FORMAT = "torchscript decides, audits and learns in the cell; onnx only decides."
-_OUT = "The file to write; its checksum is written beside it, as FILE.sha256."
-_KEY = (
-    "Sign the file with this key, as --make-key writes it; the signature is written beside it, as "
-    "FILE.sig."
-)
-_NEW_KEY = (
-    "First write a new secret key to this new file, which only you can read, and sign with it."
-)
-_CPP = "Write into this new folder the C and C++ sources that run an exported file of any store."
 SIGNED = (
     "Signed with {key}: {name}.sig. Give the key to whoever loads the file, and the signature is "
     "checked before loading."
@@ -32,18 +22,40 @@ UNSIGNED = (
 
 @verb("dengine export engine.db --out model.ts")
 @options.existing_store(click.argument("store", metavar="[STORE]", required=False))
-@click.option("--out", type=FILE, help=_OUT)
+@click.option(
+    "--out", type=FILE, help="The file to write; its checksum is written beside it, as FILE.sha256."
+)
 @click.option(
     "--format",
     "form",
     type=click.Choice(EXPORTERS),
     default=EXPORTERS[0],
     show_default=True,
-    help=_FORMAT,
+    help="torchscript decides, audits and learns in the cell; onnx only decides.",
 )
-@click.option("--key", type=click.Path(exists=True, dir_okay=False, path_type=Path), help=_KEY)
-@click.option("--make-key", "new_key", type=FILE, help=_NEW_KEY)
-@click.option("--cpp", type=FOLDER, help=_CPP)
+@click.option(
+    "--key",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help=(
+        "Sign the file with this key, as --make-key writes it; the signature is "
+        "written beside it, as FILE.sig."
+    ),
+)
+@click.option(
+    "--make-key",
+    "new_key",
+    type=FILE,
+    help=(
+        "First write a new secret key to this new file, which only you can read, and sign with it."
+    ),
+)
+@click.option(
+    "--cpp",
+    type=FOLDER,
+    help=(
+        "Write into this new folder the C and C++ sources that run an exported file of any store."
+    ),
+)
 @options.allow_import_option
 @options.force_option
 def export(

@@ -198,10 +198,6 @@ def _address(store: str | None, cell_id: str | None, product: str | None = None)
 
 
 _CELL_ID = "The cell, where the store holds several; `dengine status` lists them.  [default: cell]"
-_PRODUCT = (
-    "What the cell makes: cells of one product share labels and versions.  "
-    "[default: as the store says]"
-)
 
 
 def existing_store(store: Option) -> Option:
@@ -237,7 +233,14 @@ def store_option(text: str, *names: str, required: bool = False) -> Option:
     options: dict[str, Option] = {
         "store": click.option("--store", required=required, metavar="FILE|URL", help=text),
         "cell_id": click.option(*names, "--cell-id", "cell_id", metavar="NAME", help=_CELL_ID),
-        "product": click.option("--product", metavar="NAME", help=_PRODUCT),
+        "product": click.option(
+            "--product",
+            metavar="NAME",
+            help=(
+                "What the cell makes: cells of one product share labels and versions.  "
+                "[default: as the store says]"
+            ),
+        ),
     }
     return bundle_options("store", _address, options)
 
@@ -301,71 +304,94 @@ class RecipeChoice:
 
 
 # No option of a policy has a default here: the recipe, or the store, has it.
-_ALPHA = "Two-sided error level of the confidence bound, a probability.  [default: the recipe's]"
-_LB = (
-    "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  "
-    "[default: the recipe's]"
-)
-_GUARANTEE = (
-    "What must keep to LB: the neighbourhood of each part, at one look (local), or all accepted "
-    "parts together (pooled). With cost, a part passes where that is expected to be cheaper than a "
-    "check, by --prices. Or a rule of your own."
-)
-_PRICES = (
-    "Of a check, of a bad part accepted and of a good part rejected, in one unit, as in 0.5,200,5. "
-    "Alone they imply --guarantee cost and --audit-rate 0.05.  [default: 5,120,47.5]"
-)
-_STOPS = (
-    "Which bad accepted parts stop the system: some, or all. With all, an accepted part that no "
-    "stop follows counts as good."
-)
-_AUDITS = (
-    "Share of the parts that the model is certain of and that are verified all the same; without "
-    "audits nothing is known of rejected parts."
-)
-_NOVELTY = (
-    "Verify a trace that is this many times less like the learned traces than they are like each "
-    "other; 0: off."
-)
-_FORCE_LIMITS = (
-    "Verify a part whose force leaves limits between two times, in seconds. LOW or HIGH may be "
-    "empty; :reject rejects the part; '' removes all limits."
-)
-_FORCE_LIMIT = "START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]"
-_SHARE = click.FloatRange(0.0, 1.0, max_open=True)
 
 
 POLICY = {
-    "alpha": click.option("--alpha", type=ALPHA, help=_ALPHA),
-    "lower_bound": click.option("--lower-bound", type=LOWER_BOUND, help=_LB),
-    "guarantee": click.option(
-        "--guarantee", type=NameChoice("guarantee", OWN_RULE), help=_GUARANTEE
+    "alpha": click.option(
+        "--alpha",
+        type=ALPHA,
+        help=(
+            "Two-sided error level of the confidence bound, a probability.  [default: the recipe's]"
+        ),
     ),
-    "stops": click.option("--stops", type=NameChoice("stops"), help=_STOPS),
-    "audit_rate": click.option("--audit-rate", type=_SHARE, metavar="SHARE", help=_AUDITS),
-    "prices": click.option("--prices", type=CommaList(click.FloatRange(0.0)), help=_PRICES),
+    "lower_bound": click.option(
+        "--lower-bound",
+        type=LOWER_BOUND,
+        help=(
+            "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  "
+            "[default: the recipe's]"
+        ),
+    ),
+    "guarantee": click.option(
+        "--guarantee",
+        type=NameChoice("guarantee", OWN_RULE),
+        help=(
+            "What must keep to LB: the neighbourhood of each part, at one look (local), "
+            "or all accepted parts together (pooled). With cost, a part passes where "
+            "that is expected to be cheaper than a check, by --prices. Or a rule of your "
+            "own."
+        ),
+    ),
+    "stops": click.option(
+        "--stops",
+        type=NameChoice("stops"),
+        help=(
+            "Which bad accepted parts stop the system: some, or all. With all, an "
+            "accepted part that no stop follows counts as good."
+        ),
+    ),
+    "audit_rate": click.option(
+        "--audit-rate",
+        type=click.FloatRange(0.0, 1.0, max_open=True),
+        metavar="SHARE",
+        help=(
+            "Share of the parts that the model is certain of and that are verified all "
+            "the same; without audits nothing is known of rejected parts."
+        ),
+    ),
+    "prices": click.option(
+        "--prices",
+        type=CommaList(click.FloatRange(0.0)),
+        help=(
+            "Of a check, of a bad part accepted and of a good part rejected, in one "
+            "unit, as in 0.5,200,5. Alone they imply --guarantee cost and --audit-rate "
+            "0.05.  [default: 5,120,47.5]"
+        ),
+    ),
     "force_limits": click.option(
         "--force-limit",
         "force_limits",
-        metavar=_FORCE_LIMIT,
+        metavar="START:END:LOW:HIGH[:reject][:channel=FZ][:along=Z]",
         multiple=True,
         # None where the option was not given; an empty tuple removes all limits of a recipe.
         callback=lambda _, option, values: tuple(filter(None, values)) if values else None,
-        help=_FORCE_LIMITS,
+        help=(
+            "Verify a part whose force leaves limits between two times, in seconds. LOW "
+            "or HIGH may be empty; :reject rejects the part; '' removes all limits."
+        ),
     ),
 }
 SETTINGS = POLICY | {
     "novelty": click.option(
-        "--novelty", type=click.FloatRange(0.0), metavar="FACTOR", help=_NOVELTY
+        "--novelty",
+        type=click.FloatRange(0.0),
+        metavar="FACTOR",
+        help=(
+            "Verify a trace that is this many times less like the learned traces than "
+            "they are like each other; 0: off."
+        ),
     )
 }
-_RECIPE = (
-    "All settings: by a reducer's name, from a TOML file, or with a reducer of your own.  "
-    "[default: conv]"
-)
 RECIPE = {
     "name": click.option(
-        "--reducer", "--recipe", "name", type=NameChoice("recipe", OWN_RECIPE), help=_RECIPE
+        "--reducer",
+        "--recipe",
+        "name",
+        type=NameChoice("recipe", OWN_RECIPE),
+        help=(
+            "All settings: by a reducer's name, from a TOML file, or with a reducer of "
+            "your own.  [default: conv]"
+        ),
     )
 }
 
@@ -462,44 +488,67 @@ def fault_lines(data: Dataset, most: int) -> list[str]:
     return lines
 
 
-_SAMPLES = "Samples of a trace: the first so many, which decides earlier.  [default: all]"
-_CHANNELS = "FZ_Base, or several with commas between.  [default: those that are described]"
-_DESCRIPTION = (
-    "What the recordings are.  [default: recordings.toml in a folder, FILE.toml beside a file]"
-)
-_SET = (
-    "State a key of the description for this command, like label.column=verdict; the value is "
-    "TOML, or a text. `dengine data` shows the keys."
-)
-_HERTZ = "Samples per second of live traces."
-_UNIT = "Unit of live traces, one for all channels or kN,mm."
-_FIT = "What to do with live traces of another length.  [default: strict]"
-_NAMES = CommaList(click.STRING)
-_RATE = click.FloatRange(0.0, min_open=True)
-_TRIGGER = (
-    "When an insertion begins on a robot: contact=5 (newtons), register@NAME (not zero), bit=0 (a "
-    "digital output), motion=0.01 (m/s)."
-)
-_DATA = (
-    "The bundled set, insertion; a folder or file of recordings with its description (see `dengine "
-    "data`); an .npz file with X (traces, samples) and y (1 success, 0 failure); or a store's .db."
-)
 CHOICE = {
-    "samples": click.option("--samples", type=COUNT, help=_SAMPLES),
+    "samples": click.option(
+        "--samples",
+        type=COUNT,
+        help="Samples of a trace: the first so many, which decides earlier.  [default: all]",
+    ),
     "channel": click.option(
-        "--channels", "--channel", "channel", type=_NAMES, metavar="NAMES", help=_CHANNELS
+        "--channels",
+        "--channel",
+        "channel",
+        type=CommaList(click.STRING),
+        metavar="NAMES",
+        help="FZ_Base, or several with commas between.  [default: those that are described]",
     ),
 }
 LIVE = {
-    "rate_hz": click.option("--rate-hz", type=_RATE, metavar="HZ", help=_HERTZ),
-    "unit": click.option("--unit", metavar="TEXT", help=_UNIT),
-    "fit": click.option("--fit", type=NameChoice("fit"), help=_FIT),
+    "rate_hz": click.option(
+        "--rate-hz",
+        type=click.FloatRange(0.0, min_open=True),
+        metavar="HZ",
+        help="Samples per second of live traces.",
+    ),
+    "unit": click.option(
+        "--unit", metavar="TEXT", help="Unit of live traces, one for all channels or kN,mm."
+    ),
+    "fit": click.option(
+        "--fit",
+        type=NameChoice("fit"),
+        help="What to do with live traces of another length.  [default: strict]",
+    ),
 }
 TRACE = CHOICE | LIVE
-TRIGGER = {"trigger": click.option("--trigger", metavar="TEXT", help=_TRIGGER)}
+TRIGGER = {
+    "trigger": click.option(
+        "--trigger",
+        metavar="TEXT",
+        help=(
+            "When an insertion begins on a robot: contact=5 (newtons), register@NAME "
+            "(not zero), bit=0 (a digital output), motion=0.01 (m/s)."
+        ),
+    )
+}
 DATA = CHOICE | {
-    "description": click.option("--description", type=FILE, help=_DESCRIPTION),
-    "stated": click.option("--set", "stated", metavar="KEY=VALUE", multiple=True, help=_SET),
+    "description": click.option(
+        "--description",
+        type=FILE,
+        help=(
+            "What the recordings are.  [default: recordings.toml in a folder, FILE.toml "
+            "beside a file]"
+        ),
+    ),
+    "stated": click.option(
+        "--set",
+        "stated",
+        metavar="KEY=VALUE",
+        multiple=True,
+        help=(
+            "State a key of the description for this command, like label.column=verdict; "
+            "the value is TOML, or a text. `dengine data` shows the keys."
+        ),
+    ),
 }
 
 
@@ -542,7 +591,17 @@ def data_options(
         data = click.argument("data", metavar=metavar)
     else:
         need: dict[str, Any] = {"required": True} if default is None else {"default": default}
-        data = click.option("--data", metavar=metavar, help=_DATA, show_default=True, **need)
+        data = click.option(
+            "--data",
+            metavar=metavar,
+            help=(
+                "The bundled set, insertion; a folder or file of recordings with its "
+                "description (see `dengine data`); an .npz file with X (traces, samples) and "
+                "y (1 success, 0 failure); or a store's .db."
+            ),
+            show_default=True,
+            **need,
+        )
     more = LIVE | TRIGGER if live else {}
     return bundle_options(
         "source",
@@ -634,14 +693,14 @@ def require_modules(purpose: str, extra: str, *modules: str) -> None:
         )
 
 
-_SCENARIO = "What changes in the simulated cell: nominal (nothing), wear, variant or bias_jump."
-_SEED = "An integer; the same seed gives the same run."
-_NEW_SEED = "An integer; seed of a new store's engine.  [default: 0]"
-_ALLOW = (
-    "Import your own reducer and rule, module:Class, that STORE names. Only for a store that you "
-    "trust."
+allow_import_option = click.option(
+    "--allow-import",
+    is_flag=True,
+    help=(
+        "Import your own reducer and rule, module:Class, that STORE names. Only for "
+        "a store that you trust."
+    ),
 )
-allow_import_option = click.option("--allow-import", is_flag=True, help=_ALLOW)
 force_option = click.option(
     "--force", is_flag=True, help="Replace files that exist; a store is never replaced."
 )
@@ -661,17 +720,26 @@ def _out_option(kind: click.Path, text: str) -> Option:
 out_option = _out_option(FOLDER, "Folder for the CSV and the pictures; created if it is missing.")
 picture_option = _out_option(FILE, "Draw a picture into this file, .png, .pdf or .svg.")
 seed_option = click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help=_SEED
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="An integer; the same seed gives the same run.",
 )
-new_seed_option = click.option("--seed", type=click.IntRange(0), help=_NEW_SEED)
-_CHECK = click.FloatRange(0.0, 3600.0, min_open=True)
-_CHECK_SECONDS = "How long a verification takes in your cell; every figure of time saved uses it."
+new_seed_option = click.option(
+    "--seed", type=click.IntRange(0), help="An integer; seed of a new store's engine.  [default: 0]"
+)
 check_option = click.option(
     "--check-seconds",
-    type=_CHECK,
+    type=click.FloatRange(0.0, 3600.0, min_open=True),
     default=5.0,
     show_default=True,
     metavar="S",
-    help=_CHECK_SECONDS,
+    help="How long a verification takes in your cell; every figure of time saved uses it.",
 )
-scenario_option = click.option("--scenario", default="nominal", show_default=True, help=_SCENARIO)
+scenario_option = click.option(
+    "--scenario",
+    default="nominal",
+    show_default=True,
+    help="What changes in the simulated cell: nominal (nothing), wear, variant or bias_jump.",
+)

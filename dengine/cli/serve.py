@@ -22,37 +22,31 @@ if TYPE_CHECKING:
 MODULES = ("starlette", "uvicorn", "prometheus_client", "msgspec", "defusedxml")
 # A decision of the demonstration may wait this many seconds: no robot waits for it.
 DEMO_DEADLINE = 5.0
-_SPEED = click.FloatRange(0.01, 1000.0)
-_DEADLINE = click.FloatRange(0.001, 60.0)
-_PORT = click.IntRange(1, 65535)
-_DEMO = (
-    "Play the bundled recordings as a robot would; forgotten at the end, or kept in a new --store."
-)
-_HOST = "Address to listen on; any but this machine's own needs a token."
-_TOKEN_FILE = (
-    "A file that only its owner can read, with a token on each line: TOKEN, or TOKEN "
-    "viewer|operator NAME. Every request then needs a token."
-)
-_ALLOW_HOST = "A further name by which clients may call the server."
-_DEADLINE_HELP = "Seconds that a decision may wait in line; after that it is recorded as verify."
-_LARGEST = "Largest request body, in bytes."
-_XMLRPC = "XML-RPC at /RPC2, for robot programs."
-_OPCUA = "Port of OPC UA, for PLC and SCADA, usually 4840.  [default: off]"
-_ROBOT = "Record the force of this Universal Robots controller, for XML-RPC."
-_DEPLOY = (
-    "Only write examples into this new folder: systemd service, container file, Grafana dashboard, "
-    "Prometheus alerts."
-)
-_SHADOW = "Verify every part; what the model would have done is only recorded."
 
 
 @click.command(epilog=options.example_epilog("dengine serve --store cell.db --port 8000"))
 @options.store_option("The engine's store; created if it does not exist.")
-@click.option("--demo", is_flag=True, help=_DEMO)
 @click.option(
-    "--speed", type=_SPEED, default=1.0, show_default=True, help="Parts per second of --demo."
+    "--demo",
+    is_flag=True,
+    help=(
+        "Play the bundled recordings as a robot would; forgotten at the end, or kept "
+        "in a new --store."
+    ),
 )
-@click.option("--host", default="127.0.0.1", show_default=True, help=_HOST)
+@click.option(
+    "--speed",
+    type=click.FloatRange(0.01, 1000.0),
+    default=1.0,
+    show_default=True,
+    help="Parts per second of --demo.",
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Address to listen on; any but this machine's own needs a token.",
+)
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
@@ -60,37 +54,79 @@ _SHADOW = "Verify every part; what the model would have done is only recorded."
     show_default=True,
     help="0: any free port.",
 )
-@click.option("--token-file", type=FILE, help=_TOKEN_FILE)
+@click.option(
+    "--token-file",
+    type=FILE,
+    help=(
+        "A file that only its owner can read, with a token on each line: TOKEN, or "
+        "TOKEN viewer|operator NAME. Every request then needs a token."
+    ),
+)
 @click.option("--cert", type=FILE, help="For TLS: the certificate with its chain, in PEM.")
 @click.option("--key", type=FILE, help="For TLS: the key, in PEM, without a password.")
-@click.option("--allow-host", "allow_hosts", multiple=True, metavar="NAME", help=_ALLOW_HOST)
+@click.option(
+    "--allow-host",
+    "allow_hosts",
+    multiple=True,
+    metavar="NAME",
+    help="A further name by which clients may call the server.",
+)
 @click.option(
     "--deadline",
-    type=_DEADLINE,
+    type=click.FloatRange(0.001, 60.0),
     default=0.5,
     show_default=True,
     metavar="S",
-    help=_DEADLINE_HELP,
+    help="Seconds that a decision may wait in line; after that it is recorded as verify.",
 )
 @options.check_option
 @options.bundle_options("trace_options", options.drop_none, TRACE)
 @click.option(
-    "--largest", type=click.IntRange(1024), default=2**20, show_default=True, help=_LARGEST
+    "--largest",
+    type=click.IntRange(1024),
+    default=2**20,
+    show_default=True,
+    help="Largest request body, in bytes.",
 )
-@click.option("--shadow", is_flag=True, help=_SHADOW)
-@click.option("--xmlrpc/--no-xmlrpc", default=True, show_default=True, help=_XMLRPC)
+@click.option(
+    "--shadow",
+    is_flag=True,
+    help="Verify every part; what the model would have done is only recorded.",
+)
+@click.option(
+    "--xmlrpc/--no-xmlrpc",
+    default=True,
+    show_default=True,
+    help="XML-RPC at /RPC2, for robot programs.",
+)
 @click.option("--page/--no-page", default=True, show_default=True, help="The live page, at /.")
-@click.option("--opcua", type=_PORT, metavar="PORT", help=_OPCUA)
+@click.option(
+    "--opcua",
+    type=click.IntRange(1, 65535),
+    metavar="PORT",
+    help="Port of OPC UA, for PLC and SCADA, usually 4840.  [default: off]",
+)
 @click.option("--opcua-cert", type=FILE, help="Certificate of OPC UA, in PEM.  [default: --cert]")
 @click.option("--opcua-key", type=FILE, help="Key of OPC UA, in PEM.  [default: --key]")
-@click.option("--robot", metavar="HOST[:PORT]", help=_ROBOT)
+@click.option(
+    "--robot",
+    metavar="HOST[:PORT]",
+    help="Record the force of this Universal Robots controller, for XML-RPC.",
+)
 @click.option(
     "--trigger",
     default="register@output_int_register_25",
     show_default=True,
     help="When the robot records.",
 )
-@click.option("--deploy", type=FOLDER, help=_DEPLOY)
+@click.option(
+    "--deploy",
+    type=FOLDER,
+    help=(
+        "Only write examples into this new folder: systemd service, container file, "
+        "Grafana dashboard, Prometheus alerts."
+    ),
+)
 @options.allow_import_option
 @options.new_seed_option
 @options.recipe_options
