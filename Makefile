@@ -33,6 +33,8 @@ packages = json.load(sys.stdin)["install"]
 for package in sorted(packages, key=lambda package: package["metadata"]["name"].lower()):
     metadata = package["metadata"]
     hashes = package["download_info"].get("archive_info", {}).get("hashes")
+    if "+" in metadata["version"]:
+        sys.exit(f"The public index has no {metadata['name']} {metadata['version']}.")
     if hashes:
         print(f"{metadata['name']}=={metadata['version']} --hash=sha256:{hashes['sha256']}")
 endef
@@ -108,11 +110,15 @@ audit: $(VENV)/.dev
 	@$(VENV)/bin/pip-audit --strict --no-deps --disable-pip --requirement $(AUDIT).txt --format json --output $(AUDIT).json || true
 	@$(VENV)/bin/python -c "$$COUNT_AUDITED" $(AUDIT).json $(AUDITED)
 
-# For a project of one's own: a wheel; and what it needs, with versions and hashes, as pip resolves it on this machine.
-dist: $(VENV)/.demo
-	rm -rf build dist
-	$(VENV)/bin/python -m pip wheel --quiet --no-deps --disable-pip-version-check --wheel-dir dist .
-	$(PIP) --dry-run --ignore-installed --report - ".[serve,files,mcap]" | $(VENV)/bin/python -c "$$LOCKED" > dist/requirements.lock
+# For a project of one's own: a wheel and an sdist; and what they need with these extras, with versions and hashes, for this
+# version of Python and this system. `===` takes the public index's build of PyTorch, which is found on every machine, and not
+# one like 2.13.0+cpu. An old pip downloads all of it, with CUDA's libraries.
+EXTRAS = serve,files,mcap,onnx,postgres,opcua,ur,sim,baselines,dask
+dist: $(VENV)/.dev
+	rm -rf dist
+	$(VENV)/bin/python -m build --no-isolation > /dev/null
+	$(PIP) --dry-run --ignore-installed --report - ".[$(EXTRAS)]" "$$(sed -n 's/^torch==/torch===/p' constraints.txt)" \
+		| $(VENV)/bin/python -c "$$LOCKED" > dist/requirements.lock
 	@ls dist
 
 clean:

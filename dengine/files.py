@@ -1,7 +1,8 @@
 """Files: outputs, written as a whole or not at all, and NumPy archives, read safely. Data
 sets, exports, backups, tables and figures are read and written by them.
 
-`output_file` and `write_output` never replace a file unasked, and never a database. `read_archive`
+`output_file` and `write_output` never replace a file unasked, and never a database; `new_folder`
+refuses one that holds something. `read_archive`
 unpacks no Python objects, and no more bytes than the machine can hold. `write_manifest` lists the
 checksums of files, and `read_key` reads the secret that signs exports.
 """
@@ -289,6 +290,21 @@ def output_file(
                 os.fsync(folder)
             finally:
                 os.close(folder)
+
+
+@contextmanager
+def new_folder(path: FilePath) -> Iterator[Path]:
+    """Context manager that makes a folder, or takes an empty one, and gives its path.
+
+    Raises OutputError if it holds something, or for an OSError, also one that the block raises.
+    """
+    target = Path(path)
+    with _write_errors(target):
+        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+            wanted = "Expected a new or an empty folder"
+            raise OutputError(f"{wanted}, {target} holds something; name another folder.")
+        target.mkdir(parents=True, exist_ok=True)
+        yield target
 
 
 def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:

@@ -317,7 +317,11 @@ def _read_text(path: Path) -> str | None:
 
     Raises SettingError if it is larger than 1 MB, is not UTF-8 or cannot be read.
     """
-    try:
+    problem = f"{path} is not UTF-8 text"
+    with (  # an OSError among them is a name that is too long
+        instead(SettingError, f"Cannot read the recipe {str(path)[:200]}", OSError),
+        instead(SettingError, problem, UnicodeDecodeError, do="save it as UTF-8"),
+    ):
         if not path.is_file():
             return None
         if path.stat().st_size > LARGEST:
@@ -325,14 +329,6 @@ def _read_text(path: Path) -> str | None:
                 f"Expected a recipe of at most {LARGEST // 2**20} MB, {path} is larger."
             )
         return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise SettingError(
-            f"{path} is not UTF-8 text: {error.reason} at byte {error.start}; save it as UTF-8."
-        ) from error
-    except OSError as error:  # a name that is too long among them
-        raise SettingError(
-            f"Cannot read the recipe {str(path)[:200]}: {error.strerror}."
-        ) from error
 
 
 def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:

@@ -1,7 +1,7 @@
 """An OPC UA client of a served cell, in Python: what a PLC's program has to do.
 
     dengine serve --store try.db --opcua 4840
-    python training/opcua_client.py --url opc.tcp://127.0.0.1:4840/dengine --parts 60
+    python opcua_client.py --url opc.tcp://127.0.0.1:4840/dengine --parts 60
 
 It plays recorded parts: Decide for each part, Report the result of the check, and at the end read
 the variables that a panel shows. Once after each connection it looks up what a controller's program

@@ -28,18 +28,34 @@ if TYPE_CHECKING:
     from ..experiments.survey import Drift, Survey
 
 MOST_FAULTS = 10  # that are shown
-_SAVE = "Write the description, recordings.toml in a folder or FILE.toml beside a file."
 SIGNIFICANT = 0.01  # p-values below it are called drift
 
 
 @verb("dengine data insertion --out out/")
 @options.data_options(argument=True)
-@click.option("--save", is_flag=True, help=_SAVE)
+@click.option(
+    "--sample",
+    is_flag=True,
+    help=(
+        "First write recordings to try it on into DATA, a new or an empty folder: "
+        "200 files of the bundled set, three of them broken."
+    ),
+)
+@click.option(
+    "--save",
+    is_flag=True,
+    help="Write the description, recordings.toml in a folder or FILE.toml beside a file.",
+)
 @click.option("--check", is_flag=True, help="End with exit code 1 if there is any fault.")
 @options.out_option
 @click.pass_context
 def data(
-    context: click.Context, source: DataChoice, save: bool, check: bool, out: Out | None
+    context: click.Context,
+    source: DataChoice,
+    sample: bool,
+    save: bool,
+    check: bool,
+    out: Out | None,
 ) -> None:
     """Describe recordings, and list what is wrong with them.
 
@@ -52,9 +68,12 @@ def data(
     with X (traces, samples) and y (1 success, 0 failure).
     """
     from ..datasets.description import Seen
+    from ..datasets.sample import write_sample
     from ..experiments.figures import data_picture
     from ..experiments.survey import survey_dataset
 
+    if sample:
+        write_sample(source.data)
     description = source.describe(propose=True)
     if description is not None and description.open_keys:
         _print_open_keys(source, description, _save(source, description, save, context))
@@ -89,10 +108,10 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
     """
     notes = description.notes
     questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]
-    record = {"data": source.data, "description": description.to_toml()}
+    text = description.to_toml()
     print_result(
-        {**record, "open": description.open_keys},
-        description.to_toml(),
+        {"data": source.data, "description": text, "open": description.open_keys},
+        text,
         f"Wrote {path}." if path else "",
         "Still open, so nothing was read; state each with --set KEY=VALUE:",
         *questions,
@@ -159,12 +178,6 @@ def _drift_row(drift: "Drift") -> tuple[str, str, str]:
     return drift.name, means, f"{verdict} (Spearman's rho {drift.rho:+.2f}, p {drift.p:.2g})"
 
 
-_OUT = (
-    "The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when multiplied by scale; y "
-    "(n,) labels."
-)
-
-
 @verb("dengine simulate --n 50 --out traces.npz --seed 0")
 @click.option(
     "--n",
@@ -173,7 +186,15 @@ _OUT = (
     show_default=True,
     help="Number of insertions, of 2 s each.",
 )
-@click.option("--out", type=options.FILE, required=True, help=_OUT)
+@click.option(
+    "--out",
+    type=options.FILE,
+    required=True,
+    help=(
+        "The .npz file to write: X (n, 1000) forces at 500 Hz, newtons when "
+        "multiplied by scale; y (n,) labels."
+    ),
+)
 @options.scenario_option
 @options.seed_option
 @options.n_jobs_option(-1, "Number of processes; -1: one for each core.")

@@ -10,15 +10,6 @@ from . import options
 from .options import FILE, FOLDER, verb
 from .output import Record, format_size, print_result
 
-EXPORTERS = ("torchscript", "onnx")
-SIGNED = (
-    "Signed with {key}: {name}.sig. Give the key to whoever loads the file, and the signature is "
-    "checked before loading."
-)
-UNSIGNED = (
-    "Loading such a file runs the code in it: load only your own files, or sign them with --key."
-)
-
 
 @verb("dengine export engine.db --out model.ts")
 @options.existing_store(click.argument("store", metavar="[STORE]", required=False))
@@ -28,8 +19,8 @@ UNSIGNED = (
 @click.option(
     "--format",
     "form",
-    type=click.Choice(EXPORTERS),
-    default=EXPORTERS[0],
+    type=click.Choice(["torchscript", "onnx"]),
+    default="torchscript",
     show_default=True,
     help="torchscript decides, audits and learns in the cell; onnx only decides.",
 )
@@ -37,8 +28,8 @@ UNSIGNED = (
     "--key",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help=(
-        "Sign the file with this key, as --make-key writes it; the signature is written beside "
-        "it, as FILE.sig."
+        "Sign the file with this key, as --make-key writes it; the signature is "
+        "written beside it, as FILE.sig."
     ),
 )
 @click.option(
@@ -52,7 +43,9 @@ UNSIGNED = (
 @click.option(
     "--cpp",
     type=FOLDER,
-    help="Write into this new folder the C and C++ sources that run an exported file of any store.",
+    help=(
+        "Write into this new folder the C and C++ sources that run an exported file of any store."
+    ),
 )
 @options.allow_import_option
 @options.force_option
@@ -97,7 +90,7 @@ def export(
         record["cpp"] = export_sources(cpp)
         lines.append(f"Wrote {cpp}; build it as {cpp / 'CMakeLists.txt'} says.")
     if store is not None and out is not None:
-        exporter = {"torchscript": export_torchscript, "onnx": export_onnx}[form]
+        exporter = export_onnx if form == "onnx" else export_torchscript
         # Read-only: the cell may run meanwhile.
         with DataEngine.open(store, reading=True, allow_import=allow_import) as engine:
             exporter(engine, out, key=key, force=force)
@@ -117,5 +110,11 @@ def export(
             f"Wrote {out} ({format_size(n_bytes)}) and {out.name}.sha256: version {version} with "
             f"{n_references} labelled references."
         )
-        lines.append(UNSIGNED if key is None else SIGNED.format(key=key, name=out.name))
+        lines.append(
+            "Loading such a file runs the code in it: load only your own files, or sign them with "
+            "--key."
+            if key is None
+            else f"Signed with {key}: {out.name}.sig. Give the key to whoever loads the file, and "
+            "the signature is checked before loading."
+        )
     print_result(record, *lines)

@@ -237,8 +237,8 @@ def store_option(text: str, *names: str, required: bool = False) -> Option:
             "--product",
             metavar="NAME",
             help=(
-                "What the cell makes: cells of one product share labels and versions.  [default: "
-                "as the store says]"
+                "What the cell makes: cells of one product share labels and versions.  "
+                "[default: as the store says]"
             ),
         ),
     }
@@ -304,6 +304,8 @@ class RecipeChoice:
 
 
 # No option of a policy has a default here: the recipe, or the store, has it.
+
+
 POLICY = {
     "alpha": click.option(
         "--alpha",
@@ -316,25 +318,26 @@ POLICY = {
         "--lower-bound",
         type=LOWER_BOUND,
         help=(
-            "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  [default: "
-            "the recipe's]"
+            "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  "
+            "[default: the recipe's]"
         ),
     ),
     "guarantee": click.option(
         "--guarantee",
         type=NameChoice("guarantee", OWN_RULE),
         help=(
-            "What must keep to LB: the neighbourhood of each part, at one look (local), or all "
-            "accepted parts together (pooled). With cost, a part passes where that is expected to "
-            "be cheaper than a check, by --prices. Or a rule of your own."
+            "What must keep to LB: the neighbourhood of each part, at one look (local), "
+            "or all accepted parts together (pooled). With cost, a part passes where "
+            "that is expected to be cheaper than a check, by --prices. Or a rule of your "
+            "own."
         ),
     ),
     "stops": click.option(
         "--stops",
         type=NameChoice("stops"),
         help=(
-            "Which bad accepted parts stop the system: some, or all. With all, an accepted part "
-            "that no stop follows counts as good."
+            "Which bad accepted parts stop the system: some, or all. With all, an "
+            "accepted part that no stop follows counts as good."
         ),
     ),
     "audit_rate": click.option(
@@ -342,17 +345,17 @@ POLICY = {
         type=click.FloatRange(0.0, 1.0, max_open=True),
         metavar="SHARE",
         help=(
-            "Share of the parts that the model is certain of and that are verified all the same; "
-            "without audits nothing is known of rejected parts."
+            "Share of the parts that the model is certain of and that are verified all "
+            "the same; without audits nothing is known of rejected parts."
         ),
     ),
     "prices": click.option(
         "--prices",
         type=CommaList(click.FloatRange(0.0)),
         help=(
-            "Of a check, of a bad part accepted and of a good part rejected, in one unit, as in "
-            "0.5,200,5. Alone they imply --guarantee cost and --audit-rate 0.05.  [default: "
-            "5,120,47.5]"
+            "Of a check, of a bad part accepted and of a good part rejected, in one "
+            "unit, as in 0.5,200,5. Alone they imply --guarantee cost and --audit-rate "
+            "0.05.  [default: 5,120,47.5]"
         ),
     ),
     "force_limits": click.option(
@@ -363,8 +366,8 @@ POLICY = {
         # None where the option was not given; an empty tuple removes all limits of a recipe.
         callback=lambda _, option, values: tuple(filter(None, values)) if values else None,
         help=(
-            "Verify a part whose force leaves limits between two times, in seconds. LOW or HIGH "
-            "may be empty; :reject rejects the part; '' removes all limits."
+            "Verify a part whose force leaves limits between two times, in seconds. LOW "
+            "or HIGH may be empty; :reject rejects the part; '' removes all limits."
         ),
     ),
 }
@@ -374,8 +377,8 @@ SETTINGS = POLICY | {
         type=click.FloatRange(0.0),
         metavar="FACTOR",
         help=(
-            "Verify a trace that is this many times less like the learned traces than they are "
-            "like each other; 0: off."
+            "Verify a trace that is this many times less like the learned traces than "
+            "they are like each other; 0: off."
         ),
     )
 }
@@ -386,8 +389,8 @@ RECIPE = {
         "name",
         type=NameChoice("recipe", OWN_RECIPE),
         help=(
-            "All settings: by a reducer's name, from a TOML file, or with a reducer of your own.  "
-            "[default: conv]"
+            "All settings: by a reducer's name, from a TOML file, or with a reducer of "
+            "your own.  [default: conv]"
         ),
     )
 }
@@ -485,10 +488,6 @@ def fault_lines(data: Dataset, most: int) -> list[str]:
     return lines
 
 
-_DATA = (
-    "The bundled set, insertion; a folder or file of recordings with its description (see `dengine "
-    "data`); an .npz file with X (traces, samples) and y (1 success, 0 failure); or a store's .db."
-)
 CHOICE = {
     "samples": click.option(
         "--samples",
@@ -526,8 +525,8 @@ TRIGGER = {
         "--trigger",
         metavar="TEXT",
         help=(
-            "When an insertion begins on a robot: contact=5 (newtons), register@NAME (not zero), "
-            "bit=0 (a digital output), motion=0.01 (m/s)."
+            "When an insertion begins on a robot: contact=5 (newtons), register@NAME "
+            "(not zero), bit=0 (a digital output), motion=0.01 (m/s)."
         ),
     )
 }
@@ -536,8 +535,8 @@ DATA = CHOICE | {
         "--description",
         type=FILE,
         help=(
-            "What the recordings are.  [default: recordings.toml in a folder, FILE.toml beside a "
-            "file]"
+            "What the recordings are.  [default: recordings.toml in a folder, FILE.toml "
+            "beside a file]"
         ),
     ),
     "stated": click.option(
@@ -546,8 +545,8 @@ DATA = CHOICE | {
         metavar="KEY=VALUE",
         multiple=True,
         help=(
-            "State a key of the description for this command, like label.column=verdict; the "
-            "value is TOML, or a text. `dengine data` shows the keys."
+            "State a key of the description for this command, like label.column=verdict; "
+            "the value is TOML, or a text. `dengine data` shows the keys."
         ),
     ),
 }
@@ -570,13 +569,6 @@ def parse_stated(items: Iterable[str]) -> dict[str, Any]:
     return stated
 
 
-def _data_choice(
-    data: str, description: Path | None, stated: tuple[str, ...], **options: Any
-) -> DataChoice:
-    """Return the choice of a data set from the values of `--data` and of its options."""
-    return DataChoice(data, description, parse_stated(stated), drop_none(**options))
-
-
 def data_options(
     default: str | None = "insertion", argument: bool = False, live: bool = False
 ) -> Option:
@@ -597,14 +589,27 @@ def data_options(
     metavar = "NAME|FILE|FOLDER"
     if argument:
         data = click.argument("data", metavar=metavar)
-    elif default is None:
-        data = click.option("--data", metavar=metavar, help=_DATA, required=True)
     else:
+        need: dict[str, Any] = {"required": True} if default is None else {"default": default}
         data = click.option(
-            "--data", metavar=metavar, help=_DATA, default=default, show_default=True
+            "--data",
+            metavar=metavar,
+            help=(
+                "The bundled set, insertion; a folder or file of recordings with its "
+                "description (see `dengine data`); an .npz file with X (traces, samples) and "
+                "y (1 success, 0 failure); or a store's .db."
+            ),
+            show_default=True,
+            **need,
         )
     more = LIVE | TRIGGER if live else {}
-    return bundle_options("source", _data_choice, {"data": data} | DATA | more)
+    return bundle_options(
+        "source",
+        lambda data, description, stated, **given: DataChoice(
+            data, description, parse_stated(stated), drop_none(**given)
+        ),
+        {"data": data} | DATA | more,
+    )
 
 
 def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
@@ -692,8 +697,8 @@ allow_import_option = click.option(
     "--allow-import",
     is_flag=True,
     help=(
-        "Import your own reducer and rule, module:Class, that STORE names. Only for a store that "
-        "you trust."
+        "Import your own reducer and rule, module:Class, that STORE names. Only for "
+        "a store that you trust."
     ),
 )
 force_option = click.option(

@@ -10,7 +10,7 @@ import click
 
 from ..errors import SettingError
 from . import options
-from .options import FILE, TRACE, RecipeChoice
+from .options import FILE, FOLDER, TRACE, RecipeChoice
 from .run import host_and_port
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ DEMO_DEADLINE = 5.0
     "--demo",
     is_flag=True,
     help=(
-        "Play the bundled recordings as a robot would; forgotten at the end, or kept in a new "
-        "--store."
+        "Play the bundled recordings as a robot would; forgotten at the end, or kept "
+        "in a new --store."
     ),
 )
 @click.option(
@@ -58,8 +58,8 @@ DEMO_DEADLINE = 5.0
     "--token-file",
     type=FILE,
     help=(
-        "A file that only its owner can read, with a token on each line: TOKEN, or TOKEN "
-        "viewer|operator NAME. Every request then needs a token."
+        "A file that only its owner can read, with a token on each line: TOKEN, or "
+        "TOKEN viewer|operator NAME. Every request then needs a token."
     ),
 )
 @click.option("--cert", type=FILE, help="For TLS: the certificate with its chain, in PEM.")
@@ -119,6 +119,14 @@ DEMO_DEADLINE = 5.0
     show_default=True,
     help="When the robot records.",
 )
+@click.option(
+    "--deploy",
+    type=FOLDER,
+    help=(
+        "Only write examples into this new folder: systemd service, container file, "
+        "Grafana dashboard, Prometheus alerts."
+    ),
+)
 @options.allow_import_option
 @options.new_seed_option
 @options.recipe_options
@@ -131,6 +139,7 @@ def serve(
     allow_import: bool,
     robot: str | None,
     trigger: str,
+    deploy: Path | None,
     trace_options: options.Options,
     seed: int | None,
     **settings: Any,
@@ -147,6 +156,15 @@ def serve(
     contract of traces; without them a new store takes the form of its first trace, whose rate and
     unit are unknown, or with --robot 1000 samples at 500 Hz.
     """
+    if deploy is not None:
+        from shutil import copytree
+
+        from ..files import new_folder
+
+        with new_folder(deploy) as target:
+            copytree(Path(__file__).parents[1] / "serve/deploy", target, dirs_exist_ok=True)
+        click.echo(f"Wrote {deploy}; its README.md says what each file is for.")
+        return
     options.require_modules("the server", "serve", *MODULES)
     if settings["opcua"]:
         options.require_modules("OPC UA", "opcua", "asyncua")

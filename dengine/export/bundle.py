@@ -73,7 +73,7 @@ def make_key(path: FilePath) -> Path:
             f"{target} is there already, and files may be signed with it; name a new one."
         )
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
-    do = "choose a folder that exists and is writable"
+    do = "name a new file in a folder that is writable; files may be signed with an old key"
     with (
         instead(ExportError, f"Cannot write {target}", OSError, do=do),
         os.fdopen(os.open(target, flags, 0o600), "w", encoding="ascii") as file,
@@ -355,15 +355,10 @@ def _read(path: Path, most: int = -1) -> bytes:
 
     Raises ExportError if it is missing or cannot be read.
     """
-    try:
-        with path.open("rb") as file:
-            return file.read(most)
-    except FileNotFoundError as error:
-        raise ExportError(
-            f"{error.filename} is missing; an export is a file and its .sha256, copied together."
-        ) from error
-    except (OSError, ValueError) as error:
-        raise ExportError(f"{path} cannot be read: {error}.") from error
+    do = "an export is a file and its .sha256, copied together"
+    problem = f"{path} cannot be read"
+    with instead(ExportError, problem, OSError, ValueError, do=do), path.open("rb") as file:
+        return file.read(most)
 
 
 def metadata_of(content: bytes, path: Path) -> Metadata:

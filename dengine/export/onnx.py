@@ -93,11 +93,11 @@ def export_onnx(
     ExportError
         If the engine audits (checks some parts that the model is certain of), has force limits, or
         a rule other than that of the guarantee "local" with stops "some", or a part is among the
-        references more than once; if nothing was trained yet; for a baseline; if the reducer or the
-        interval has no module; for code that was changed after it was compiled; if the rule is
-        stale, because an update of it failed; if the store was changed from outside; if the key
-        cannot be read, or a package is missing; and if onnxruntime does not decide as the model
-        does.
+        references more than once; the message names all of these that apply. If nothing was trained
+        yet; for a baseline; if the reducer or the interval has no module; for code that was changed
+        after it was compiled; if the rule is stale, because an update of it failed; if the store
+        was changed from outside; if the key cannot be read, or a package is missing; and if
+        onnxruntime does not decide as the model does.
     OutputError
         If `path` cannot be written.
     """
@@ -147,27 +147,24 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
 
 
 def _refuse_unsupported(source: Exportable) -> None:
-    """Raise ExportError if the decision needs something that ONNX cannot carry.
+    """Raise ExportError if the decision needs something that ONNX cannot carry, and name it all.
 
     That is an audit rate above 0, a rule other than that of the guarantee "local" with stops
     "some", a part that is among the references more than once, and force limits.
     """
-    rule = type(source.model.rule)
+    rule = type(source.model.rule)  # a user's own as well: `OnnxDecision` knows the paper's alone
     n_repeats = int(source.model.index.repeats)
-    use_local = "export torchscript, or set guarantee = 'local' and stops = 'some'"
-    no_audits = "export torchscript, or set audit_rate = 0"
-    problem = ""
-    if source.audit_rate > 0.0:
-        problem = f"audits, its integers are not the content hash's; {no_audits}"
-    elif rule is not DecisionRule:  # a user's own as well: `OnnxDecision` knows the paper's alone
-        problem = f"{rule.__name__}, a rule that learns; {use_local}"
-    elif n_repeats > 0:
-        repeats = f"{n_repeats} of the references are of parts that were there already"
-        problem = f"votes: {repeats}; export torchscript"
-    elif source.force_limits:
-        problem = "an operator's force limits; export torchscript"
-    if problem:
-        raise ExportError(f"ONNX carries no {problem}.")
+    needed = {
+        "audits (set audit_rate = 0)": source.audit_rate > 0.0,
+        f"{rule.__name__}, a rule that learns (set guarantee = 'local' and stops = 'some')": (
+            rule is not DecisionRule
+        ),
+        f"votes of parts that came again ({n_repeats} references)": n_repeats > 0,
+        "an operator's force limits": bool(source.force_limits),
+    }
+    problems = "; nor ".join(name for name, is_needed in needed.items() if is_needed)
+    if problems:
+        raise ExportError(f"ONNX carries no {problems}. Export torchscript instead.")
 
 
 class OnnxModel:
@@ -200,16 +197,9 @@ class OnnxModel:
         for a wrong shape.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
-        action, reason, lower, upper, n_success, n_failure, z = outputs
-        return ExportedDecision(
-            ACTIONS[int(action)],
-            REASONS[int(reason)],
-            float(lower),
-            float(upper),
-            int(n_success),
-            int(n_failure),
-            z,
-        )
+        action, reason, *counted, z = outputs
+        numbers = (value.item() for value in counted)
+        return ExportedDecision._make((ACTIONS[action], REASONS[reason], *numbers, z))
 
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
         """Decide on each trace of (n, T) or (n, C, T), as `decide` does."""

@@ -31,7 +31,7 @@ from ..decision.members import SAFE_MODES
 from ..decision.scripting import script
 from ..engine.decide import as_part
 from ..errors import ExportError, instead
-from ..files import FilePath
+from ..files import FilePath, new_folder
 from ..folds import part_hash
 from ..records import (
     ACTIONS,
@@ -73,18 +73,10 @@ def export_sources(folder: FilePath) -> Path:
 
     Raises
     ------
-    ExportError
+    OutputError
         If it holds something or cannot be written.
     """
-    target = Path(folder)
-    with instead(
-        ExportError, f"Cannot write {target}", OSError, do="choose a folder that is writable"
-    ):
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            raise ExportError(
-                f"Expected a new or an empty folder for the sources, {target} holds something; "
-                "name another folder."
-            )
+    with new_folder(folder) as target:
         shutil.copytree(Path(__file__).parent / "cpp", target, dirs_exist_ok=True)
         (target / "VERSION").write_text(f"{__version__}\n", encoding="utf-8")
     return target

@@ -1,6 +1,6 @@
 """Checkpoints of a network: weights of a single member, from which all members of a reducer start.
-`training/train_encoder.py` writes one with `save_checkpoint`; `TorchReducer(checkpoint=...)` reads
-it with `load_checkpoint`. A checkpoint holds tensors alone, so that loading it runs no code.
+`save_checkpoint` writes one; `TorchReducer(checkpoint=...)` reads it with `load_checkpoint`. A
+checkpoint holds tensors alone, so that loading it runs no code.
 """
 
 import re
@@ -55,7 +55,7 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
             raise SettingError(
                 "Expected a checkpoint of this network for traces of this many channels, "
                 f"{path} is of another: {name} has shape and type {actual.get(name)}, not "
-                f"{expected.get(name)}; train one with training/train_encoder.py."
+                f"{expected.get(name)}; train one and write it with save_checkpoint."
             )
     for name, value in weights.items():
         least = 0.0 if name.endswith("running_var") else -LARGEST
@@ -82,7 +82,7 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
     except Exception:  # a damaged file raises many types, one of which advises to run its code
         raise SettingError(
             f"Expected a checkpoint of named dense tensors alone, {path} is none; write one with "
-            "training/train_encoder.py."
+            "save_checkpoint."
         ) from None
 
 

@@ -161,8 +161,8 @@ class TorchReducer(Reducer):
         Augmentation: frames of shift in time, standard deviations of a factor and of white noise,
         and the parameter of mixup; 0 turns each off.
     checkpoint : str, default ""
-        File of tensors that `training/train_encoder.py` wrote, from which all members start. It
-        must not have been trained on parts that are counted later.
+        File of tensors that `save_checkpoint` wrote, from which all members start. It must not have
+        been trained on parts that are counted later.
     random_state : int, RandomState or None, default 0
         Seed of the initial weights, the batches and the augmentation.
 

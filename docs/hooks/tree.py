@@ -14,7 +14,7 @@ README = REPO / "README.md"
 TREE = re.compile(r"(?<=^```text\n)dengine/ .*?(?=^```$)", flags=re.DOTALL | re.MULTILINE)
 OTHER_FOLDERS = {
     "docs/": "tutorials, how-to, reference, explanation; `make docs` builds the site into site/",
-    "models/": "recipes/*.toml, and trained files with their cards",
+    "models/": "trained files with their cards",
     "training/": "scripts over dengine: train, compare, export, measure",
     "notebooks/": "executed walkthroughs",
     "tests/": "unit, contract, e2e, golden: `make test`; slow: `make test-all`",

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from dengine import DataEngine, Dataset, Description, describe, load_dataset
+from dengine.datasets.sample import write_sample
 from dengine.errors import DataError
 from dengine.experiments.survey import survey_dataset
 from tests.support.command_line import dengine, document, well
-from training.make_recordings import write_plants, write_recordings
+from tests.support.plants import write_plants
 
 # What nothing proves about a bag.
 BAG = {
@@ -33,7 +34,7 @@ def shown(*words: object) -> str:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """24 recordings as UR cells make them, three of them broken."""
     path = tmp_path_factory.mktemp("recorded")
-    write_recordings(path, 24, 3, 0)
+    write_sample(path, 24)
     return path
 
 
@@ -65,6 +66,14 @@ def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(
     again = dengine("data", folder, "--save")
     assert again.exit_code == 1
     assert "--force" in again.stderr
+
+
+def test_sample_recordings_are_written_into_a_new_or_an_empty_folder_alone(folder: Path) -> None:
+    before = sorted(path.name for path in folder.iterdir())
+    refused = dengine("data", "--sample", folder)
+    assert refused.exit_code == 1
+    assert "Expected a new or an empty folder" in refused.stderr
+    assert sorted(path.name for path in folder.iterdir()) == before
 
 
 def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(

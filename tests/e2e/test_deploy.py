@@ -23,10 +23,11 @@ from dengine.errors import SettingError
 from dengine.records import Action, Reason
 from dengine.serve.auth import read_tokens
 from dengine.serve.metrics import Metrics
+from tests.support.command_line import dengine, well
 from tests.support.serving import a_service, started
 
 REPO = Path(__file__).resolve().parents[2]
-DEPLOY = REPO / "deploy"
+DEPLOY = REPO / "dengine" / "serve" / "deploy"
 CONTAINER, UNIT, OPTIONS = (
     (DEPLOY / name).read_text(encoding="utf-8")
     for name in ("Containerfile", "dengine.service", "dengine.env")
@@ -60,7 +61,7 @@ def parse(words: list[str]) -> click.Context:
 
 
 def test_the_recipe_for_windows_installs_extras_and_runs_tests_and_verbs_that_there_are() -> None:
-    recipe = (DEPLOY / "windows.yml").read_text(encoding="utf-8")
+    recipe = (REPO / ".ci" / "windows.yml").read_text(encoding="utf-8")
     paths = re.findall(r"\btests/[\w/.]+", recipe)
     assert [path for path in paths if not (REPO / path).exists()] == []
     (extras,) = re.findall(r'"\.\[([\w,]+)\]"', recipe)
@@ -72,19 +73,27 @@ def test_the_recipe_for_windows_installs_extras_and_runs_tests_and_verbs_that_th
     assert "://" not in recipe  # no index is named
 
 
-def test_what_the_container_copies_is_there_and_its_parts_are_those_of_the_project() -> None:
-    copied = [path for step in steps("COPY") for path in step.split()[:-1]]
-    assert {"constraints.txt", "pyproject.toml", "dengine"} <= set(copied)
-    assert [path for path in copied if not (REPO / path).exists()] == []
+def test_the_examples_are_written_by_serve_into_a_new_folder_alone(tmp_path: Path) -> None:
+    written = well("serve", "--deploy", tmp_path / "deploy")
+    assert "README.md says what each file is for" in " ".join(written.stdout.split())
+    contents = {path.name: path.read_bytes() for path in (tmp_path / "deploy").iterdir()}
+    assert contents == {path.name: path.read_bytes() for path in DEPLOY.iterdir()}
+    assert {*re.findall("^. `([^`]+)` .", contents["README.md"].decode(), flags=re.M)} == (
+        set(contents) - {"README.md"}
+    )
+    refused = dengine("serve", "--deploy", tmp_path / "deploy")
+    assert (refused.exit_code, "Expected a new or an empty folder" in refused.stderr) == (1, True)
+
+
+def test_the_container_gets_the_wheel_alone_and_the_projects_python_torch_and_extras() -> None:
+    (copied,) = steps("COPY")
+    wheel, _ = copied.split()
     kept = (DEPLOY / "Containerfile.dockerignore").read_text(encoding="utf-8").splitlines()
-    assert sorted(line[1:] for line in kept if line.startswith("!")) == sorted(copied)
-    for key in ("readme", "license-files"):
-        named = PROJECT[key] if isinstance(PROJECT[key], list) else [PROJECT[key]]
-        tops = {name.partition("/")[0] for name in named}
-        assert tops <= set(copied)  # or the package cannot be built in it
+    assert [line for line in kept if not line.startswith("#")] == ["*", f"!{wheel}"]
     (install,) = [step for step in steps("RUN") if "pip install" in step]
-    assert "--constraint constraints.txt" in install
-    (extras,) = re.findall(r'"\.\[([\w,]+)\]"', install)
+    (pinned,) = re.findall("^torch==.*$", (REPO / "constraints.txt").read_text(), flags=re.M)
+    assert f" {pinned} " in install
+    (extras,) = re.findall(rf'"\$\(echo {re.escape(wheel)}\)\[([\w,]+)\]"', install)
     assert set(extras.split(",")) <= set(PROJECT["optional-dependencies"])
     (minor,) = re.findall(r"python:3\.(\d+)-slim$", *steps("FROM"))
     low, high = re.findall(r"3\.(\d+)", PROJECT["requires-python"])

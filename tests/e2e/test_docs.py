@@ -1,9 +1,10 @@
 """Every command and snippet of the README and of the site runs, page by page, as a newcomer would
 type it; only smaller.
 
-Each page has a desk, stores and folders of its own, and runs from top to bottom. A long command
-gets options behind its own, of which the last counts. `make test` runs one page, `make test-merge` README,
-`make test-all` every one, and README and two others in one folder.
+Each page has a desk, stores and folders of its own, and runs from top to bottom; README, tutorials
+and how-to in an empty folder. A long command gets options behind its own, of which the last counts.
+`make test` runs one page, `make test-all` every one, and README and two others in one folder.
+`tests/slow/test_release.py` runs pages with the installed wheel.
 """
 
 import json
@@ -24,6 +25,7 @@ import pytest
 REPO = Path(__file__).resolve().parents[2]
 PAGES = [REPO / "README.md", *sorted((REPO / "docs").rglob("*.md"))]
 QUICK = {"docs/howto/parts.md"}
+CHECKOUT = "docs/explanation/"  # pages that say that they need one
 
 SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data insertion": "--repeats 1 --cycles 120",
@@ -39,6 +41,7 @@ SMALLER = {  # by the command's beginning: options that make it quick
     "dengine replay --data recordings": "--repeats 1 --cycles 80",
     "dengine replay --data numbered.npz": "--cycles 80",
     "dengine train --data insertion": "--data small.npz",
+    "dengine train --data recordings": "--reducer pca",
     "python training/benchmark_cycle.py": "--data small.npz --replays 1 --repeats 1 --umap-repeats 0",
     "python training/benchmark_scale.py": "--data small.npz --sizes 80 --repeats 1",
     "python -m tests.slow.proof --only null": "--repeats 2",
@@ -106,11 +109,7 @@ def name(page: Path) -> str:
 
 @pytest.fixture
 def desk(tmp_path: Path) -> Path:
-    """A folder that looks like a clone to whoever types in it, and keeps what the
-    commands write.
-    """
-    for folder in ("training", "tests", "models", "notebooks"):
-        (tmp_path / folder).symlink_to(REPO / folder)
+    """A folder that keeps what the commands write, with nothing in it but a small set."""
     X, y = recordings()
     np.savez(
         tmp_path / "small.npz", X=X[:, ::5], y=y, workpiece=np.arange(len(y))
@@ -187,8 +186,6 @@ def type_in(command: str, desk: Path) -> None:
         record(desk / command.rsplit("/", 1)[1] / "data")
     elif command.startswith(CPP) and not HAS_CPP:
         assert "DENGINE_REQUIRE_CPP" not in os.environ
-    elif command.startswith("python training/benchmark_export.py") and not HAS_CPP:
-        shell(smaller(command).replace("--cell build/cpp/dengine-cell", ""), desk)
     elif not command.startswith(NOT_RUN):
         shell(smaller(command), desk)
 
@@ -218,6 +215,8 @@ def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(
 
 def type_page(page: Path, desk: Path) -> None:
     """All blocks of a page, from top to bottom."""
+    for folder in ("training", "tests") if name(page).startswith(CHECKOUT) else ():
+        (desk / folder).symlink_to(REPO / folder)
     for block in blocks(page):
         if block.language == "python":
             snippet(block, desk)
@@ -239,24 +238,21 @@ def test_every_shortened_command_is_on_a_page() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "pages",
-    [
-        pytest.param(["README.md"], marks=pytest.mark.merge, id="README"),
-        pytest.param(
-            ["README.md", "docs/tutorials/first_part.md", "docs/howto/production.md"], id="all"
-        ),
-    ],
-)
 def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(
-    desk: Path, pages: list[str]
+    desk: Path,
 ) -> None:
     (suggested,) = re.findall(
         r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8")
     )
     shell(suggested.replace("--cycles 600", "--cycles 80"), desk)
-    for page in pages:
+    for page in ("README.md", "docs/tutorials/first_part.md", "docs/howto/production.md"):
         type_page(REPO / page, desk)
+
+
+def test_the_readme_shows_what_the_demo_types() -> None:
+    (demo,) = re.findall(r"\$\(RUN\) (.*)", (REPO / "Makefile").read_text("utf-8"))
+    readme = PAGES[0].read_text("utf-8")
+    assert f"\ndengine {demo.replace('$(OUT)', 'out')}\n" in readme
 
 
 def test_each_page_has_stores_and_folders_of_its_own() -> None:

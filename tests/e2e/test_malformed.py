@@ -96,7 +96,10 @@ def test_a_parameter_of_another_type_is_refused_before_any_retrain_fails_by_it(k
 @pytest.mark.parametrize(
     ("content", "text"),
     [
-        (b"radius = 0.3 # \xe9", r"mine\.toml is not UTF-8 text: .* at byte \d+; save it as UTF-8"),
+        (
+            b"radius = 0.3 # \xe9",
+            r"mine\.toml is not UTF-8 text: .* in position \d+: .*; save it as UTF-8",
+        ),
         (b"#" * (2**20 + 1), "at most 1 MB"),
     ],
     ids=["Latin-1", "many megabytes"],

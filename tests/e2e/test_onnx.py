@@ -75,7 +75,7 @@ def test_what_the_twin_cannot_do_is_refused(
             (engine, "ONNX carries no audits"),
             (
                 ModelPrediction("pca").fit(data.X, data.y, hashes=hashes),
-                "ONNX carries no votes: 1 of the references",
+                r"ONNX carries no votes of parts that came again \(1 references\)",
             ),
             (fitted(data, interval="jeffreys"), "use wilson or binomial"),
             *(
@@ -97,6 +97,25 @@ def test_what_the_twin_cannot_do_is_refused(
     )
     with pytest.raises(ExportError, match=r"needs onnxscript; pip install dengine\[onnx\]"):
         export_onnx(fitted(data), tmp_path / "model.onnx")
+
+
+def test_all_that_a_policy_needs_and_the_twin_lacks_is_named_at_once(
+    data: Dataset, tmp_path: Path
+) -> None:
+    policy = {
+        "audit_rate": 0.1,
+        "guarantee": "pooled",
+        "stops": "all",
+        "force_limits": ("0.01:0.1:-50:50",),
+    }
+    with trained(data, **policy) as engine, pytest.raises(ExportError) as refusal:
+        export_onnx(engine, tmp_path / "model.onnx")
+    assert str(refusal.value) == (
+        "ONNX carries no audits (set audit_rate = 0); nor PooledRule, a rule that learns (set "
+        "guarantee = 'local' and stops = 'some'); nor an operator's force limits. Export "
+        "torchscript instead."
+    )
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_damaged_file_and_a_foreign_one_are_refused(file: Path, tmp_path: Path) -> None:

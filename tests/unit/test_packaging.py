@@ -1,11 +1,14 @@
-"""What a user installs: small to import, complete, and nothing but `dengine`."""
+"""What a user imports: small, complete, and with its dependencies declared. `test_release.py` has what
+is in the wheel.
+"""
 
+import ast
 import re
-import shutil
 import subprocess
 import sys
-import sysconfig
-import zipfile
+import tomllib
+from importlib.metadata import packages_distributions
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -13,11 +16,9 @@ import pytest
 import dengine
 
 
-def fresh(code: str, *flags: str, cwd: Path | None = None) -> str:
+def fresh(code: str) -> str:
     """What code prints in a fresh interpreter."""
-    done = subprocess.run(
-        [sys.executable, *flags, "-c", code], capture_output=True, text=True, cwd=cwd
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout.strip()
 
@@ -52,98 +53,25 @@ def test_the_page_of_an_index_has_no_link_that_leads_into_a_checkout_and_its_exa
     assert (tmp_path / "engine.db").is_file()
 
 
-@pytest.fixture(scope="module")
-def wheel(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    # From a copy: setuptools leaves build/ behind and must not meet an old one.
-    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
-    shutil.copytree(
-        repo / "dengine", source / "dengine", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    for folder in ("models", "training", "tests", "notebooks"):
-        (source / folder).mkdir()
-        (source / folder / "__init__.py").touch()  # a trap: none of these may be packaged
-    for name in ("pyproject.toml", "LICENSE"):
-        shutil.copy(repo / name, source / name)
-    command = [
-        sys.executable,
-        "-m",
-        "build",
-        "--wheel",
-        "--no-isolation",
-        "--outdir",
-        str(out),
-        str(source),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
-    (built,) = out.glob("*.whl")
-    return built
-
-
-@pytest.mark.merge
-def test_the_wheel_has_dengine_whole_and_no_other_top_level_name(wheel: Path, repo: Path) -> None:
-    names = set(zipfile.ZipFile(wheel).namelist())
-    assert {name.split("/")[0] for name in names} == {
-        "dengine",
-        f"dengine-{dengine.__version__}.dist-info",
+def test_every_package_that_is_imported_is_declared(repo: Path) -> None:
+    trees = [ast.parse(path.read_text("utf-8")) for path in (repo / "dengine").rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    imported = {name.name for node in nodes if isinstance(node, ast.Import) for name in node.names}
+    imported |= {
+        node.module or "" for node in nodes if isinstance(node, ast.ImportFrom) and not node.level
     }
-    modules = {str(p.relative_to(repo)) for p in (repo / "dengine").rglob("*.py")}
-    assert modules <= names
-    assert {
-        "dengine/py.typed",
-        "dengine/data/insertion.npz",
-        "dengine/serve/page/static/uplot.LICENSE",
-    } <= names
-    sources = {
-        p.relative_to(repo).as_posix()
-        for p in (repo / "dengine" / "export" / "cpp").rglob("*")
-        if p.is_file()
-    }
-    assert len(sources) > 10
-    assert sources <= names
-    assert f"dengine-{dengine.__version__}.dist-info/licenses/LICENSE" in names
+    packages = {name.partition(".")[0] for name in imported} - sys.stdlib_module_names
+    assert {"torch", "uvicorn"} <= packages
+    project = tomllib.loads((repo / "pyproject.toml").read_text("utf-8"))["project"]
+    declared = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    names = {canonical(re.split(r"[<>=;\[]", requirement)[0]) for requirement in declared}
+    installed = packages_distributions()
+    assert [
+        package
+        for package in sorted(packages - {"dengine"})
+        if not names & set(map(canonical, installed.get(package, [package])))
+    ] == []
 
 
-HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "onnxruntime", "umap"}
-USE = """
-import sys
-sys.path[:0] = [{target!r}, {dependencies!r}]  # no .pth files
-import dengine, numpy as np
-from dengine import DataEngine, Recipe, load_dataset, replay
-print(dengine.__file__)
-DataEngine(recipe=Recipe("pca")).decide(np.random.default_rng(0).normal(size=100))
-print(*{{name.partition(".")[0] for name in sys.modules}})
-data = load_dataset("insertion")
-print(len(data), data.X.shape[1])
-print(len(replay(data, "pca", cycles=60).action))
-"""
-
-
-@pytest.fixture(scope="module")
-def target(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("installed") / "site"
-
-
-@pytest.fixture(scope="module")
-def used(wheel: Path, target: Path) -> list[str]:
-    """The lines that `USE` prints of the installed wheel: one process for several claims."""
-    zipfile.ZipFile(wheel).extractall(target)  # what installing a pure wheel with --target does
-    code = USE.format(target=str(target), dependencies=sysconfig.get_path("purelib"))
-    return fresh(code, "-I", "-S", cwd=target.parent).splitlines()
-
-
-@pytest.mark.merge
-def test_the_wheel_works_where_there_is_no_checkout(
-    used: list[str], target: Path, repo: Path
-) -> None:
-    where, _, size, played = used
-    assert Path(where).is_relative_to(target)
-    assert not Path(where).is_relative_to(repo)
-    assert (size, played) == ("1503 1000", "60")
-
-
-@pytest.mark.merge
-def test_an_engine_with_pca_in_memory_loads_nothing_heavy(used: list[str]) -> None:
-    loaded = {*used[1].split()}
-    assert {"dengine", "torch"} <= loaded
-    assert HEAVY & loaded == set(), "import it in the function that uses it"
+def canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name.strip()).lower()

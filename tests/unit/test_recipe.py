@@ -1,6 +1,6 @@
 """Every setting of an engine, from and to TOML."""
 
-import tomllib
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,15 +51,20 @@ def test_toml_gives_back_the_recipe(recipe: Recipe) -> None:
     )
 
 
-def test_the_recipe_files_equal_the_defaults_in_the_code(repo: Path) -> None:
-    paths = sorted((repo / "models" / "recipes").glob("*.toml"))
-    assert {"conv", "paper"} < {path.stem for path in paths} <= set(RECIPES)
-    for path in paths:
-        recipe = RECIPES[path.stem]
-        text = path.read_text(encoding="utf-8")
-        assert Recipe.load(path) == recipe, "run: python training/write_recipes.py"
-        assert text.endswith(recipe.to_toml()), "run: python training/write_recipes.py"
-        assert set(Recipe.__dataclass_fields__) <= set(tomllib.loads(text))
+def test_the_page_of_the_recipes_shows_them_as_they_are(repo: Path) -> None:
+    page = (repo / "docs" / "reference" / "recipes.md").read_text("utf-8")
+    (shown,) = re.findall(r"^```toml [^\n]*\n(.*?\n)```$", page, flags=re.M | re.S)
+    recipe = Recipe.load("conv")
+    assert shown.strip() == recipe.to_toml().strip()
+    table = [line.replace("`", "").strip("| ").split(" | ") for line in page.splitlines()]
+    _, _, *rows = [cells for cells in table if len(cells) == 7]
+    assert {name for name, *_ in rows} == set(RECIPES)
+    for name, reducer, radius, retrain_every, alpha, lower_bound, novelty in rows:
+        text = (
+            f'reducer = "{reducer}"\nradius = {radius}\nretrain_every = {retrain_every}\n'
+            f"novelty = {novelty}\n[policy]\nalpha = {alpha}\nlower_bound = {lower_bound}\n"
+        )
+        assert Recipe.from_toml(text) == RECIPES[name]
 
 
 def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None:

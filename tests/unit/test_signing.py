@@ -31,13 +31,13 @@ def test_a_key_is_new_secret_and_never_replaced(key: Path, tmp_path: Path) -> No
     assert len(bytes.fromhex(key.read_text().strip())) == 32
     assert make_key(tmp_path / "other.key").read_text() != key.read_text()
     kept = key.read_text()
-    with pytest.raises(ExportError, match="is there already"):
+    with pytest.raises(ExportError, match="File exists; name a new file"):
         make_key(key)
     (tmp_path / "link.key").symlink_to(tmp_path / "planted")
-    with pytest.raises(ExportError, match="is there already"):
+    with pytest.raises(ExportError, match="File exists; name a new file"):
         make_key(tmp_path / "link.key")
     done = command("export", "--make-key", tmp_path / "nowhere" / "cell.key")
-    assert (done.exit_code, "choose a folder that exists" in " ".join(done.output.split())) == (
+    assert (done.exit_code, "in a folder that is writable" in " ".join(done.output.split())) == (
         1,
         True,
     )

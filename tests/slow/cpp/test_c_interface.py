@@ -14,7 +14,7 @@ import torch
 
 import dengine
 from dengine import Dataset, export_torchscript, load_exported
-from dengine.errors import ExportError
+from dengine.errors import OutputError
 from dengine.export import export_sources, import_journal
 from dengine.records import ACTIONS, REASONS, Action
 from tests.support.command_line import dengine as command
@@ -111,7 +111,7 @@ def test_the_sources_come_into_an_empty_folder_alone(tmp_path: Path) -> None:
     assert done.exit_code == 0
     assert (tmp_path / "cell" / "VERSION").read_text() == f"{dengine.__version__}\n"
     assert (tmp_path / "cell" / "include" / "dengine.h").is_file()
-    with pytest.raises(ExportError, match="Expected a new or an empty folder"):
+    with pytest.raises(OutputError, match="Expected a new or an empty folder"):
         export_sources(tmp_path / "cell")
 
 

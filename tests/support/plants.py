@@ -1,22 +1,8 @@
-"""Write recordings as a robot cell makes them, from the bundled data set: examples for an import.
-
-    python training/make_recordings.py --out recordings --n 200 --broken 3
-    dengine data recordings
-    python training/make_recordings.py --out plants --plants --n 120
-
-The first command writes one CSV file per insertion, as UR cells record them, for example
-`insertion_0001_True.csv`: 960 to 1040 rows at 500 Hz, the simulated force in FZ_Base, small noise
-in the other columns, and the label in the name. A recording that is longer than the simulated one
-stays at its last level, with the noise of its sensor; a shorter one stops earlier. Of three broken
-files the first is empty, the second is cut in its last line, and the third has another name for the
-force. The same seed writes the same files.
-
---plants writes the same insertions, 200 samples at 100 Hz, as five plants might: CSV files in
-Latin-1 with decimal commas and labels in another file; the long Parquet table of a historian; a
-wide CSV of two channels; a ROS 2 bag; and an .npz file with other names.
+"""The bundled insertions as five plants might record them, 200 samples at 100 Hz: CSV files in Latin-1
+with decimal commas and labels in another file; the long Parquet table of a historian; a wide CSV of
+two channels; a ROS 2 bag; and an .npz file with other names.
 """
 
-import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -27,78 +13,12 @@ from numpy.typing import NDArray
 
 from dengine import load_dataset
 
-FORCES = ("FX_Base", "FY_Base", "FZ_Base")
-TORQUES = ("MuX_Base", "MuY_Base", "MuZ_Base")
-POSE = ("TCP_X", "TCP_Y", "TCP_Z", "TCP_RX", "TCP_RY", "TCP_RZ")
-CHANNELS = (*FORCES, *TORQUES, *POSE)
-NOISE = (0.4, 0.4, 0.0, 0.02, 0.02, 0.02, 2e-5, 2e-5, 2e-5, 1e-4, 1e-4, 1e-4)  # N, Nm, m, rad
-FORCE = CHANNELS.index("FZ_Base")
-SHORTEST = 960  # rows of a recording
-LONGEST = 1040
-TAIL = 50  # samples at the end that give the level and the noise of a longer recording
 PLANT_RATE_HZ = 100
 PLANT_STEP = 5  # of the 500 Hz samples, a plant has every fifth
 CYCLE_SECONDS = 12.0  # from one recording to the next
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-
-def record(force: NDArray[np.float32], rng: np.random.Generator) -> Floats:
-    """Return a force (T,) as a recording (rows, channels) of a random length."""
-    n_rows = int(rng.integers(SHORTEST, LONGEST + 1))
-    tail = force[-TAIL:].astype(np.float64)
-    rest = tail.mean() + rng.normal(0.0, tail.std(), max(0, n_rows - len(force)))
-    values = rng.normal(0.0, NOISE, (n_rows, len(CHANNELS)))
-    values[:, FORCE] = np.concatenate([force, rest])[:n_rows]
-    values[:, CHANNELS.index("TCP_Z")] += np.linspace(0.25, 0.21, n_rows)
-    return values
-
-
-def to_csv(values: Floats, start_s: float, rate_hz: float) -> str:
-    """Return a recording as CSV text: the seconds of the controller, then the channels."""
-    frame = pd.DataFrame(values, columns=CHANNELS)
-    frame.insert(0, "Timestamp", start_s + np.arange(len(values)) / rate_hz)
-    return str(frame.to_csv(index=False, float_format="%.7g"))
-
-
-def break_text(text: str, index: int) -> str:
-    """Return a file's text broken in one of three ways, which follow each other by `index`.
-
-    It is empty, or cut off in its last line, or its force has another name.
-    """
-    if index % 3 == 0:
-        return ""
-    if index % 3 == 1:
-        return text[: text.rindex(",") - 10]
-    return text.replace("FZ_Base", "FZ")
-
-
-def write_recordings(
-    folder: Path, n: int = 200, n_broken: int = 3, seed: int = 0, rate_hz: float = 500.0
-) -> list[str]:
-    """Write n recordings as CSV files, some of them broken; return the names of the broken ones.
-
-    Raises SystemExit unless 0 <= n_broken <= n, and n is at most the number of bundled traces.
-    """
-    rng = np.random.default_rng(seed)
-    data = load_dataset("insertion")
-    if not 0 <= n_broken <= n <= len(data):
-        raise SystemExit(
-            f"Expected 0 <= --broken <= --n <= {len(data)}, got --broken {n_broken} and --n {n}."
-        )
-    folder.mkdir(parents=True, exist_ok=True)
-    rows = rng.permutation(len(data))[:n]
-    broken = sorted(rng.choice(n, n_broken, replace=False).tolist())
-    broken_names = []
-    for i, row in enumerate(rows):
-        name = f"insertion_{i + 1:04d}_{bool(data.y[row])}.csv"
-        text = to_csv(record(data.X[row], rng), 1000.0 + CYCLE_SECONDS * i, rate_hz)
-        if i in broken:
-            text = break_text(text, broken.index(i))
-            broken_names.append(name)
-        (folder / name).write_text(text, encoding="utf-8")
-    return broken_names
 
 
 def write_plants(folder: Path, n: int = 120, seed: int = 0) -> None:
@@ -235,34 +155,3 @@ def cell_messages(forces: Floats, good: Bools) -> Iterator[Message]:
             yield time, "/wrench", {"force": zero | {"z": float(z)}, "torque": zero}
             if i == len(rest) + 10 + len(force):
                 yield time, "/height_check/ok", {"data": bool(is_good)}
-
-
-def main() -> None:
-    """Write the recordings; print the names of the broken ones."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, help="the folder to write; created if it is missing"
-    )
-    parser.add_argument("--n", type=int, default=200, help="files (default: 200)")
-    parser.add_argument(
-        "--broken", type=int, default=3, help="how many of these cannot be read (default: 3)"
-    )
-    parser.add_argument(
-        "--seed", type=int, default=0, help="the same seed, the same files (default: 0)"
-    )
-    parser.add_argument(
-        "--plants", action="store_true", help="write five folders, as five plants do"
-    )
-    arguments = parser.parse_args()
-    if arguments.plants:
-        write_plants(arguments.out, arguments.n, arguments.seed)
-        return
-    names = write_recordings(arguments.out, arguments.n, arguments.broken, arguments.seed)
-    broken = ", ".join(names) or "none"
-    print(f"Wrote {arguments.n} recordings to {arguments.out}; broken: {broken}.")
-
-
-if __name__ == "__main__":
-    main()
