@@ -29,7 +29,7 @@ VERBS = sorted(main.commands)
 LESS = {  # so that an example takes seconds; its own options are all read
     "compare": "--reducers pca --repeats 1 --cycles 60",
     "costs": "--alphas 0.5 --lower-bounds 0.8 --cycles 100 --n-jobs 1",
-    "replay": "--repeats 1 --cycles 60",
+    "replay": "--repeats 1 --cycles 60 --reducer pca",
     "run": "--cycles 6",
     "simulate": "--n 4",
     "train": "--data small.npz --reducer pca",

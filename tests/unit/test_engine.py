@@ -421,7 +421,7 @@ def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(
 
 # A process takes seconds to start, and `RetrainingProcess` is one: test_retraining_process.py.
 @pytest.mark.parametrize(
-    "kind", ["thread", pytest.param("spawned process", marks=pytest.mark.merge)]
+    "kind", ["thread", pytest.param("spawned process", marks=pytest.mark.slow)]
 )
 def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: Dataset) -> None:
     def learn(engine: DataEngine) -> DataEngine:
