@@ -4,8 +4,11 @@ at hand.
 
 from __future__ import annotations
 
+import gc
 import os
 
+# A collection goes through the objects of every imported library, and frees next to nothing.
+gc.set_threshold(50_000)
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is steadier at these sizes
 os.environ.setdefault(
     "DENGINE_STORE_WAIT", "30"
@@ -72,6 +75,7 @@ SLOW_CASES = ("umap-learn", "UmapLearn", "postgres", "minirocket")
 # compiler. Single tests are marked where they stand.
 MERGE = (
     "test_without_posix",
+    "test_retraining_process",
     "test_serve_process",
     "test_page",
     "test_read_only",

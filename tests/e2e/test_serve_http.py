@@ -698,6 +698,7 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(
     assert not (tmp_path / "cell.db").exists()
 
 
+@pytest.mark.merge  # each start begins with that of the process that retrains
 def test_what_runs_beside_has_to_start_too_or_one_line_says_why(tmp_path: Path) -> None:
     pytest.importorskip("asyncua")
     words = ("--store", tmp_path / "cell.db", "--reducer", "pca", "--port", "0")
