@@ -75,7 +75,6 @@ SLOW_CASES = ("umap-learn", "UmapLearn", "postgres", "minirocket")
 # compiler. Single tests are marked where they stand.
 MERGE = (
     "test_without_posix",
-    "test_retraining_process",
     "test_serve_process",
     "test_page",
     "test_read_only",

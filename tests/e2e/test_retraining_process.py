@@ -140,6 +140,7 @@ def test_it_ends_with_whoever_made_it_also_at_work(
         at_work.result(0)
 
 
+@pytest.mark.merge
 def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_taken_for_hung(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -157,6 +158,7 @@ def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_ta
         assert [report.accepted for report in engine.store.versions.retrains()] == [True]
 
 
+@pytest.mark.merge
 def test_a_process_that_was_given_up_is_started_again_and_retrains(
     data: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
