@@ -156,6 +156,8 @@ def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(
         *POLICY,
         "--repeats",
         2,
+        "--cycles",
+        100,
         "--check-seconds",
         9,
     ]
@@ -277,6 +279,8 @@ def test_a_store_goes_on_with_a_reducer_of_this_folder(
         *POLICY,
         "--repeats",
         1,
+        "--cycles",
+        100,
         "--out",
         "out",
     ]

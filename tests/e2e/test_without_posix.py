@@ -35,9 +35,9 @@ from dengine import replay
 from dengine.store import journal, owned_file
 assert not hasattr(owned_file.os, "pread") and not hasattr(journal.os, "O_NOFOLLOW")
 """
-# A link in a journal's place, a token's file, and a child of the process that has the cell.
+# A link in a journal's place, a token's file, a child of the process that has the cell, and a verb as it is typed.
 FILES = """
-import subprocess, sys
+import runpy, subprocess, sys
 from pathlib import Path
 from dengine import DataEngine
 from dengine.errors import StoreError
@@ -55,6 +55,8 @@ DataEngine.open(folder / "engine.db").close()
 child.kill()
 child.wait()
 print("opened")
+sys.argv[1:] = ["status", str(folder / "engine.db")]
+runpy.run_module("dengine", run_name="__main__")
 """
 REPORTING = """
 import sys, time
@@ -158,6 +160,7 @@ def test_every_module_imports_and_files_of_the_system_are_used_as_elsewhere(tmp_
     text = python("-c", EVERY_MODULE + FILES, tmp_path)
     assert "Could not use the journal" in text
     assert "\n1 token\nopened\n" in text
+    assert "What it is" in text  # of a status
     assert (tmp_path / "mine").read_bytes() == b"my notes"
 
 
@@ -199,4 +202,3 @@ def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
     words = json.dumps([[str(word) for word in command] for command in commands])
     results = json.loads(python("-m", "tests.support.verbs", words).splitlines()[-1])
     assert [result for result in results if result["exit_code"] != 0] == []
-    python("-m", "dengine", "status", store)  # as it is typed

@@ -371,7 +371,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
     stream: Dataset,
 ) -> None:
     engine = make(POOLED)
-    play(engine, stream)
+    play(engine, stream, 0, 300)
     for x in stream.X[stream.y == 1][:12]:
         engine.decide(x + np.float32(0.02))
     engine.retrain(wait=False)
@@ -384,7 +384,7 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
         raise RuntimeError(reason)
 
     engine = make(POOLED, on_safe_mode=angry)
-    play(engine, stream)
+    play(engine, stream, 0, 300)
     play(engine, spoiled(stream))
     assert engine.safe_mode
     status = engine.store.decisions.counts()
@@ -578,7 +578,7 @@ def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_t
     stream: Dataset,
 ) -> None:
     engine = make(replace(LOCAL, audit_rate=0.3))
-    play(engine, stream)
+    play(engine, stream, 0, 300)
     result = rejected(engine, stream)
     n = engine.status().certificate.rejected.n
     assert "rejected parts were good" not in engine.status().alarm
