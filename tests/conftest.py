@@ -4,8 +4,11 @@ at hand.
 
 from __future__ import annotations
 
+import gc
 import os
 
+# A collection goes through the objects of every imported library, and frees next to nothing.
+gc.set_threshold(50_000)
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: one thread is steadier at these sizes
 os.environ.setdefault(
     "DENGINE_STORE_WAIT", "30"
@@ -92,8 +95,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         stem, case = item.path.stem, item.callspec.id if hasattr(item, "callspec") else ""
         item.add_marker(pytest.mark.xdist_group(GROUPS.get(stem, stem)))
         is_slow_case = any(name in case for name in SLOW_CASES)
-        is_slow = is_slow_case or item.get_closest_marker("slow") is not None
-        if (stem in MERGE and not is_slow) or "postgres" in case:
+        is_marked = item.get_closest_marker("slow") is not None
+        if not is_marked and ("postgres" in case or (stem in MERGE and not is_slow_case)):
             item.add_marker("merge")
         if item.get_closest_marker("merge") or SLOW in item.path.parents or is_slow_case:
             item.add_marker("slow")

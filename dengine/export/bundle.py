@@ -68,10 +68,6 @@ def make_key(path: FilePath) -> Path:
         If there is a file already, because models may be signed with it, or it cannot be written.
     """
     target = Path(path)
-    if os.path.lexists(target):
-        raise ExportError(
-            f"{target} is there already, and files may be signed with it; name a new one."
-        )
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
     do = "name a new file in a folder that is writable; files may be signed with an old key"
     with (

@@ -107,6 +107,7 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
     np.testing.assert_array_equal(baseline.predict_interval(X[120:]), before)
 
 
+@pytest.mark.merge  # it starts a process
 def test_the_table_imports_nothing() -> None:
     code = "import sys; from dengine.experiments.baselines import BASELINES; print(*{'aeon'} & {*sys.modules})"
     assert (

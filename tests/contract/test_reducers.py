@@ -251,7 +251,7 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
     engine = DataEngine.open(tmp_path / "e.db", reducer=TEACHABLE[name](), replaying=True)
     if first:
         learn(range(150))
-    reports = [engine.retrain() for _ in range(3)]
+    reports = [engine.retrain() for _ in range(2)]
     assert [report.reason for report in reports if not report.accepted] == []
     texts = [engine.decide(x) for x in X[160:]]
     assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {report.reason for report in texts}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -52,7 +53,7 @@ def store(left: Path, tmp_path: Path) -> Path:
 def marks(file: Path) -> list[int]:
     """Where the records begin that the store lacks: two of each part."""
     content = file.read_bytes()
-    begins = [i for i in range(len(content)) if content.startswith(journal.MARK, i)]
+    begins = [found.start() for found in re.finditer(re.escape(journal.MARK), content)]
     return begins[-2 * IN_JOURNAL :]
 
 

@@ -70,7 +70,9 @@ class DemoCell:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DemoCell]:
     folder = tmp_path_factory.mktemp("demo")
-    with started(folder, "--demo") as process:
+    # The policy of the demonstration; pca, since no page shows how long a reducer trains.
+    words = "--demo --reducer pca --alpha 0.1 --lower-bound 0.9 --audit-rate 0.05"
+    with started(folder, *words.split()) as process:
         yield DemoCell(f"http://127.0.0.1:{process.port}", folder / "cell.db")
         process.end()
 

@@ -90,7 +90,8 @@ class Robots:
                 return
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+# The end by Ctrl-C is the same once more, sent to the whole group.
+@pytest.mark.parametrize("name", [pytest.param("SIGINT", marks=pytest.mark.slow), "SIGTERM"])
 def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(
     tmp_path, parts, name: str
 ) -> None:

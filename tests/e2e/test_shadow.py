@@ -50,6 +50,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.merge  # it starts a process
 def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(
     stream: Dataset, tmp_path: Path
 ) -> None:

@@ -34,6 +34,29 @@ from dengine import replay
 from dengine.store import journal, owned_file
 assert not hasattr(owned_file.os, "pread") and not hasattr(journal.os, "O_NOFOLLOW")
 """
+# A link in a journal's place, a token's file, a child of the process that has the cell, and a verb as it is typed.
+FILES = """
+import runpy, subprocess, sys
+from pathlib import Path
+from dengine import DataEngine
+from dengine.errors import StoreError
+from dengine.serve.auth import read_tokens
+folder = Path(sys.argv[1])
+try:
+    DataEngine("pca", store=folder / "linked.db")
+except StoreError as error:
+    print(" ".join(str(error).split()))
+print(len(read_tokens(folder / "token")), "token")
+engine = DataEngine("pca", store=folder / "engine.db")
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], close_fds=False)
+engine.close()
+DataEngine.open(folder / "engine.db").close()
+child.kill()
+child.wait()
+print("opened")
+sys.argv[1:] = ["status", str(folder / "engine.db")]
+runpy.run_module("dengine", run_name="__main__")
+"""
 REPORTING = """
 import sys, time
 from dengine import DataEngine
@@ -47,7 +70,20 @@ for i in range(40):
 print("done", flush=True)
 time.sleep(600)
 """
-SECOND = "import sys; from dengine import DataEngine; DataEngine.open(sys.argv[1])"
+# Opens the store while another process has it, says why it is refused, and again once a line comes.
+SECOND = """
+import sys
+from dengine import DataEngine
+from dengine.errors import StoreError
+try:
+    DataEngine.open(sys.argv[1])
+    print("nobody has it", flush=True)
+except StoreError as error:
+    print(" ".join(str(error).split()), flush=True)
+ids = sys.stdin.readline().split()
+engine = DataEngine.open(sys.argv[1])
+print(*[engine.find(id_).success for id_ in ids])
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -62,10 +98,6 @@ def python(*words: object, code: int = 0) -> str:
     )
     assert done.returncode == code, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout + done.stderr
-
-
-def test_every_module_imports() -> None:
-    python("-c", EVERY_MODULE)
 
 
 def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_not(
@@ -92,54 +124,38 @@ def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
 
 
 def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(tmp_path: Path) -> None:
-    store = tmp_path / "engine.db"
-    command = [sys.executable, "-c", REPORTING, str(store)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        lines = []
-        for line in process.stdout:
-            if line == "done\n":
-                break
-            lines.append(line.split())
-        refused = python("-c", SECOND, store, code=1)
-        process.kill()
-        process.wait(WAIT)
+    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+    commands = [
+        [sys.executable, "-c", code, tmp_path / "engine.db"] for code in (REPORTING, SECOND)
+    ]
+    with subprocess.Popen(commands[0], stdout=subprocess.PIPE, text=True) as process:
+        lines = [line.split() for line in iter(process.stdout.readline, "done\n")]
+        with subprocess.Popen(commands[1], text=True, **pipes) as second:
+            refused = second.stdout.readline()
+            process.kill()
+            process.wait(WAIT)
+            answers, _ = second.communicate(" ".join(id_ for id_, _ in lines) + "\n", timeout=WAIT)
     assert f"process {process.pid} on " in refused
-    assert "StoreError" in refused
     assert len(lines) == 40
-    text = "engine = DataEngine.open(sys.argv[1]); print(*[engine.find(each).success for each in sys.argv[2:]])"
-    result = python(
-        "-c",
-        f"import sys; from dengine import DataEngine; {text}",
-        store,
-        *(id_ for id_, _ in lines),
+    assert (second.returncode, answers.split()[-40:]) == (
+        0,
+        [str(label == "1") for _, label in lines],
     )
-    assert result.split()[-40:] == [str(label == "1") for _, label in lines]
 
 
-def test_a_child_process_does_not_keep_the_cell(tmp_path: Path) -> None:
-    text = (
-        "import subprocess, sys; from dengine import DataEngine; engine = DataEngine('pca', store=sys.argv[1]); "
-        "child = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'], close_fds=False); "
-        "engine.close(); DataEngine.open(sys.argv[1]).close(); child.kill(); child.wait(); print('opened')"
-    )
-    assert "opened" in python("-c", text, tmp_path / "engine.db")
-
-
-def test_a_link_in_the_journals_place_is_refused(tmp_path: Path) -> None:
+def test_every_module_imports_and_files_of_the_system_are_used_as_elsewhere(tmp_path: Path) -> None:
+    """A link in a journal's place is refused, a token's bits say nothing of who may read it, and a
+    child process does not keep the cell.
+    """
     (tmp_path / "mine").write_bytes(b"my notes")
-    (tmp_path / "engine.db.cell.journal").symlink_to(tmp_path / "mine")
-    text = "import sys; from dengine import DataEngine; DataEngine('pca', store=sys.argv[1])"
-    assert "Could not use the journal" in python("-c", text, tmp_path / "engine.db", code=1)
-    assert (tmp_path / "mine").read_bytes() == b"my notes"
-
-
-def test_a_tokens_file_is_read_whose_bits_say_nothing_of_who_may_read_it(tmp_path: Path) -> None:
+    (tmp_path / "linked.db.cell.journal").symlink_to(tmp_path / "mine")
     (tmp_path / "token").write_text("t" * 32, encoding="utf-8")
     (tmp_path / "token").chmod(0o666)
-    text = "import sys; from pathlib import Path; from dengine.serve.auth import read_tokens; "
-    assert "1 token" in python(
-        "-c", f"{text}print(len(read_tokens(Path(sys.argv[1]))), 'token')", tmp_path / "token"
-    )
+    text = python("-c", EVERY_MODULE + FILES, tmp_path)
+    assert "Could not use the journal" in text
+    assert "\n1 token\nopened\n" in text
+    assert "What it is" in text  # of a status
+    assert (tmp_path / "mine").read_bytes() == b"my notes"
 
 
 def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
@@ -180,4 +196,3 @@ def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
     words = json.dumps([[str(word) for word in command] for command in commands])
     results = json.loads(python("-m", "tests.support.verbs", words).splitlines()[-1])
     assert [result for result in results if result["exit_code"] != 0] == []
-    python("-m", "dengine", "status", store)  # as it is typed

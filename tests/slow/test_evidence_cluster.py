@@ -9,13 +9,15 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pandas as pd
 import pytest
 
-distributed = pytest.importorskip("distributed")
+if find_spec("distributed") is None:  # to import it takes every worker a second
+    pytest.skip("needs distributed", allow_module_level=True)
 
 SCRIPT = Path(__file__).resolve().parents[2] / "training" / "evidence.py"
 TINY = ["--only=pca", "--sets=drift", "--cycles=200", "--cells=1", "--seeds=100:102"]
@@ -24,8 +26,10 @@ DECISIONS = ["seed", "certain", "accepted", "rejected", "false_positive", "net_s
 
 
 @contextmanager
-def cluster() -> Iterator["distributed.Client"]:
+def cluster() -> Iterator[Any]:
     """Start two worker processes; the client of their scheduler."""
+    import distributed
+
     workers = {"n_workers": 2, "threads_per_worker": 1, "processes": True}
     with (
         distributed.LocalCluster(**workers, dashboard_address=None, silence_logs=50) as local,

@@ -227,7 +227,7 @@ def step(engine: DataEngine, data: Dataset, kind: str, value) -> None:
 @pytest.mark.parametrize(
     "recipe", [pytest.param(RECIPE, marks=pytest.mark.slow), POOLED], ids=["local", "pooled"]
 )
-@settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=3, deadline=None, suppress_health_check=list(HealthCheck))
 @given(steps=STEPS)
 def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(
     recipe, steps, make_data, tmp_path_factory
@@ -339,7 +339,7 @@ def test_after_forgetting_a_label_the_weights_are_as_if_it_had_been_another(
 ) -> None:
     data = make_data(80)
     policy = replace(RECIPE.policy, alpha=0.001, lower_bound=0.999)  # that verifies them all
-    recipe = replace(Recipe.load("conv"), policy=policy, retrain_every=30, max_steps=5)
+    recipe = replace(Recipe.load("conv"), policy=policy, retrain_every=30, max_steps=5, folds=2)
     predicted = []
     for label in (True, False):
         (place := tmp_path / str(label)).mkdir()

@@ -337,27 +337,23 @@ def test_a_search_that_is_interrupted_shows_what_was_finished(
     assert nothing.curve() is None
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
+def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejected(
+    make_data: Callable[..., Dataset],
+) -> None:
+    data = make_data(160)
+    scores = replay(data, Recipe("rocket", policy=Policy(shadow=True)), 3)
+    for changes in (
         {"guarantee": "local", "alpha": 0.5, "lower_bound": 0.8},
         {"guarantee": "pooled", "lower_bound": 0.7},
         {"prices": (5, 20, 11), "audit_rate": 0.0},
-    ],
-    ids=["local", "pooled", "cost"],
-)
-def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejected(
-    changes: dict[str, Any], make_data: Callable[..., Dataset]
-) -> None:
-    data = make_data(160)
-    policy = Policy(stops="all").changed(**changes)
-    scores = replay(data, Recipe("rocket", policy=Policy(shadow=True)), 3)
-    shared = replay_policy(scores, policy)
-    alone_ = replay(data, Recipe("rocket", policy=policy), 3)
-    first = int(np.argmax(np.append(alone_.action == "reject", True)))
-    assert (alone_.action[:first] != "verify").any()
-    np.testing.assert_array_equal(shared.action[: first + 1], alone_.action[: first + 1])
-    assert shared.recipe.policy == policy
+    ):
+        policy = Policy(stops="all").changed(**changes)
+        shared = replay_policy(scores, policy)
+        alone_ = replay(data, Recipe("rocket", policy=policy), 3)
+        first = int(np.argmax(np.append(alone_.action == "reject", True)))
+        assert (alone_.action[:first] != "verify").any(), changes
+        np.testing.assert_array_equal(shared.action[: first + 1], alone_.action[: first + 1])
+        assert shared.recipe.policy == policy
 
 
 def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data) -> None:

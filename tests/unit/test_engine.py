@@ -4,9 +4,8 @@ import gc
 import subprocess
 import sys
 from collections import Counter
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from threading import Event
 from threading import enumerate as living_threads
@@ -419,11 +418,8 @@ def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(
         DataEngine.open(SqlStore())
 
 
-# A process takes seconds to start, and `RetrainingProcess` is one: test_retraining_process.py.
-@pytest.mark.parametrize(
-    "kind", ["thread", pytest.param("spawned process", marks=pytest.mark.merge)]
-)
-def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: Dataset) -> None:
+# That one in a process of its own does so too is in test_retraining_process.py.
+def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(data: Dataset) -> None:
     def learn(engine: DataEngine) -> DataEngine:
         ids = [engine.decide(x).id for x in data.X[:100]]
         for name, y in zip(ids, data.y[:100], strict=True):
@@ -434,12 +430,7 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(kind: str, data: 
 
     recipe = replace(RECIPE, retrain_every=80)
     inline = learn(make(recipe))
-    pool = (
-        ThreadPoolExecutor(1)
-        if kind == "thread"
-        else ProcessPoolExecutor(1, mp_context=get_context("spawn"))
-    )
-    with pool:
+    with ThreadPoolExecutor(1) as pool:
         beside = learn(make(recipe, executor=pool))
     beside.poll()  # swaps in what the pool has finished
     assert inline.version == beside.version == 1

@@ -66,7 +66,7 @@ SLOW = [
 def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(
     name: str, make_data, tmp_path: Path
 ) -> None:
-    data = make_data(260, samples=60)
+    data = make_data(200, samples=60)
     with played(tmp_path, data, RECIPES[name]) as engine:
         balls = 0
         for past in list(engine.history())[::6]:
@@ -291,7 +291,7 @@ def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_mad
     make_data, tmp_path: Path, clock_goes: float
 ) -> None:
     times = iter(np.arange(1e6) * clock_goes + 1e9)
-    data, window = make_data(260, samples=60), "0:0.1:-1000:1000"
+    data, window = make_data(160, samples=60), "0:0.1:-1000:1000"
     engine = played(
         SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))),
         data,

@@ -320,7 +320,17 @@ class RandomHistory:
         self.engine = DataEngine.open(self.folder / "running" / "e.db", replaying=True)
 
 
-@pytest.mark.parametrize("policy", HISTORIES.values(), ids=HISTORIES)
+# With audits there are overdue checks of either kind; without them the long run is the same again.
+REPEATED = ("pooled", "cost")
+
+
+@pytest.mark.parametrize(
+    "policy",
+    [
+        pytest.param(policy, id=name, marks=[pytest.mark.slow] * (name in REPEATED))
+        for name, policy in HISTORIES.items()
+    ],
+)
 def test_in_random_histories_with_overdue_checks_a_reopened_engine_is_the_one_that_ran(
     stream: Dataset, tmp_path: Path, policy: Policy
 ) -> None:
@@ -361,7 +371,7 @@ def test_a_retrain_that_is_asked_for_while_confirmations_wait_stores_them_first(
     stream: Dataset,
 ) -> None:
     engine = make(POOLED)
-    play(engine, stream)
+    play(engine, stream, 0, 300)
     for x in stream.X[stream.y == 1][:12]:
         engine.decide(x + np.float32(0.02))
     engine.retrain(wait=False)
@@ -374,7 +384,7 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
         raise RuntimeError(reason)
 
     engine = make(POOLED, on_safe_mode=angry)
-    play(engine, stream)
+    play(engine, stream, 0, 300)
     play(engine, spoiled(stream))
     assert engine.safe_mode
     status = engine.store.decisions.counts()
@@ -420,7 +430,7 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
         rf"\d+ of {n_parts} parts since the alarm are evidence, \d+ wrong: like this it does not end",
         recovery,
     )
-    play(engine, make_data(1500, samples=60, seed=9))  # more than the bad ones, which are learned
+    play(engine, make_data(800, samples=60, seed=9))  # more than the bad ones, which are learned
     assert (engine.safe_mode, heard[-1], engine.store.events.newest()[-1].kind) == (
         "",
         "",
@@ -523,7 +533,7 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
     policy: Policy, stream: Dataset, tmp_path: Path
 ) -> None:
     with make(policy, store=tmp_path / "engine.db") as engine:
-        play(engine, stream)
+        play(engine, stream, 0, 300)
         bad = replace(stream, X=stream.X + np.float32(0.001))
         result = rejected(engine, bad)
         assert len(result) > 3
@@ -568,7 +578,7 @@ def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_t
     stream: Dataset,
 ) -> None:
     engine = make(replace(LOCAL, audit_rate=0.3))
-    play(engine, stream)
+    play(engine, stream, 0, 300)
     result = rejected(engine, stream)
     n = engine.status().certificate.rejected.n
     assert "rejected parts were good" not in engine.status().alarm

@@ -61,7 +61,13 @@ class Fleet:
         return self.opened[-1]
 
 
-@pytest.fixture(params=DATABASES)
+# What one database server shares between cells is tried on both before each merge; the rest on
+# SQLite alone, and on PostgreSQL with the slow tests.
+ON_BOTH = pytest.mark.parametrize("fleet", DATABASES, indirect=True)
+SERVER = pytest.param("postgres", marks=[*DATABASES[1].marks, pytest.mark.slow])
+
+
+@pytest.fixture(params=["sqlite", SERVER])
 def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
     created = Fleet(url_of(request.param, tmp_path))
     yield created
@@ -120,13 +126,13 @@ def test_a_new_cell_decides_at_once_and_as_its_peers_do(
 
 
 @pytest.mark.parametrize(
-    "recipe", [RECIPE, pytest.param(CONV, marks=pytest.mark.merge)], ids=["pca", "conv"]
+    "recipe", [RECIPE, pytest.param(CONV, marks=pytest.mark.slow)], ids=["pca", "conv"]
 )
 def test_one_retrain_serves_all(
     recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:
     cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
-    for i in range(90):
+    for i in range(60):
         learn(cells[i % 3], parts, [i])
     for engine in cells:
         engine.poll()
@@ -221,6 +227,7 @@ def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_g
     assert counts(first, probe) == counts(second, probe)
 
 
+@ON_BOTH
 def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
     fleet: Fleet, parts, probe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -245,10 +252,11 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     assert predictions(first, probe) == predictions(second, probe)
 
 
+@ON_BOTH
 def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
     fleet: Fleet, parts: Dataset, probe
 ) -> None:
-    first, second = taught(fleet, parts, 90)
+    first, second = taught(fleet, parts, 60)
     wrong, *gone = [past.decision.id for past in first.history() if past.success is not None][20:24]
     first.correct(wrong, not first.store.decisions.get(wrong).success)
     first.forget(*gone)
@@ -277,7 +285,7 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
 def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases_it(
     fleet: Fleet, parts: Dataset
 ) -> None:
-    first, second = taught(fleet, parts, 90)
+    first, second = taught(fleet, parts, 60)
     with ThreadPoolExecutor(1) as executor:
         third = fleet.engine("c", executor=executor)
         third.retrain(wait=False)  # it does not know of the rollback
@@ -285,9 +293,9 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
         executor.shutdown()
     pinned = first.version
     for engine, rows in (
-        (third, range(90, 91)),
-        (second, range(91, 140)),
-        (first, range(140, 190)),
+        (third, range(60, 61)),
+        (second, range(61, 100)),
+        (first, range(100, 140)),
     ):
         engine.poll()
         learn(engine, parts, rows)
@@ -302,8 +310,8 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
 
 def test_each_cell_counts_what_became_of_its_own_parts(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a", recipe=POOLED), fleet.engine("b", recipe=POOLED)
-    learn(first, parts, range(120))
-    learn(second, parts, range(120, 160))
+    learn(first, parts, range(80))
+    learn(second, parts, range(80, 120))
     evidence = [len(engine.store.labels.outcomes_since(0)) for engine in (first, second)]
     assert evidence == [engine.store.decisions.counts()["labels"] for engine in (first, second)]
     assert rule(first) != rule(second)
@@ -334,6 +342,7 @@ def reopened(fleet: Fleet, engine: DataEngine) -> SqlStore:
     return SqlStore(fleet.url, cell_id)  # its product is known
 
 
+@ON_BOTH
 def test_nothing_is_mixed_between_products_and_cells_without(
     fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:
@@ -359,6 +368,7 @@ def test_nothing_is_mixed_between_products_and_cells_without(
         )
 
 
+@ON_BOTH
 def test_label_numbers_are_unique_and_increase_over_the_product(
     fleet: Fleet, parts: Dataset
 ) -> None:
@@ -367,15 +377,15 @@ def test_label_numbers_are_unique_and_increase_over_the_product(
     with ThreadPoolExecutor(4) as pool:
         list(
             pool.map(
-                lambda engine, i: learn(engine, parts, range(25 * i, 25 * i + 25)),
+                lambda engine, i: learn(engine, parts, range(10 * i, 10 * i + 10)),
                 fleet.opened,
                 range(4),
             )
         )
-    assert [engine.store.decisions.counts()["labels"] for engine in fleet.opened] == [25] * 4
+    assert [engine.store.decisions.counts()["labels"] for engine in fleet.opened] == [10] * 4
     seen = fleet.opened[0].store.labels.with_traces()
-    assert seen.seq.tolist() == list(range(1, 101))
-    assert {trace.tobytes() for trace in seen.traces} == {x.tobytes() for x in parts.X[:100]}
+    assert seen.seq.tolist() == list(range(1, 41))
+    assert {trace.tobytes() for trace in seen.traces} == {x.tobytes() for x in parts.X[:40]}
 
 
 class ShakyNews:
@@ -392,6 +402,7 @@ class ShakyNews:
         return self._news_since(seq, limit)
 
 
+@ON_BOTH
 def test_a_cell_without_news_goes_on_and_says_so_once(
     fleet: Fleet, parts: Dataset, probe: np.ndarray, caplog
 ) -> None:
@@ -446,6 +457,7 @@ def test_the_first_trace_of_any_cell_sets_the_contract(fleet: Fleet, parts: Data
     assert second.trace == first.trace == fleet.engine("c").trace
 
 
+@ON_BOTH
 def test_a_cell_keeps_its_product_and_one_that_worked_alone_joins_none(
     fleet: Fleet, parts: Dataset
 ) -> None:
@@ -484,6 +496,7 @@ def test_questions_about_a_product_go_down_an_index(tmp_path: Path) -> None:
         ], (statement, plan)
 
 
+@ON_BOTH
 def test_the_cells_of_a_database_are_listed(fleet: Fleet, parts: Dataset) -> None:
     learn(fleet.engine("a"), parts, range(30))
     fleet.engine("b")

@@ -165,7 +165,7 @@ def test_a_journal_that_grew_adds_what_is_new(
 ) -> None:
     X, result = make_data(7, seed=4).X, {}
     new = new_store(data, tmp_path / "new.db", stops=stops, audit_rate=0.1)
-    for cuts in ([7], [2, 3, 7], range(1, 8)):
+    for cuts in ([7], range(1, 8)):
         path = shutil.copy(new, str(tmp_path / f"{len(cuts)}.db"))
         for n in cuts:
             import_journal(path, write_lines(tmp_path / "cell.csv", X, CELL[:n]))
@@ -179,7 +179,7 @@ def test_a_journal_that_grew_adds_what_is_new(
             engine.report(
                 engine.decide(make_data(1, seed=8, noise=9.0).X[0]).id, True
             )  # silence adds up: no StoreError
-    assert result[1] == result[3] == result[7]
+    assert result[1] == result[7]
 
 
 LATE = [

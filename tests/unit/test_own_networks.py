@@ -269,6 +269,7 @@ def test_the_contract_of_a_reducer_has_what_an_engine_requires_of_a_version(netw
         check_reducer(reducer_of(network))
 
 
+@pytest.mark.slow  # the whole contract of a reducer once more, in Python
 def test_a_network_that_compiles_and_does_not_run_answers_in_python_and_keeps_the_contract(
     tmp_path: Path,
 ) -> None:

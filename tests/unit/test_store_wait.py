@@ -67,6 +67,7 @@ print("closed")
 """
 
 
+@pytest.mark.merge  # it starts a process
 def test_on_a_full_disk_only_report_raises(tmp_path: Path) -> None:
     store = tmp_path / "engine.db"
     done = subprocess.run(

@@ -83,6 +83,7 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
     assert report.quarantined == 2
 
 
+@pytest.mark.slow  # it compiles torch's headers once more; dengine-cell loads the same module
 def test_libtorch_alone_decides_by_calling_the_module(
     programs: Path, repo: Path, make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:

@@ -4,31 +4,29 @@ not use.
 
 import os
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx")
-onnxruntime = pytest.importorskip("onnxruntime")
-pytest.importorskip("onnxscript")
-
-from dengine import (
-    ModelPrediction,
-    TraceSpec,
-    WilsonRadiusClassifier,
-    load_dataset,
-)  # after the skips
+from dengine import ModelPrediction, TraceSpec, WilsonRadiusClassifier, load_dataset
 from dengine.export import export_onnx, load_onnx, make_key
 from dengine.export.bundle import write_export
 from dengine.records import Action, Reason
 from tests.support.programs import Program, must_agree
 
+# Looked for, not imported: that would take every worker seconds.
+NEEDED = ("onnx", "onnxruntime", "onnxscript")
+pytestmark = pytest.mark.skipif(not all(map(find_spec, NEEDED)), reason=f"needs {NEEDED}")
+
 
 def library() -> Path:
     """onnxruntime's shared library, as its package for Python brings it."""
-    names = sorted((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so*"))
+    names = sorted(
+        (Path(find_spec("onnxruntime").origin).parent / "capi").glob("libonnxruntime.so*")
+    )
     if not names:
         pytest.skip("this onnxruntime brings no shared library of its own")
     return names[0]

@@ -117,20 +117,19 @@ def faults(
     ]
 
 
-def between(program: list[str]) -> None:
-    """Begin this program again with a library between it and its disk, which hangs or fails when a
-    file says so.
+def preloaded() -> dict[str, str]:
+    """Build a library that stands between a program and its disk, which hangs or fails when a file
+    says so; return the environment of a program that has it.
     """
     folder = Path(tempfile.mkdtemp(prefix="dengine-faults-"))
     source = Path(__file__).with_name("sync.c")
     subprocess.run(
         ["gcc", "-shared", "-fPIC", "-o", folder / "sync.so", source, "-ldl"], check=True
     )
-    around = os.environ | {
+    return os.environ | {
         "LD_PRELOAD": str(folder / "sync.so"),
         "DENGINE_SYNC": str(folder / "sync"),
     }
-    os.execve(sys.executable, program, around)
 
 
 def tried(fault: Fault, place: Callable[[], Place], trials: int, console: Console) -> Outcome:
@@ -225,7 +224,9 @@ def main() -> None:
     if arguments.mutations:
         sys.exit(not mutated())
     if "DENGINE_SYNC" not in os.environ:
-        between([sys.executable, "-m", "tests.slow.faults", *sys.argv[1:]])
+        os.execve(
+            sys.executable, [sys.executable, "-m", "tests.slow.faults", *sys.argv[1:]], preloaded()
+        )
     logging.disable(logging.CRITICAL)  # faults are what is asked for here
     console, folder = Console(), SYNC.parent
     rows = []

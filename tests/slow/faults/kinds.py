@@ -24,8 +24,8 @@ import sqlalchemy as sa
 from dengine import Action, DataEngine, Decision, Reason, ReplayCell, load_dataset
 from dengine.engine import trainer
 from dengine.errors import DataError, ReportError, StoreError, TraceError
-from dengine.store import StoredDecision, verify_history
-from dengine.store.journal import HEADER, RESERVE, journal_path
+from dengine.store import StoredDecision, journal, recording, verify_history
+from dengine.store.journal import HEADER, journal_path
 from dengine.store.ledger import row_sum
 from tests.support.serving import started
 
@@ -37,6 +37,7 @@ AWAY = 1.5  # seconds after which a store is not slow, but away
 ODD = "no-database-takes-it"
 IDS = 100  # asked for again while the store is away
 FLIPS = 40  # of one bit each
+SHORT = 1 << 17  # bytes of a journal that is to be cleared
 CHANGES = (
     "UPDATE setting SET value = replace(value, 'lower_bound = 0.9', 'lower_bound = 0.8') WHERE key = 'recipe'",
     "UPDATE label SET success = 1 - success WHERE seq = 3",
@@ -266,17 +267,26 @@ def _syncs(do: str) -> Iterator[None]:
         SYNC.write_text("")
 
 
+@contextlib.contextmanager
+def _short_journals() -> Iterator[None]:
+    """Journals are cleared after SHORT bytes: dengine's own eight megabytes take a minute to fill."""
+    before = journal.RESERVE, recording.LONG
+    journal.RESERVE = recording.LONG = SHORT
+    try:
+        yield
+    finally:
+        journal.RESERVE, recording.LONG = before
+
+
 def _before_a_disk(outcome: Outcome, place: Place, full: bool = False) -> Cell:
     """A cell that waits as long as a robot's. full : its journal is to begin anew."""
-    cell, journal = (
-        Cell(replace(place, wait=0.4), outcome),
-        Path(f"{place.url}.{place.cell}.journal"),
-    )
+    cell = Cell(replace(place, wait=0.4), outcome)
+    file = Path(f"{place.url}.{place.cell}.journal")
     cell.play(60)
     cell.engine.flush()
-    while full and journal.stat().st_size <= HEADER + RESERVE:
-        list(map(cell.engine.decide, stream().X))
-        cell.engine.flush()
+    while full and file.stat().st_size <= HEADER + SHORT:
+        cell.engine.decide(stream().X[0])
+        cell.engine.flush()  # so that it is the next record that finds it too long
     outcome.injected += 1
     return cell
 
@@ -298,6 +308,7 @@ def _unsynced(cell: Cell, i: int) -> Decision:
     return earlier
 
 
+@_short_journals()
 def hung_disk(outcome: Outcome, place: Place, do: str = "hang") -> None:
     """A disk whose syncs hang: no call takes long, and what was not taken can be said again."""
     cell, data = _before_a_disk(outcome, place, full=do == "hang"), stream()

@@ -21,7 +21,7 @@ from dengine import Action, DataEngine, Decision, Reason, Source
 from dengine.errors import StoreError
 from dengine.store import Event, NewLabel, StoredDecision
 from dengine.store.journal import FRAME, Journal, decode_record, encode_record
-from tests.slow.faults.__main__ import faults
+from tests.slow.faults.__main__ import faults, preloaded
 from tests.slow.faults.harness import RECIPE, Cell, Outcome, Place
 from tests.slow.faults.kinds import ON_DISKS, Hung, killed_server, lock
 
@@ -72,7 +72,9 @@ def test_a_sync_that_hangs_or_fails_costs_nothing(
         "DENGINE_STORE_WAIT", raising=False
     )  # as a cell waits for its store: the tests' own wait is long
     words = [sys.executable, "-m", "tests.slow.faults", "--trials", "1", "--only", "sync"]
-    done = subprocess.run(words, cwd=repo, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        words, cwd=repo, env=preloaded(), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
