@@ -17,13 +17,13 @@ from ..checks import check_text
 from ..dataset import Fault
 from ..description import UNKNOWN, Description
 from ..read.files import BAD, caught, natural_key, read_file
-from ..read.frames import part_tables, read_frame
+from ..read.frames import read_frame, read_npz
 from ..read.split import tables_of
 from ..read.text import read_text
 from ..table import UnreadableError
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
-from .layout import layout_of, places_of
+from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import propose_form
 
@@ -175,17 +175,17 @@ def tables_in(p: Proposal, content: bytes, name: str) -> Tables:
     The only archive holds all parts if its arrays hold curves. Raises DataError if it is damaged.
     """
     kind = p.description.format
-    layout = p.stated.get("layout", "")
-    if kind == "npz" and (layout == "npz" or (len(p.names) == 1 and not layout)):
-        parts = part_tables(content, name)
-        if any(len(cells) > 1 for cells in parts[0].columns.values()):
-            return parts
+    if kind == "npz":
+        is_single = len(p.names) == 1 and "layout" not in p.stated
+        table = read_npz(content, name, has_all=True)
+        if p.stated.get("layout") == "npz" or (is_single and has_lists(table)):
+            return [table]
     if kind in ("text", "jsonl") and len(content) > MOST_BYTES:
         content = content[: content.rfind(b"\n", 0, MOST_BYTES)]
         p.is_cut = True
     if kind != "text":
         return tables_of(content, name, replace(p.description, layout="files"))
-    return [read_text(content, name, p.description.text, lambda _: False, lambda _: True)]
+    return [read_text(content, name, p.description.text).whole()]
 
 
 def propose_tables(p: Proposal, files: Sequence[Tables]) -> None:
@@ -198,9 +198,9 @@ def propose_tables(p: Proposal, files: Sequence[Tables]) -> None:
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"
         return
-    p.places = places_of(p, files)
-    if not p.places:
+    p.tables = parts_of(p, files)
+    if not p.tables:
         raise DataError(f"Expected recordings in {listed(p.names)}, found none.")
-    if p.description.layout != "files" or len(p.places) != len(files):
+    if p.description.layout != "files" or len(p.tables) != len(files):
         p.names = ()
     propose_roles(p)

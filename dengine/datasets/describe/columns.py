@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ...errors import DataError
 from ..description import Description, TextForm
 from ..read.clock import ISO
-from ..read.places import Place
-from ..read.split import column_kinds
+from ..read.split import column_kind
 from ..table import Table
 from ..units import bare
 
@@ -127,9 +126,9 @@ class Proposal:
 
     stated : keys that the user gave, with their values. description : with all keys so far. base :
     the folder. names : the recordings' files, if each is one. others : the other files. is_cut :
-    whether some file was read in part. places : the place of each recording that was looked at, by
-    its source. columns : of the rows that are samples, as far as that is known. notes : a comment
-    for each key that needs one.
+    whether some file was read in part. tables : of the recordings that were looked at. columns : of
+    the rows that are samples, as far as that is known. notes : a comment for each key that needs
+    one.
     """
 
     stated: Stated
@@ -138,7 +137,7 @@ class Proposal:
     names: Sequence[str] = ()
     others: Sequence[str] = ()
     is_cut: bool = False
-    places: Mapping[str, Place] = field(default_factory=dict)
+    tables: Tables = ()
     columns: Mapping[str, Column] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
 
@@ -149,13 +148,7 @@ class Proposal:
             self.notes |= {key: note} if note else {}
 
     @property
-    def tables(self) -> list[Table]:
-        """The table of each recording that was looked at."""
-        return [place.table for place in self.places.values()]
-
-    @property
     def unused(self) -> list[Column]:
         """The columns that have no role yet."""
-        is_number, is_word = column_kinds(self.description)
-        names = [name for name in self.columns if not (is_number(name) or is_word(name))]
-        return [self.columns[name] for name in names]
+        kind_of = column_kind(self.description)
+        return [column for name, column in self.columns.items() if not kind_of(name)]

@@ -10,7 +10,6 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, TextForm
 from ..read.frames import join
-from ..read.places import Place
 from ..read.split import split
 from ..table import Table
 from . import labels
@@ -31,10 +30,8 @@ def layout_of(p: Proposal, files: Files) -> str:
 
     Raises DataError for a table of results without samples.
     """
-    if p.description.format == "npz" and len(files[0]) > 1:
-        return "npz"
     if _is_wide(p.description.format, files):
-        return "wide"
+        return "npz" if p.description.format == "npz" else "wide"
     tables = [tables[0] if len(tables) == 1 else join(tables) for tables in files]
     columns = columns_of(tables, TextForm())
     stated = [columns[name] for name in p.description.part.column if name in columns]
@@ -52,7 +49,7 @@ def _is_wide(kind: str, files: Files) -> bool:
     first = files[0][0]
     is_json = kind in ("json", "jsonl") and (len(files) == 1 or len(files[0]) > 1)
     has_curves = is_json and max(map(len, first.columns.values())) > 1
-    return kind == "ts" or has_curves or bool(numbered_columns(first)) or _has_lists(first)
+    return kind == "ts" or has_curves or bool(numbered_columns(first)) or has_lists(first)
 
 
 def _propose_part(p: Proposal, columns: Collection[Column]) -> bool:
@@ -79,15 +76,20 @@ def numbered_columns(table: Table) -> list[str]:
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
 
 
-def _has_lists(table: Table) -> bool:
+def has_lists(table: Table) -> bool:
     """Return whether cells of a column are lists."""
     cells = [column[0] for column in table.columns.values() if len(column)]
     return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
 
 
+def _n_runs(column: Column) -> list[int]:
+    """Return how many runs of equal words each table has."""
+    return [int((words[1:] != words[:-1]).sum()) + 1 for words in column.words]
+
+
 def _has_runs(column: Column) -> bool:
     """Return whether a column has one word for each of several runs of rows."""
-    n_runs = [int((words[1:] != words[:-1]).sum()) + 1 for words in column.words]
+    n_runs = _n_runs(column)
     is_unique = len(column.counts) == sum(n_runs) and "" not in column.counts
     is_long = column.counts.total() >= LEAST_RUN * sum(n_runs)
     if not is_unique or not is_long or sum(n > 1 for n in n_runs) <= len(n_runs) / 2:
@@ -100,10 +102,8 @@ def _has_runs(column: Column) -> bool:
 def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table with a row for each result, and no samples."""
     for column in columns:
-        words = column.words[0]
-        edges = np.flatnonzero(words[1:] != words[:-1])
-        is_long = min(np.diff(edges), default=LEAST_RUN) >= LEAST_RUN
-        source = labels.with_meanings(LabelSource(), column.counts if not is_long else ())
+        is_short = column.counts.total() < LEAST_RUN * sum(_n_runs(column))
+        source = labels.with_meanings(LabelSource(), column.counts if is_short else ())
         if labels.is_plain(source) and source.good and source.bad:
             actual = f"a row for each result, with its verdict in {column.name}, and no curve"
             where = column.tables[0].source
@@ -111,8 +111,8 @@ def _refuse_results(columns: Iterable[Column]) -> None:
             raise DataError(f"Expected the samples of each part in {where}, got {actual}; {do}.")
 
 
-def places_of(p: Proposal, files: Files) -> dict[str, Place]:
-    """Return where each part stands that was looked at, by its source.
+def parts_of(p: Proposal, files: Files) -> list[Table]:
+    """Return the tables of the parts that are looked at.
 
     The last part of files that were read in part may be cut.
     """
@@ -123,10 +123,9 @@ def places_of(p: Proposal, files: Files) -> dict[str, Place]:
         description = description.with_values({"time.column": clock})
     if layout in ("wide", "columns") and not description.channels:
         description = replace(description, channels=tuple(map(Channel, patterns)))
-    places = dict[str, Place]()
+    parts = list[Table]()
     for tables in files:
-        parts = list(split(tables, tables[0].source, description, []))
-        is_cut = p.is_cut and layout == "long" and len(parts) > 1
-        for source, path, table in parts[: len(parts) - is_cut][: MOST_PARTS - len(places)]:
-            places[source] = Place(path, table)
-    return places
+        of_file = [part for part in split(tables, description) if not part.damage]
+        is_cut = p.is_cut and layout == "long" and len(of_file) > 1
+        parts += of_file[: len(of_file) - is_cut]
+    return parts[:MOST_PARTS]

@@ -12,8 +12,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
-from ..read.places import LabelReader
-from ..read.recordings import Reader
+from ..read.recordings import kept_rows
 from ..table import Table
 from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
@@ -55,17 +54,16 @@ def propose_roles(p: Proposal) -> None:
         p.put("traces.samples", UNKNOWN, "it follows from rows")
     else:
         if clock.column and UNKNOWN not in clock.column + clock.format:
-            propose_rate(p, [kept_rows(p, table) for table in p.tables])
+            propose_rate(p, [samples_only(p, table) for table in p.tables])
         propose_lengths(p)
     list_others(p)
 
 
-def kept_rows(p: Proposal, table: Table) -> Table:
+def samples_only(p: Proposal, table: Table) -> Table:
     """Return the rows of a table that are samples, as far as their words are known."""
-    stated = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
-    plain = replace(p.description, rows=stated, channels=())
+    rows = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
     with suppress(DataError):
-        return Reader(plain, LabelReader(LabelSource())).kept_rows(table)[0]
+        return kept_rows(table, rows)[0]
     return table
 
 
@@ -73,7 +71,7 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
     """Set what the words of columns mean for their rows, and leave out those that are none."""
     if rows:
         p.description = replace(p.description, rows=rows)
-        p.columns = columns_of([kept_rows(p, table) for table in p.tables], p.description.text)
+        p.columns = columns_of([samples_only(p, table) for table in p.tables], p.description.text)
 
 
 def qualify_rows(p: Proposal) -> None:
@@ -123,8 +121,8 @@ def propose_part(p: Proposal) -> None:
     """Find the column or line with the part's number, if exactly one has its name."""
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
-    least = len(p.places) / 2
-    sources = [s for s in sources if len({*part_words(s, p.places).values()}) > least]
+    least = len(p.tables) / 2
+    sources = [s for s in sources if len({*part_words(s, p.tables).values()}) > least]
     if len(sources) > 1:
         names = listed(source.line or source.column[0] for source in sources)
         p.notes["part.column"] = f"may be one of {names}"

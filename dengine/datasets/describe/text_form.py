@@ -8,12 +8,12 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import UNKNOWN
+from ..description import UNKNOWN, TextForm
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
@@ -45,29 +45,18 @@ Rows = Sequence[Sequence[str]]
 class Look:
     """The first lines of a file.
 
-    width : cells of a row. header, units, data : the lines of the header, the units and the first
-    samples, from 1; 0 for none. line : the header. rows : the cells of the samples.
+    form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
     """
 
-    encoding: str
-    delimiter: str
+    form: TextForm
     width: int
-    header: int
-    units: int
-    data: int
     line: str
     rows: Rows
 
     @property
-    def names(self) -> list[str]:
-        """The names in the header."""
-        line = COMMENT.sub("", self.line.lstrip())
-        return header_names(split_line(line, self.delimiter))
-
-    def is_like(self, other: "Look") -> bool:
-        """Return whether another file has this form, and a column in common."""
-        is_same = (self.delimiter, self.width) == (other.delimiter, other.width)
-        return is_same and (not self.line or not {*self.names}.isdisjoint(other.names))
+    def key(self) -> tuple[str, int, str]:
+        """What files of one form have in common."""
+        return self.form.delimiter, self.width, self.line
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
@@ -86,8 +75,8 @@ def look(content: bytes, stated: Stated) -> Look | None:
     heads = [i for i in range(data) if len(rows[i]) >= width and any(map(str.strip, rows[i]))]
     units = heads.pop() + 1 if len(heads) > 1 and _are_units(rows[heads[-1]]) else 0
     header = heads[-1] + 1 if heads else 0
-    line = lines[header - 1] if header else ""
-    return Look(encoding, delimiter, width, header, units, data + 1, line, rows[data:])
+    form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
+    return Look(form, width, lines[header - 1] if header else "", rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -140,55 +129,48 @@ def _are_units(row: Sequence[str]) -> bool:
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     """Find the keys of `[text]` for most of the files, and leave out files of another form.
 
-    These have another delimiter, another number of columns, or no column in common with most. If
-    several have samples, it is asked why.
+    These have another delimiter, another number of columns, or another header than most. If several
+    have samples, it is asked why. A header may stand at another line in each file.
     """
-    looks = {
-        name: form
-        for name, content in contents.items()
-        if (form := look(content, p.stated)) is not None
-    }
+    found = {name: look(content, p.stated) for name, content in contents.items()}
+    looks = {name: form for name, form in found.items() if form is not None}
     if not looks:
         raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
-    lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
-    usual = next(form for form in looks.values() if (form.width, form.line) == lines[0][0])
-    odd = {name: form for name, form in looks.items() if not usual.is_like(form)}
+    head = Counter(item.key for item in looks.values()).most_common(1)[0][0]
+    usual = next(item for item in looks.values() if item.key == head)
+    odd = {name: item for name, item in looks.items() if item.key != head}
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
-    if sum(len(form.rows) >= LEAST_RUN for form in odd.values()) > 1:
+    if sum(len(item.rows) >= LEAST_RUN for item in odd.values()) > 1:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
-    _propose_keys(p, usual, [form for name, form in looks.items() if name not in odd])
-
-
-def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
-    """Set the keys of `[text]` for files like one; a header may stand at another line in each."""
-    is_text = isinstance(p.description.text.header, str)
-    is_same = all(form.header == usual.header for form in same) and not is_text
-    above = 0 if is_same else usual.header
-    values = {
-        "encoding": LATIN if LATIN in {form.encoding for form in same} else usual.encoding,
-        "delimiter": usual.delimiter,
-        "header": usual.line if above else usual.header,
-        "units": usual.units and usual.units - above,
-        "data": usual.data - above,
-        "names": [] if p.stated.get("text.header") else _column_names(usual),
-    }
-    for key, value in values.items():
+    same = [item for name, item in looks.items() if name not in odd]
+    form = usual.form
+    is_moved = any(item.form.header != form.header for item in same)
+    if form.header and (is_moved or isinstance(p.description.text.header, str)):
+        above = int(form.header)
+        units = form.units and form.units - above
+        form = replace(form, header=usual.line, units=units, data=form.data - above)
+    if any(item.form.encoding == LATIN for item in same):
+        form = replace(form, encoding=LATIN)
+    names = () if p.stated.get("text.header") else tuple(_column_names(usual))
+    for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
     if p.description.text.encoding == LATIN:
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    cells = {cell.strip() for form in same for row in form.rows for cell in row}
+    cells = {cell.strip() for item in same for row in item.rows for cell in row}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
-def _column_names(usual: Look) -> list[str]:
+def _column_names(usual: Look) -> Sequence[str]:
     """Return names for the columns where the header does not give one for each; else none.
 
     In a matrix, whose rows are parts, a first column of few whole numbers is their class.
     """
     width = usual.width
     if usual.line:
-        return usual.names[:width] if len(usual.names) > width else []
+        line = COMMENT.sub("", usual.line.lstrip())
+        names = header_names(split_line(line, usual.form.delimiter))
+        return names[:width] if len(names) > width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))

@@ -67,6 +67,7 @@ def read_messages(
 
 def read_bag(
     files: Files,
+    title: str,
     description: Description,
     notes: list[str],
     faults: list[Fault],
@@ -80,6 +81,8 @@ def read_bag(
     ----------
     files : sequence of (Path, str)
         In their order, each with its name for messages.
+    title : str
+        What the bag is called in messages.
     description : Description
     notes, faults : list
         Get what users should know, and the files that are damaged.
@@ -103,7 +106,7 @@ def read_bag(
     table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
     for topic, messages in events.items():
         table[topic] = _cells_of(messages, table[LOG_TIME], topic in verdicts)
-    return Table(files[0][1], table, [])
+    return Table(title, table, [])
 
 
 def _rows_of(

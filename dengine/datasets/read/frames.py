@@ -103,25 +103,19 @@ def read_parquet(content: bytes, source: str) -> Table:
         return read_frame(pd.read_parquet(io.BytesIO(content)), source)
 
 
-def read_npz(content: bytes, source: str) -> Table:
-    """Return the table of a NumPy archive of one part; see `columns_of`."""
-    arrays, _ = read_archive(content, name=source)
-    squeezed = {name: np.atleast_1d(np.squeeze(x)) for name, x in arrays.items()}
-    return Table(source, columns_of("", squeezed), [])
+def read_npz(content: bytes, source: str, has_all: bool) -> Table:
+    """Return the table of a NumPy archive.
 
-
-def part_tables(content: bytes, source: str) -> list[Table]:
-    """Return a table for each part of an archive whose arrays hold all parts.
-
-    Parts are the first axis of the largest array. Arrays of another first axis hold for all parts.
+    The archive of one part has a column for each array, see `columns_of`. That of all parts has a
+    row for each of the first axis of its largest array, whose cells are arrays.
     """
     arrays, _ = read_archive(content, name=source)
-    arrays = {name: np.atleast_1d(x) for name, x in arrays.items()}
+    if not has_all:
+        squeezed = {name: np.atleast_1d(np.squeeze(x)) for name, x in arrays.items()}
+        return Table(source, columns_of("", squeezed), [])
     n = len(max(arrays.values(), key=np.size, default=()))
-    parts = [
-        {k: np.atleast_1d(x[i]) if len(x) == n else x for k, x in arrays.items()} for i in range(n)
-    ]
-    return [Table(source, columns_of("", part), []) for part in parts]
+    columns = {name: np.atleast_1d(x) for name, x in arrays.items()}
+    return Table(source, columns, range(1, n + 1))
 
 
 def read_ts(content: bytes, source: str, form: TextForm) -> list[Table]:
