@@ -35,13 +35,14 @@ def check_description(description: Description) -> None:
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")
     n_clocks = len(clock.column)
+    limits = {channel.limit for channel in description.channels.values()}
     wanted = {
         "traces.samples, the samples of each trace": description.traces.samples > 0,
         "a rate of 1 Hz to 1 MHz in time.rate_hz": (
             not clock.rate_hz or LEAST_RATE_HZ <= clock.rate_hz <= MOST_RATE_HZ
         ),
         "time.column, since the order is time": n_clocks or description.order != "time",
-        "one limit for all channels": len({c.limit for c in description.channels}) == 1,
+        "one limit for all channels": len(limits) == 1,
         f"a format for each of {n_clocks} columns in [time]": (n_clocks in (0, len(clock.format))),
     }
     expect_all(wanted)

@@ -55,9 +55,6 @@ def propose_clock(p: Proposal) -> None:
     elif odd:
         text = f"{odd[0].name} has cells of no known form, like {listed([*odd[0].odd][:3])}"
         p.put("time.column", UNKNOWN, f"{text}: state time.format or text.drop, or time.column=[]")
-    elif "c0" in p.description.text.names:
-        text = f"no header names one: of {listed(p.columns)}, or time.column=[] for none"
-        p.put("time.column", UNKNOWN, text)
     else:
         p.notes["time.rate_hz"] = "unknown, for no clock was found; state it if you know it"
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..description import Description, TextForm
-from ..read.clock import ISO
+from ..description import Clock, Description, TextForm
+from ..read.clock import ISO, times_of
 from ..read.split import column_kind
 from ..table import Table
 from ..units import bare
@@ -25,7 +25,7 @@ TIMES = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%I:%M:%S.%f %p", "%I:%M:%S %
 MOMENTS = (f"{day} {time}" for day in DAYS for time in TIMES)
 ZONED = ("%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f")
 FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
-LIKE_A_TIME = r"^\d+[:\-./T](?:\d+|[A-Za-z]{3})[:\-./T]\d|^\d+:\d+\.\d|^\d{8}T\d{6}"
+LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
 MOST_CELLS = 20  # of a recording whose form of times is looked at
@@ -93,25 +93,22 @@ class Column:
     @cached_property
     def forms(self) -> list[str]:
         """All forms of dates and times that fit its cells."""
-        import pandas as pd
-
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
         cells = {word for words in self.words for word in (*words[:MOST_CELLS], *words[-1:])}
-        texts = pd.Series(sorted(cells), dtype=object)
-        if not cells or not texts.str.contains(LIKE_A_TIME).all():
+        if not cells or not all(map(LIKE_A_TIME.match, cells)):
             return []
-        forms = [form for form in FORMS if _fits(texts, form)]
+        table = Table(self.name, {self.name: np.array(sorted(cells), dtype=object)}, [])
+        forms = [form for form in FORMS if _fits(table, form)]
         return forms[:1] if forms[:1] in ([DAY], [ISO]) else forms
 
 
-def _fits(texts: Any, form: str) -> bool:
-    """Return whether all texts are dates or times of a form."""
-    import pandas as pd
-
-    texts = texts.str.replace(",", ".") if "%f" in form else texts
-    form = "ISO8601" if form == ISO else form
-    return not pd.to_datetime(texts, format=form, errors="coerce", utc=True).isna().any()
+def _fits(table: Table, form: str) -> bool:
+    """Return whether a column, named like its table, holds dates or times of a form."""
+    with suppress(DataError):
+        times_of(table, Clock((table.source,), (form,)), TextForm())
+        return True
+    return False
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:

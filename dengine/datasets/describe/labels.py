@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
-from typing import Any
+from typing import Any, Literal
 
 from ...errors import DataError
 from ..description import UNKNOWN, LabelSource, PartSource
@@ -116,14 +116,14 @@ def is_verdict(name: str, words: Names) -> bool:
     return bool(is_named) and is_label and len(words) <= MOST_WORDS
 
 
-def row_of(column: Column) -> str:
+def row_of(column: Column) -> Literal["", "same", "last"]:
     """Return which row of a recording has the label in a column, `same` or `last`; "" for none.
 
     It is the last if above it stand only words for not checked.
     """
     last = [str(words[-1]) for words in column.words if len(words)]
     above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
-    row = "same" if column.fixed else "last"
+    row: Literal["same", "last"] = "same" if column.fixed else "last"
     return row if above <= {*UNCHECKED} and is_verdict(column.name, last) else ""
 
 
@@ -143,8 +143,11 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 
 
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
-    """Yield the sources that may hold labels: in listings, paths, columns and lines."""
+    """Yield the stated source, or those that may hold labels in listings, paths, columns, lines."""
     label = p.description.label
+    if any(getattr(label, kind) for kind in KINDS):
+        yield label
+        return
     for name in p.others:
         with suppress(DataError, ValueError):
             table = listing_table(p.base / name, p.description.text)
@@ -153,19 +156,23 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
                     yield replace(label, listing=name, key=key, column=column)
     if p.description.layout in ("files", "columns"):
         yield from (replace(label, path=path) for path in in_paths(paths))
-    rows = {column.name: row_of(column) for column in p.unused}
-    yield from (replace(label, column=name, at=row) for name, row in rows.items() if row)
+    for unused in p.unused:
+        if row := row_of(unused):
+            yield replace(label, column=unused.name, at=row)
     yield from (replace(label, line=line) for line in lines_of(p, NAME))
 
 
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
-    """Return the word of each recording that has one in a source."""
+    """Return the word of each recording that has one in a source; there must be some if stated."""
     words = dict[str, str]()
-    with suppress(*([] if source == p.description.label else [DataError])):
+    is_stated = source == p.description.label
+    with suppress(*([] if is_stated else [DataError])):
         reader = read_labels(p.base, source, p.description.text)
         for table in tables:
             with suppress(UnreadableError):
                 words[table.source] = reader.words(table, parts.get(table.source, ""))[0]
+    if is_stated and not words:
+        raise DataError("Expected words where [label] says they stand, found none.")
     return words
 
 
@@ -184,15 +191,11 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
     tables = [*p.tables, *others]
     parts = part_words(p.description.part, tables)
-    label = p.description.label
-    is_stated = any(getattr(label, kind) for kind in KINDS)
     counted = dict[LabelSource, Words]()
-    for source in [label] if is_stated else sources_of(p, [table.path for table in tables]):
+    for source in sources_of(p, [table.path for table in tables]):
         words = words_of(p, source, tables, parts)
-        if is_stated and not words:
-            raise DataError("Expected words where [label] says they stand, found none.")
         n = len(tables if source.listing or source.path else p.tables)
-        if is_stated or len(words) > n / 2:
+        if len(words) > n / 2 or source == p.description.label:
             counted[with_meanings(source, words.values())] = words
     return counted
 
@@ -215,24 +218,26 @@ def propose_label(p: Proposal) -> None:
     is `?`, and the note lists them all.
     """
     counted = count_sources(p)
-    sides = {source: sides_of(source, words) for source, words in counted.items()}
-    certain = [source for source in counted if sides[source]]
-    doubt = _disagreement([sides[source] for source in certain])
-    titles = {source: title_of(source, words) for source, words in counted.items()}
+    certain = [source for source, words in counted.items() if sides_of(source, words)]
+    doubt = _disagreement([sides_of(source, counted[source]) for source in certain])
     if doubt or not (certain or len(counted) == 1):
-        text = "; ".join([*titles.values(), *_few_words(p), doubt or NO_LABEL])
-        p.put("label.column", UNKNOWN, text)
+        titles = map(title_of, counted, counted.values())
+        p.put("label.column", UNKNOWN, "; ".join([*titles, *_few_words(p), doubt or NO_LABEL]))
         return
     best, *others = certain or counted
-    words = counted[best]
+    words = counted.pop(best)
     checks = tuple(source for source in others if counted[source].keys() >= words.keys())
     p.description = replace(p.description, label=best, check=p.description.check or checks)
+    _note_words(p, best, words, [*map(title_of, counted, counted.values())])
+
+
+def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
+    """Put the words of the label, and its other sources, into the notes."""
     counts = counts_of(words.values())
-    open_keys = [f"label.{key}" for key in ("good", "bad") if UNKNOWN in getattr(best, key)]
-    p.notes |= dict.fromkeys(open_keys, f"which of the words? {counts}")
-    del titles[best]
-    note = "; ".join([f"{counts}, over {len(words):,} recordings", *titles.values()])
-    p.notes[f"label.{next(kind for kind in KINDS if getattr(best, kind))}"] = note
+    if UNKNOWN in label.good + label.bad:
+        p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")
+    kind = next(kind for kind in KINDS if getattr(label, kind))
+    p.notes[f"label.{kind}"] = "; ".join([f"{counts}, over {len(words):,} recordings", *others])
 
 
 def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:

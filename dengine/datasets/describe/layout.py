@@ -2,15 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, TextForm
-from ..read.frames import join
-from ..read.split import split
+from ..read.split import OBJECTS, split
 from ..table import Table
 from . import labels
 from .clock import NAME as CLOCK_NAME
@@ -22,18 +21,20 @@ PART_NAME = re.compile(
 )
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
 MOST_PARTS = 240
-Files = Sequence[Tables]  # the tables of each file
 
 
-def layout_of(p: Proposal, files: Files) -> str:
+def layout_of(p: Proposal, files: Tables) -> str:
     """Return how parts are laid out, `?` if nothing tells; find what tells rows apart.
 
     Raises DataError for a table of results without samples.
     """
-    if _is_wide(p.description.format, files):
-        return "npz" if p.description.format == "npz" else "wide"
-    tables = [tables[0] if len(tables) == 1 else join(tables) for tables in files]
-    columns = columns_of(tables, TextForm())
+    kind = p.description.format
+    first = files[0]
+    if kind in OBJECTS and len(files) > 1 and len(first.lines) == 1:
+        return "files"
+    if numbered_columns(first) or has_lists(first):
+        return "npz" if kind == "npz" else "wide"
+    columns = columns_of(files, TextForm())
     stated = [columns[name] for name in p.description.part.column if name in columns]
     if _propose_part(p, columns.values()) or any(len(c.counts) > 1 for c in stated):
         return "long"
@@ -44,29 +45,20 @@ def layout_of(p: Proposal, files: Files) -> str:
     return UNKNOWN
 
 
-def _is_wide(kind: str, files: Files) -> bool:
-    """Return whether a row, or an object, has all samples of a part."""
-    first = files[0][0]
-    is_json = kind in ("json", "jsonl") and (len(files) == 1 or len(files[0]) > 1)
-    has_curves = is_json and max(map(len, first.columns.values())) > 1
-    return kind == "ts" or has_curves or bool(numbered_columns(first)) or has_lists(first)
-
-
 def _propose_part(p: Proposal, columns: Collection[Column]) -> bool:
     """Propose `part.column`, and return whether any column has runs, see `_has_runs`.
 
-    It is the first column with runs that is named like a part. If none is, it is the only column
-    with runs, or the only one of them with digits; `?` if there are several, or if a column that is
-    named like a part has no runs. Without runs nothing is proposed.
+    It is the first column with runs that is named like a part, or else the only column that has
+    runs or such a name; `?` if there are several. Without runs nothing is proposed.
     """
-    runs = [column for column in columns if _has_runs(column)]
-    numbered = [column for column in runs if re.search(r"\d", min(column.counts))]
-    certain = [column for column in runs if PART_NAME.search(column.name)]
-    named = [column for column in columns if PART_NAME.search(column.name)]
-    best = certain or [*named, *(numbered or runs)]
+    runs = [column.name for column in columns if _has_runs(column)]
+    named = [column.name for column in columns if PART_NAME.search(column.name)]
+    certain = [name for name in runs if name in named]
+    best = certain or [*named, *runs]
     if runs:
-        note = f"one of {listed(column.name for column in best)}" if len(best) > 1 else ""
-        p.put("part.column", best[0].name if certain or len(best) == 1 else UNKNOWN, note)
+        is_clear = certain or len(best) == 1
+        note = f"one of {listed(best)}" if len(best) > 1 else ""
+        p.put("part.column", best[0] if is_clear else UNKNOWN, note)
     return bool(runs)
 
 
@@ -111,21 +103,21 @@ def _refuse_results(columns: Iterable[Column]) -> None:
             raise DataError(f"Expected the samples of each part in {where}, got {actual}; {do}.")
 
 
-def parts_of(p: Proposal, files: Files) -> list[Table]:
+def parts_of(p: Proposal, files: Tables) -> list[Table]:
     """Return the tables of the parts that are looked at.
 
     The last part of files that were read in part may be cut.
     """
     description, layout = p.description, p.description.layout
-    patterns = [ANY] if layout == "columns" else numbered_columns(files[0][0])
+    patterns = [ANY] if layout == "columns" else numbered_columns(files[0])
     if layout == "columns":
-        clock = [*filter(CLOCK_NAME.search, files[0][0].columns)]
+        clock = [*filter(CLOCK_NAME.search, files[0].columns)]
         description = description.with_values({"time.column": clock})
     if layout in ("wide", "columns") and not description.channels:
-        description = replace(description, channels=tuple(map(Channel, patterns)))
+        description = replace(description, channels=dict.fromkeys(patterns, Channel()))
     parts = list[Table]()
-    for tables in files:
-        of_file = [part for part in split(tables, description) if not part.damage]
+    for table in files:
+        of_file = [part for part in split(table, description) if not part.damage]
         is_cut = p.is_cut and layout == "long" and len(of_file) > 1
         parts += of_file[: len(of_file) - is_cut]
     return parts[:MOST_PARTS]

@@ -39,8 +39,7 @@ FORCES = (
 def propose_roles(p: Proposal) -> None:
     """Give each column a role, one after the other; what is stated stays."""
     p.columns = columns_of(p.tables, p.description.text)
-    channels = (channel.column for channel in p.description.channels)
-    for name in (*p.description.time.column, *channels):
+    for name in (*p.description.time.column, *p.description.channels):
         expect_one_of([*p.columns, UNKNOWN], name, "the columns")
     qualify_rows(p)
     propose_clock(p)
@@ -144,7 +143,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
     others = listed(name for name in units if [name] != best)
     if len(best) == 1:
-        p.description = replace(p.description, channels=(Channel(best[0], units[best[0]]),))
+        p.description = replace(p.description, channels={best[0]: Channel(units[best[0]])})
         p.notes |= {f"channels.{best[0]}": f"others: {others}"} if others else {}
     else:
         text = f"one or several of: {others}" if units else "no column has numbers that change"
@@ -174,7 +173,7 @@ def find_lost(p: Proposal) -> None:
     """Find the words for lost samples of the channels, and rows that have none of them."""
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
-    for name in {channel.column for channel in p.description.channels} & {*p.columns}:
+    for name in p.description.channels.keys() & p.columns.keys():
         column = p.columns[name]
         lost = {word for word in column.odd if word.lower() in LOST}
         if column.counts[""] > SPARSE * column.counts.total():
@@ -188,7 +187,7 @@ def find_lost(p: Proposal) -> None:
 
 def propose_lengths(p: Proposal) -> None:
     """Find how many samples the traces have, and what happens to those of other lengths."""
-    words = [p.columns[c.column].words for c in p.description.channels if c.column in p.columns]
+    words = [p.columns[name].words for name in p.description.channels if name in p.columns]
     lengths = [n for n in map(len, words[0] if words else ()) if n]
     usual = int(np.median(lengths or 0))
     others = [n for n in lengths if n != usual]
@@ -201,7 +200,7 @@ def propose_lengths(p: Proposal) -> None:
 
 def list_others(p: Proposal) -> None:
     """List the columns without a role, and the files beside the recordings."""
-    listings = {source.listing for source in (p.description.label, *p.description.check)}
+    listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)
     if UNKNOWN not in p.description.exclude and others:
         p.put("exclude", others, f"not read, for they are of another form: {listed(others)}")

@@ -5,10 +5,11 @@ Each value follows from a count over the lines that were looked at. If two value
 
 import codecs
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -53,11 +54,6 @@ class Look:
     line: str
     rows: Rows
 
-    @property
-    def key(self) -> tuple[str, int, str]:
-        """What files of one form have in common."""
-        return self.form.delimiter, self.width, self.line
-
 
 def look(content: bytes, stated: Stated) -> Look | None:
     """Return how a file is written, by its first lines; None if it is no text."""
@@ -72,11 +68,9 @@ def look(content: bytes, stated: Stated) -> Look | None:
         width = 1
     rows = [split_line(line, delimiter) if line.strip() else [] for line in lines]
     data = _first_row(rows, width)
-    heads = [i for i in range(data) if len(rows[i]) >= width and any(map(str.strip, rows[i]))]
-    units = heads.pop() + 1 if len(heads) > 1 and _are_units(rows[heads[-1]]) else 0
-    header = heads[-1] + 1 if heads else 0
+    header, units = _head_lines(rows[:data], width)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, lines[header - 1] if header else "", rows[data:])
+    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -121,43 +115,54 @@ def _first_row(rows: Rows, width: int) -> int:
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
-def _are_units(row: Sequence[str]) -> bool:
-    """Return whether the cells of a row that are filled are units."""
-    return all(is_unit(c) or UNIT_WORDS.fullmatch(c) for c in map(str.strip, row) if c)
+def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
+    """Return the lines of the header and of the units above the samples; 0 for none."""
+    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(map(str.strip, row))]
+    units = 0
+    if len(heads) > 1:
+        cells = filter(None, map(str.strip, rows[heads[-1] - 1]))
+        if all(is_unit(cell) or UNIT_WORDS.fullmatch(cell) for cell in cells):
+            units = heads.pop()
+    return max(heads, default=0), units
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     """Find the keys of `[text]` for most of the files, and leave out files of another form.
 
     These have another delimiter, another number of columns, or another header than most. If several
-    have samples, it is asked why. A header may stand at another line in each file.
+    have samples, it is asked why.
     """
-    found = {name: look(content, p.stated) for name, content in contents.items()}
-    looks = {name: form for name, form in found.items() if form is not None}
-    if not looks:
+    groups = defaultdict[Any, dict[str, Look]](dict)
+    for name, content in contents.items():
+        if item := look(content, p.stated):
+            groups[item.form.delimiter, item.width, item.line][name] = item
+    if not groups:
         raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
-    head = Counter(item.key for item in looks.values()).most_common(1)[0][0]
-    usual = next(item for item in looks.values() if item.key == head)
-    odd = {name: item for name, item in looks.items() if item.key != head}
+    same = groups.pop(max(groups, key=lambda key: len(groups[key])))
+    odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
     if sum(len(item.rows) >= LEAST_RUN for item in odd.values()) > 1:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
-    same = [item for name, item in looks.items() if name not in odd]
+    _propose_keys(p, [*same.values()])
+
+
+def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
+    """Set the keys of `[text]` for files of one form; the header may stand at any line in each."""
+    usual = looks[0]
     form = usual.form
-    is_moved = any(item.form.header != form.header for item in same)
-    if form.header and (is_moved or isinstance(p.description.text.header, str)):
-        above = int(form.header)
+    above = int(form.header)
+    is_moved = {item.form.header for item in looks} != {above}
+    if above and (is_moved or isinstance(p.description.text.header, str)):
         units = form.units and form.units - above
         form = replace(form, header=usual.line, units=units, data=form.data - above)
-    if any(item.form.encoding == LATIN for item in same):
+    if any(item.form.encoding == LATIN for item in looks):
         form = replace(form, encoding=LATIN)
+        p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
     names = () if p.stated.get("text.header") else tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
-    if p.description.text.encoding == LATIN:
-        p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    cells = {cell.strip() for item in same for row in item.rows for cell in row}
+    cells = {cell.strip() for item in looks for row in item.rows for cell in row}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
@@ -187,16 +192,15 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     """
     seen = {mark: [cell for cell in cells if mark in cell] for mark in ".,"}
     proofs = {mark: len([*filter(DECIMAL[mark].fullmatch, seen[mark])]) for mark in ".,"}
-    text = "\n".join(cells)
-    group = next((mark for mark in GROUPS if re.search(rf"\d{mark}\d{{3}}", text)), "")
-    example = min(seen["."] + seen[","], default="")
-    note = f"'.' or ','; {example} may be a fraction or a thousand" if example else ""
-    decimal = UNKNOWN if example else "."
+    groups = re.findall(rf"\d([{GROUPS}])\d{{3}}", "\n".join(cells))
+    group = groups[0] if groups else ""
     for mark, other in (".,", ",."):
         repeats = any(cell.count(other) > 1 for cell in seen[other])
         if proofs[mark] > 20 * proofs[other] or (repeats and not proofs[other]):
-            decimal = mark
-            note = ""
-            group = other if seen[other] else group
-    p.put("text.decimal", decimal, note)
+            p.put("text.decimal", mark)
+            p.put("text.thousands", other if seen[other] else group)
+            return
     p.put("text.thousands", group)
+    if example := min(seen["."] + seen[","], default=""):
+        note = f"'.' or ','; {example} may be a fraction or a thousand"
+        p.put("text.decimal", UNKNOWN, note)

@@ -93,7 +93,7 @@ def read_bag(
         If the topic of the channels has no messages, or if a file before the last is not whole and
         a trigger cuts.
     """
-    columns = [channel.column for channel in description.channels]
+    columns = [*description.channels]
     topics = {column.partition(".")[0] for column in columns}
     if len(topics) > 1:
         raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
@@ -118,7 +118,7 @@ def _rows_of(
     faults: list[Fault],
 ) -> list[Any]:
     """Return the times and values of each message of the channels, and put others into `events`."""
-    fields = [attrgetter(c.column.partition(".")[2]) for c in description.channels]
+    fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
     for path, name in files:
         if description.windows.trigger and (notes or faults):

@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault
-from ..description import ANY, LabelSource, PartSource, TextForm
+from ..description import LabelSource, PartSource, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
 from .frames import read_parquet
@@ -149,10 +149,10 @@ class LabelReader:
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
         meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
-        if word not in meanings and ANY not in meanings:
+        if word not in meanings:
             message = f"Expected a label among {listed(meanings)}, got {shortened(word)}"
             raise UnreadableError(message, line, source.column)
-        return meanings.get(word, meanings.get(ANY))
+        return meanings[word]
 
     def unused_note(self) -> str:
         """Return a note on the rows of the listing that name no recording; "" if all do."""

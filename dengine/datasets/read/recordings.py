@@ -27,7 +27,7 @@ from .clock import check_steps, times_of
 from .files import caught, find_files, natural_key, read_file
 from .frames import read_frame
 from .places import LabelReader, part_of, read_labels
-from .split import split, tables_of
+from .split import split, table_of
 from .windows import cut
 
 FRAME = "table"  # what a DataFrame is called in messages
@@ -66,7 +66,7 @@ def recording_of(
             is_lost = is_lost[order]
         seconds, start = times_of(table, clock, form)
         check_steps(seconds, clock, table)
-    rows = [samples_of(table, channel, form) for channel in description.channels]
+    rows = [samples_of(table, *item, form) for item in description.channels.items()]
     lengths = [*map(len, rows if seconds is None else [*rows, seconds])]
     if len({*lengths}) > 1:
         raise UnreadableError(f"Expected channels and times of one length, got {lengths}")
@@ -81,7 +81,7 @@ def recording_of(
     label = label_of(labels, table, part)
     if label is None:
         return None
-    trace = fit(samples, seconds, description)
+    trace = fitted(samples, seconds, description)
     return Recording(table.source, trace, label, part, lengths[0], start, rank)
 
 
@@ -105,9 +105,8 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
     return table, is_lost
 
 
-def samples_of(table: Table, channel: Channel, form: TextForm) -> Floats:
+def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> Floats:
     """Return the samples of a channel in its unit, shape (n,)."""
-    column = channel.column
     values = table.numbers(column, form)
     factor = 1.0
     with suppress(DataError):  # a name may have another quantity, as `U [V]` of a force
@@ -159,8 +158,7 @@ def read_recordings(
     notes: list[str] = []
     faults: list[Fault] = []
     name, base, files = files_of(source, description, notes, faults)
-    sources = (description.label, *description.check)
-    labels = [read_labels(base, label, description.text) for label in sources]
+    labels = [read_labels(base, label, description.text) for label in description.labels]
     recordings: list[Recording] = []
     n_unlabelled = 0
     for file, title in files:
@@ -210,21 +208,25 @@ def files_of(
 def parts_of(
     file: Path | Table, name: str, description: Description, base: Path
 ) -> Iterator[Table]:
-    """Return the tables of the parts in a file or a table."""
-    tables = [file] if isinstance(file, Table) else tables_of(read_file(file), name, description)
-    if description.windows.trigger or description.windows.listing:
-        return cut(tables[0], description, base)
-    return split(tables, description)
+    """Yield the tables of the parts in a file or a table."""
+    table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
+    for part in split(table, description):
+        if description.windows.trigger or description.windows.listing:
+            yield from cut(part, description, base)
+        else:
+            yield part
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
     """Return the data set of recordings in their order."""
-    parts = np.array([recording.part for recording in recordings])
-    labels = np.array([recording.label for recording in recordings])
-    channels = description.channels
+    labels, parts, sources, lengths = (
+        np.array([getattr(recording, key) for recording in recordings])
+        for key in ("label", "part", "source", "length")
+    )
+    channels = [*description.channels.values()]
     clock = description.time
-    lengths = description.traces.lengths.removesuffix("-all")
-    is_grid = lengths == "resample" and clock.column and clock.rate_hz
+    fit = description.traces.lengths.removesuffix("-all")
+    is_grid = fit == "resample" and clock.column and clock.rate_hz
     return make_dataset(
         np.stack([recording.trace for recording in recordings]),
         labels,
@@ -232,15 +234,17 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
         unit=", ".join(channel.unit for channel in channels).strip(", "),
         limit=channels[0].limit or None,
         part=parts if parts.any() else None,
-        channels=tuple(channel.column for channel in channels),
-        source=np.array([recording.source for recording in recordings]),
-        fit="strict" if is_grid else lengths,
-        lengths=np.array([recording.length for recording in recordings]),
+        channels=tuple(description.channels),
+        source=sources,
+        fit="strict" if is_grid else fit,
+        lengths=lengths,
         ordered=np.count_nonzero(np.diff(labels)) != 1,
     )
 
 
-def fit(samples: Floats, seconds: Floats | None, description: Description) -> NDArray[np.float32]:
+def fitted(
+    samples: Floats, seconds: Floats | None, description: Description
+) -> NDArray[np.float32]:
     """Return the trace (C, T) of samples (C, n), as `[traces]` says.
 
     With `resample` and a clock it is interpolated in time: at the stated rate from the first time

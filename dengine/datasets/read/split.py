@@ -20,8 +20,8 @@ DIGITS = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
 
 
-def tables_of(content: bytes, name: str, description: Description) -> list[Table]:
-    """Return the tables of a file: of JSON and `.ts` files one for each object or series.
+def table_of(content: bytes, name: str, description: Description) -> Table:
+    """Return the table of a file.
 
     Raises UnreadableError or DataError if it is no file of the described format.
     """
@@ -31,10 +31,10 @@ def tables_of(content: bytes, name: str, description: Description) -> list[Table
     if kind in OBJECTS:
         return frames.read_objects(content, name, form, kind == "jsonl")
     if kind == "parquet":
-        return [frames.read_parquet(content, name)]
+        return frames.read_parquet(content, name)
     if kind == "npz":
-        return [frames.read_npz(content, name, description.layout == "npz")]
-    return [read_text(content, name, form, column_kind(description))]
+        return frames.read_npz(content, name, description.layout == "npz")
+    return read_text(content, name, form, column_kind(description))
 
 
 def column_kind(description: Description) -> Kind:
@@ -43,9 +43,9 @@ def column_kind(description: Description) -> Kind:
     dated = {name for name, form in clock if is_dated(form)}
     order = {description.order} - {"name", "time"}
     words = dated.union(description.part.column, description.rows, order)
-    words |= {source.column for source in (description.label, *description.check)}
+    words |= {source.column for source in description.labels}
     numbers = {*description.time.column, *signals_of(description)}
-    patterns = [pattern_of(channel.column) for channel in description.channels]
+    patterns = [*map(pattern_of, description.channels)]
 
     def kind_of(name: str) -> str:
         if name in words:
@@ -64,7 +64,7 @@ def signals_of(description: Description) -> Sequence[str]:
 
 def verdicts_of(description: Description) -> set[str]:
     """Return the topics of a bag that have labels."""
-    return {source.topic for source in (description.label, *description.check)} - {""}
+    return {source.topic for source in description.labels} - {""}
 
 
 def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
@@ -72,25 +72,22 @@ def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
     return re.compile(any_text.join(map(re.escape, column.split(ANY))), re.DOTALL)
 
 
-def split(tables: Sequence[Table], description: Description) -> Iterator[Table]:
+def split(table: Table, description: Description) -> Iterator[Table]:
     """Yield the table of each part of a file.
 
-    `long`: the rows of a part must stand together, unless they are sorted by time. `wide`: the
-    cells of the columns that a channel's pattern matches, in the order of their numbers, are its
-    samples, or the list in its cell. `columns`: so is each column. Cells that are empty at the end
-    are no samples. A part that cannot be told from others has `damage`.
+    `long`: the rows of a part must stand together, unless they are sorted by time. `wide`, and each
+    object of JSON: the cells of the columns that a channel's pattern matches, in the order of their
+    numbers, are its samples, or the list in its cell. `columns`: so is each column. Cells that are
+    empty at the end are no samples. A part that cannot be told from others has `damage`.
     """
-    layout, table = description.layout, tables[0]
-    if layout == "long":
-        yield from _split_rows(frames.join(tables) if len(tables) > 1 else table, description)
-    elif layout == "columns":
+    if description.layout == "long":
+        yield from _split_rows(table, description)
+    elif description.layout == "columns":
         yield from _split_columns(table, description)
-    elif layout in ("wide", "npz") and description.format not in OBJECTS:
+    elif description.layout in ("wide", "npz") or description.format in OBJECTS:
         yield from _split_wide(table, description)
     else:
-        for i, table in enumerate(tables, 1):
-            row = f", row {table.line(0) or i}" if len(tables) > 1 else ""
-            yield replace(table, source=f"{table.source}{row}", path=table.source)
+        yield replace(table, path=table.source)
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
@@ -123,34 +120,43 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
-    """Yield each row. Columns of another number of rows hold for all parts."""
-    groups: dict[str, list[str]] = {}
-    for key in [channel.column for channel in description.channels if ANY in channel.column]:
-        names = sorted(filter(pattern_of(key, DIGITS).fullmatch, table.columns), key=natural_key)
-        if names:
-            groups[key] = names
+    """Yield each row."""
+    groups = {key: _numbered(key, table) for key in description.channels if ANY in key}
+    groups = {key: names for key, names in groups.items() if names}
     curves = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     used = {*chain(*groups.values())}
-    others = {column: c for column, c in table.columns.items() if len(c) and column not in used}
-    for i, line in enumerate(table.lines):
-        columns: frames.Columns = {}
-        for column, values in others.items():
-            cells = values[i] if len(values) == len(table.lines) else values
-            columns |= frames.columns_of(column, cells)
-        part = replace(
-            table,
-            source=f"{table.source}, row {line}",
-            path=table.source,
-            columns=columns,
-            lines=[line],
-            damage=[error for error in table.damage if error.line == line],
-        )
-        yield _with_samples(part, {key: rows[i] for key, rows in curves.items()}, groups)
+    others = {name: c for name, c in table.columns.items() if len(c) and name not in used}
+    rest = replace(table, columns=others)
+    for i in range(len(table.lines)):
+        samples = {key: rows[i] for key, rows in curves.items()}
+        yield _with_samples(_row_of(rest, i), samples, groups)
+
+
+def _row_of(table: Table, i: int) -> Table:
+    """Return the part in a row, with the columns that its cells hold; it may have damage.
+
+    Columns of another number of rows hold for all parts.
+    """
+    n = len(table.lines)
+    line = table.lines[i]
+    source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
+    damage = [error for error in table.damage if error.line == line]
+    part = replace(table, source=source, path=table.source, lines=[line], damage=damage)
+    row = {name: cells[i] if len(cells) == n else cells for name, cells in table.columns.items()}
+    try:
+        return replace(part, columns=frames.columns_of("", row))
+    except UnreadableError as error:
+        return replace(part, columns={}, damage=[error])
+
+
+def _numbered(key: str, table: Table) -> list[str]:
+    """Return the columns of a table that a channel's pattern matches, by their numbers."""
+    return sorted(filter(pattern_of(key, DIGITS).fullmatch, table.columns), key=natural_key)
 
 
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     """Yield each column that the channel's pattern matches, with the clock beside it."""
-    channel = description.channels[0].column
+    channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}
     beside = {key: cells for key, cells in table.columns.items() if key in shared}
     for column in filter(pattern_of(channel).fullmatch, table.columns):

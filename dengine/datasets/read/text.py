@@ -49,14 +49,8 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
         If the file is empty, in another encoding, or has no such header, or no row fits it.
     """
     content = to_utf8(content, form.encoding)
-    header = form.header
-    above = 0
-    if isinstance(header, str):
-        begin = header.encode()
-        lines = enumerate(io.BytesIO(content), 1)
-        header = above = next((i for i, line in lines if line.startswith(begin)), 0)
-        if not header:
-            raise UnreadableError(f"Expected a header that begins with {form.header!r}, got none")
+    header = _header_line(content, form.header)
+    above = header if isinstance(form.header, str) else 0
     first = form.data + above
     units = form.units and form.units + above
     end = content.rstrip(b"\n").count(b"\n") + 2
@@ -111,6 +105,16 @@ def header_names(cells: Sequence[str]) -> list[str]:
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
     places = [names[: i + 1].count(name) for i, name in enumerate(names)]
     return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
+
+
+def _header_line(content: bytes, header: int | str) -> int:
+    """Return the line of the header: the one that is stated, or that begins with a text."""
+    if isinstance(header, int):
+        return header
+    for i, line in enumerate(io.BytesIO(content), 1):
+        if line.startswith(header.encode()):
+            return i
+    raise UnreadableError(f"Expected a header that begins with {header!r}, got none")
 
 
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
