@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError, listed, shortened
+from ..errors import DataError, instead, listed, shortened
 from .description import TextForm
 
 Cells = NDArray[Any]
@@ -102,7 +102,8 @@ class Table:
         """
         import pandas as pd
 
-        codes, cells = pd.factorize(self.column(name), use_na_sentinel=False)
+        with instead(UnreadableError, f"Expected texts or numbers in {name}", TypeError):
+            codes, cells = pd.factorize(self.column(name), use_na_sentinel=False)
         texts = np.array([as_word(cell) for cell in cells.tolist()], dtype=object)
         return np.asarray(texts[codes])
 

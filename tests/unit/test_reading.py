@@ -555,26 +555,6 @@ def test_lines_of_json_under_another_suffix_are_refused_until_that_is_stated(
     assert load_dataset(path, describe(path, {"format": "jsonl"})).y.tolist() == [1, 0, 1, 0]
 
 
-def test_a_column_named_part_with_short_runs_is_asked_about(tmp_path: Path) -> None:
-    path = tmp_path / "all.csv"
-    rows = [f"{i // 3},{10 if i < 29 else 0},{i / 7},OK" for i in range(30)]
-    path.write_text("\n".join(["part,travel,FZ,verdict", *rows]) + "\n", encoding="utf-8")
-    proposal = describe(path)
-    assert "part.column" in proposal.open_keys
-    assert "one of part, travel" in proposal.notes["part.column"]
-
-
-def test_times_that_repeat_are_asked_about(tmp_path: Path) -> None:
-    for i in range(5):
-        rows = [f"10:00:{k // 10:02},{k * i % 7}" for k in range(60)]
-        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text("\n".join(["time,force", *rows]))
-    proposal = describe(tmp_path)
-    assert "time.column" in proposal.open_keys
-    assert "time.column=[]" in proposal.notes["time.column"]
-    data = load_dataset(tmp_path, describe(tmp_path, {"time.column": [], "time.rate_hz": 10}))
-    assert (data.X.shape, data.rate_hz) == ((5, 60), 10.0)
-
-
 def test_stated_checks_and_headers_are_kept(tmp_path: Path) -> None:
     folder = in_files(tmp_path, "time,force")
     check = {"path": "^(.)", "good": ["1", "3", "4"], "bad": ["0", "2"]}

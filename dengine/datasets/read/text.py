@@ -158,7 +158,7 @@ def _read_plain(
         return {}
     columns = dict[str, Cells]()
     for name, kind in kinds.items():
-        cells = frame.pop(name)
+        cells = frame[name]
         if kind == WORD:
             columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
         elif kind == NUMBER:
