@@ -111,7 +111,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
 
 def likely_suffixes(names: Names) -> Names:
-    """Return the suffixes that several files have; if none has, that of a bag, or all."""
+    """Return the suffixes that several files, or bags, have; or else all."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 
@@ -172,7 +172,7 @@ def read_tables(p: Proposal) -> list[Table]:
     if faults and not files:
         raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
     heads = [tuple(table.columns) for table in files]
-    usual = max(heads, key=heads.count)
+    usual = max(heads, key=heads.count, default=())
     return [table for table, head in zip(files, heads, strict=True) if head == usual]
 
 

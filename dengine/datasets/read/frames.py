@@ -137,13 +137,15 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """
     lines = to_utf8(content, form.encoding).decode().split("\n")
     heads = [line.strip().lower() for line in lines]
-    if "@data" not in heads:
+    first = heads.index("@data") + 1 if "@data" in heads else len(lines)
+    below = enumerate(lines[first:], first + 1)
+    rows = {i: line.strip().rpartition(":") for i, line in below if line.strip()}
+    if not rows:
         raise UnreadableError("Expected series below a line @data, got none")
-    first = heads.index("@data") + 1
-    rows = {i: line.split(":") for i, line in enumerate(lines[first:], first + 1) if line.strip()}
-    *channels, labels = zip_longest(*rows.values(), fillvalue="")
+    series = (channels.split(":") for channels, _, _ in rows.values())
     columns = {
-        str(c): as_cells([cell.strip().split(",") for cell in cells])
-        for c, cells in enumerate(channels)
+        str(c): as_cells([cell.split(",") for cell in cells])
+        for c, cells in enumerate(zip_longest(*series, fillvalue=""))
     }
-    return Table(source, {**columns, "class": as_cells(labels)}, [*rows])
+    columns["class"] = as_cells([label for _, _, label in rows.values()])
+    return Table(source, columns, [*rows])
