@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from zoneinfo import ZoneInfo
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed, percent
 from ..folds import content_hash
@@ -20,14 +19,12 @@ from .table import Recording
 __all__ = [
     "LEAST_RATE_HZ",
     "MOST_RATE_HZ",
-    "Fitted",
     "check_description",
     "check_text",
-    "finished_notes",
+    "lost_note",
     "tolerance_note",
     "without_repeats",
 ]
-Fitted = tuple[Recording, NDArray[np.float32]]
 
 
 def check_description(description: Description) -> None:
@@ -38,13 +35,14 @@ def check_description(description: Description) -> None:
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")
     n_clocks = len(clock.column)
+    limits = {channel.limit for channel in description.channels.values()}
     wanted = {
         "traces.samples, the samples of each trace": description.traces.samples > 0,
         "a rate of 1 Hz to 1 MHz in time.rate_hz": (
             not clock.rate_hz or LEAST_RATE_HZ <= clock.rate_hz <= MOST_RATE_HZ
         ),
         "time.column, since the order is time": n_clocks or description.order != "time",
-        "one limit for all channels": len({c.limit for c in description.channels}) == 1,
+        "one limit for all channels": len(limits) == 1,
         f"a format for each of {n_clocks} columns in [time]": (n_clocks in (0, len(clock.format))),
     }
     expect_all(wanted)
@@ -65,39 +63,41 @@ def check_text(text: TextForm) -> None:
     expect_all(wanted)
 
 
-def without_repeats(fitted: Sequence[Fitted]) -> tuple[list[Fitted], list[Fault]]:
+def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Fault]]:
     """Return the recordings without repeats of others, and the faults of those left out.
 
     Of equal traces (C, T) with one label the first is kept; if their labels differ, none is.
     Constant traces are no repeats, since a dead sensor gives the same whatever the part.
     """
-    hashes = content_hash(np.stack([trace for _, trace in fitted])).tolist() if fitted else []
+    traces = [recording.trace for recording in recordings]
+    hashes = content_hash(np.stack(traces)).tolist() if traces else []
     groups = defaultdict[int, list[Recording]](list)
-    for hash_, (recording, _) in zip(hashes, fitted, strict=True):
+    for hash_, recording in zip(hashes, recordings, strict=True):
         groups[hash_].append(recording)
-    kept, faults = list[Fitted](), list[Fault]()
-    for hash_, (recording, trace) in zip(hashes, fitted, strict=True):
-        first = groups[hash_][0]
-        samples = trace[np.isfinite(trace)]
-        message = ""
-        if len({other.label for other in groups[hash_]}) > 1:
+    kept, faults = list[Recording](), list[Fault]()
+    for hash_, recording in zip(hashes, recordings, strict=True):
+        first, *others = groups[hash_]
+        samples = recording.trace[np.isfinite(recording.trace)]
+        if (samples == samples[:1]).all() or not others:
+            kept.append(recording)
+        elif any(other.label != first.label for other in others):
             message = f"Expected one label for the samples of {first.source}, got two"
-        elif recording is not first:
+            faults.append(Fault(recording.source, 0, message))
+        elif recording is first:
+            kept.append(recording)
+        else:
             part = f" of part {first.part}" if first.part != recording.part else ""
             message = f"Expected other samples than those of {first.source}{part}, it repeats them"
-        if message and (samples != samples[:1]).any():
             faults.append(Fault(recording.source, 0, message))
-        else:
-            kept.append((recording, trace))
     return kept, faults
 
 
-def finished_notes(traces: NDArray[np.float32], sources: Sequence[str]) -> list[str]:
-    """Return a note on the traces (n, C, T) in which samples are lost, if there are any."""
-    n_lost = (~np.isfinite(traces)).sum(axis=(1, 2)).tolist()
-    lost = {source: n for source, n in zip(sources, n_lost, strict=True) if n}
-    where = f"in {len(lost)} of {len(traces)} recordings: {listed(lost)}"
-    return [f"{sum(n_lost)} samples are lost, {where}."] if lost else []
+def lost_note(recordings: Sequence[Recording]) -> str:
+    """Return a note on the recordings in which samples are lost; "" if there are none."""
+    n_lost = {item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings}
+    lost = [source for source, n in n_lost.items() if n]
+    where = f"in {len(lost)} of {len(recordings)} recordings: {listed(lost)}"
+    return f"{sum(n_lost.values())} samples are lost, {where}." if lost else ""
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:

@@ -15,7 +15,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from ..errors import DataError, instead
 from ..files import FilePath, toml_value, write_output
@@ -28,11 +28,6 @@ FOLDER_FILE = "recordings.toml"  # in a folder; beside a single file it is FILE.
 MOST_BYTES = 1_000_000
 Words = tuple[str, ...]
 Stated = Mapping[str, Any]
-
-
-def choice(*choices: str) -> Any:
-    """Return a dataclass field for a key that is one of some texts, the first by default."""
-    return field(default=choices[0], metadata={"choices": choices})
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,8 +120,8 @@ class Clock:
 class Channel:
     """One channel of the traces: `COLUMN = "UNIT"` in `[channels]`, or a table of these keys.
 
-    column
-        Column, or a pattern of columns with `*`.
+    The column may be a pattern of columns with `*`.
+
     unit
         Unit of the traces; samples are converted to it from the unit in the file's row of units or
         in the column's name.
@@ -136,7 +131,6 @@ class Channel:
         Range of the sensor, in the unit of the traces; 0: not known.
     """
 
-    column: str = ""
     unit: str = ""
     factor: float = 1.0
     limit: float = 0.0
@@ -191,7 +185,7 @@ class LabelSource:
     topic: str = ""
     listing: str = ""
     key: str = ""
-    at: str = choice("same", "first", "last")
+    at: Literal["same", "first", "last"] = "same"
     good: Words = ()
     bad: Words = ()
     unchecked: Words = ()
@@ -236,7 +230,7 @@ class TraceForm:
     """
 
     samples: int = 0
-    lengths: str = choice("strict", "cut", "pad", "pad-all", "resample")
+    lengths: Literal["strict", "cut", "pad", "pad-all", "resample"] = "strict"
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,13 +277,13 @@ class Description:
     version: int = VERSION
     files: Words = ()
     exclude: Words = ()
-    format: str = choice("text", "json", "jsonl", "parquet", "npz", "ts", "mcap", "frame")
-    layout: str = choice("files", "long", "wide", "columns", "npz", "mcap")
+    format: Literal["text", "json", "jsonl", "parquet", "npz", "ts", "mcap", "frame"] = "text"
+    layout: Literal["files", "long", "wide", "columns", "npz", "mcap"] = "files"
     order: str = "name"
     text: TextForm = TextForm()
     rows: Mapping[str, RowWords] = field(default_factory=dict)
     time: Clock = Clock()
-    channels: tuple[Channel, ...] = ()
+    channels: Mapping[str, Channel] = field(default_factory=dict)
     ignored: Mapping[str, str] = field(default_factory=dict)  # column: unit
     part: PartSource = PartSource()
     label: LabelSource = LabelSource()
@@ -310,14 +304,15 @@ class Description:
         is_older = isinstance(version, int) and version <= VERSION
         do = "install a newer dengine"
         expect_data(is_older, f"version {VERSION} of {where}", version, do)
-        channels = values.get("channels", {})
+        channels = values.get("channels")
         if isinstance(channels, Mapping):
-            channels = [
-                {"column": column, **(about if isinstance(about, Mapping) else {"unit": about})}
+            channels = {
+                column: about if isinstance(about, Mapping) else {"unit": about}
                 for column, about in channels.items()
                 if column != UNKNOWN
-            ]
-        return _made(cls, {**values, "channels": channels}, where)  # type: ignore[no-any-return]
+            }
+            values = {**values, "channels": channels}
+        return _made(cls, values, where)  # type: ignore[no-any-return]
 
     @classmethod
     def from_toml(cls, text: str, where: str = FOLDER_FILE) -> "Description":
@@ -341,11 +336,9 @@ class Description:
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested dicts of TOML's types, without what has its default; `?` for no channel."""
-        channels = {
-            channel.column: {"unit": channel.unit, **_plain(replace(channel, column=""))}
-            for channel in self.channels or [Channel(UNKNOWN)]
-        }
-        return {**_plain(self), "channels": channels}
+        channels = self.channels or {UNKNOWN: Channel()}
+        tables = {column: {"unit": c.unit, **_plain(c)} for column, c in channels.items()}
+        return {**_plain(self), "channels": tables}
 
     def to_toml(self) -> str:
         """Return the text of the TOML file, with `notes` as comments above their keys."""
@@ -371,6 +364,11 @@ class Description:
             lines += [f"# {notes[name]}"] if name in notes else []
             lines.append(f"{_toml_key(name)} = {_toml_value(value)}")
         return lines
+
+    @property
+    def labels(self) -> tuple[LabelSource, ...]:
+        """The source of labels, and those that must agree with it."""
+        return (self.label, *self.check)
 
     @property
     def open_keys(self) -> Words:
@@ -410,11 +408,11 @@ class Description:
 
         Raises DataError for a column that it does not name.
         """
-        channels = {column: Channel(column, unit) for column, unit in self.ignored.items()}
-        channels |= {channel.column: channel for channel in self.channels}
+        channels = {column: Channel(unit) for column, unit in self.ignored.items()}
+        channels |= self.channels
         for column in columns:
             expect_one_of(channels, column, "[channels] and [ignored]")
-        return replace(self, channels=tuple(channels[column] for column in columns))
+        return replace(self, channels={column: channels[column] for column in columns})
 
 
 # The sections, in the order of the file, and what their tables are made of; None: texts.
@@ -447,7 +445,7 @@ KINDS: dict[Any, str] = {
 }
 
 
-def _made(kind: Any, value: Any, where: str, choices: Words = ()) -> Any:
+def _made(kind: Any, value: Any, where: str) -> Any:
     """Return what TOML states as a dataclass, or in the type of its key.
 
     Where several values are expected, a single one stands for a list of one. Raises DataError for
@@ -458,22 +456,23 @@ def _made(kind: Any, value: Any, where: str, choices: Words = ()) -> Any:
     if origin is tuple:
         items = value if isinstance(value, list | tuple) else [value]
         return tuple(_made(args[0], item, where) for item in items)
+    if origin is Literal and value != UNKNOWN:
+        expect_one_of(args, str(value), where)
+        return value
     if origin is not Mapping and not is_dataclass(kind):
-        return _as_kind(kind, value, where, choices)
+        return _as_kind(kind, value, where)
     expect_data(isinstance(value, Mapping), f"{where} to be a table", value)
     if origin is Mapping:
         return {name: _made(args[1], item, f"{where}.{name}") for name, item in value.items()}
-    keys = {about.name: about for about in fields(kind) if about.compare}
+    keys = {about.name: about.type for about in fields(kind) if about.compare}
     values = {}
     for name, item in value.items():
         expect_one_of(keys, name, where)
-        about = keys[name]
-        choices = about.metadata.get("choices", ())
-        values[name] = _made(about.type, item, f"{where}, {name}", choices)
+        values[name] = _made(keys[name], item, f"{where}, {name}")
     return kind(**values)
 
 
-def _as_kind(kind: Any, value: Any, where: str, choices: Words) -> Any:
+def _as_kind(kind: Any, value: Any, where: str) -> Any:
     """Return a value in the type of its key; `?` passes for every key, a number for a text."""
     if value == UNKNOWN:
         return value
@@ -483,8 +482,6 @@ def _as_kind(kind: Any, value: Any, where: str, choices: Words) -> Any:
     is_kind = is_kind and isinstance(value, bool) == (kind is bool)
     is_finite = kind is not float or (is_kind and abs(value) <= sys.float_info.max)
     expect_data(is_kind and is_finite, f"{KINDS[kind]} in {where}", value)
-    if choices:
-        expect_one_of(choices, value, where)
     return float(value) if kind is float else value
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import DataError, listed, shortened
+from ..errors import DataError, instead, listed, shortened
 from .description import TextForm
 
 Cells = NDArray[Any]
@@ -43,7 +43,7 @@ class Table:
     Parameters
     ----------
     source : str
-        The file, as seen from the folder.
+        What it is called in messages: the file, with the row or the part if it has several.
     columns : mapping of str to array, shape (rows,)
         Numbers, times, or texts as objects. In a file of a single part a column of one cell holds
         for all rows.
@@ -55,10 +55,13 @@ class Table:
         Lines above the header.
     header : int
         Line of the header; 0 for none.
-    damage : mapping of int to str
-        What is wrong with lines of another number of cells; their rows have empty cells.
+    damage : sequence of UnreadableError
+        What is wrong with lines of another number of cells, whose rows have empty cells; or with a
+        part as a whole.
     origin : mapping of str to sequence of str
         The columns of the file that the cells of a column stood in, if they are others.
+    path : str
+        The path that names a part, as seen from the folder, or its column or window.
     """
 
     source: str
@@ -67,8 +70,9 @@ class Table:
     units: Mapping[str, str] = field(default_factory=dict)
     above: Sequence[str] = ()
     header: int = 0
-    damage: Mapping[int, str] = field(default_factory=dict)
+    damage: Sequence[UnreadableError] = ()
     origin: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    path: str = ""
 
     def column(self, name: str) -> Cells:
         """Return a column; raise UnreadableError if there is none of this name."""
@@ -76,6 +80,12 @@ class Table:
             columns = listed(self.columns) or "none"
             raise UnreadableError(f"Expected a column {name}, got {columns}", self.header, name)
         return self.columns[name]
+
+    def whole(self) -> "Table":
+        """Return the table itself; raise its first damage if it has any."""
+        if self.damage:
+            raise self.damage[0]
+        return self
 
     def take(self, rows: Any) -> "Table":
         """Return a table of some rows: a slice, or an array of positions or booleans."""
@@ -92,7 +102,8 @@ class Table:
         """
         import pandas as pd
 
-        codes, cells = pd.factorize(self.column(name), use_na_sentinel=False)
+        with instead(UnreadableError, f"Expected texts or numbers in {name}", TypeError):
+            codes, cells = pd.factorize(self.column(name), use_na_sentinel=False)
         texts = np.array([as_word(cell) for cell in cells.tolist()], dtype=object)
         return np.asarray(texts[codes])
 
@@ -138,37 +149,34 @@ class Table:
         return str(words[-1 if at == "last" else 0])
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Recording:
-    """The samples of one part, as a file holds them.
+    """The trace of one part, and what is known of it.
 
     Parameters
     ----------
     source : str
         The file, or the file and row.
-    samples : array of float64, shape (C, n)
-    seconds : array of float64, shape (n,), optional
-        Time of each sample since the first.
-    start : float
-        Time of the first sample in seconds, by the clock's own zero; NaN without a clock.
+    trace : array of float32, shape (C, T)
+    label : int
+        1 good, 0 bad.
     part : str
         Number of the part; "" if none is stated.
-    label : int or None
-        1 good, 0 bad, None not checked.
-    order : str
+    length : int
+        Samples as recorded.
+    start : float
+        Time of the first sample in seconds, by the clock's own zero; NaN without a clock.
+    rank : str
         Word of the column by which the recordings are put in order.
-    lines : sequence of int
-        Line of each sample; empty if they are not known.
     """
 
     source: str
-    samples: Floats
-    seconds: Floats | None = None
-    start: float = np.nan
-    part: str = ""
-    label: int | None = None
-    order: str = ""
-    lines: Sequence[int] = ()
+    trace: NDArray[np.float32]
+    label: int
+    part: str
+    length: int
+    start: float
+    rank: str
 
 
 def as_word(cell: Any) -> str:

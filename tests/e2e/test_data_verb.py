@@ -61,7 +61,10 @@ def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(
     shown("data", folder, "--set", "channels.FZ_Base=N", "--save")
     saved = Description.load(folder / "recordings.toml")
     data = load_dataset(folder)
-    assert (saved.channels[0].unit, saved.seen.recordings) == ("N", len(data) + len(data.faults))
+    assert (saved.channels["FZ_Base"].unit, saved.seen.recordings) == (
+        "N",
+        len(data) + len(data.faults),
+    )
     assert (data.unit, data.rate_hz, data.channels) == ("N", 500.0, ("FZ_Base",))
     again = dengine("data", folder, "--save")
     assert again.exit_code == 1

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 import pandas as pd
@@ -147,7 +147,7 @@ def described(layout: str, X: np.ndarray, style: Style, names: Cells, kind: str)
         layout=layout,
         text=style.form if kind == "text" else TextForm(),
         time=Clock(("time",), rate_hz=RATE) if style.has_clock and not is_wide else Clock(),
-        channels=tuple(Channel(f"{name}_*" if is_wide else name) for name in names),
+        channels={f"{name}_*" if is_wide else name: Channel() for name in names},
         traces=TraceForm(X.shape[2]),
         part=part,
         label=label,
@@ -454,7 +454,7 @@ def test_one_sentence_says_what_to_type(tmp_path: Path) -> None:
     ]
     changes: list[tuple[str, Any, str]] = [
         ("label", LabelSource("?"), "still open: label.column"),
-        ("channels", (), "still open: channels"),
+        ("channels", {}, "still open: channels"),
         ("traces", TraceForm(), "traces.samples"),
         ("label", listed, "list.csv"),
         ("part", PartSource(path="part"), "one group"),
@@ -462,7 +462,7 @@ def test_one_sentence_says_what_to_type(tmp_path: Path) -> None:
         ("time", Clock(("time",), ("s", "ms")), "a format for each"),
         ("time", Clock(("time",), zone="Mars/X"), "time.zone"),
         ("time", Clock(rate_hz=2e6), "1 Hz to 1 MHz"),
-        ("channels", (Channel("FZ", limit=1.0), Channel("Weg ü")), "one limit"),
+        ("channels", {"FZ": Channel(limit=1.0), "Weg ü": Channel()}, "one limit"),
     ]
     cases += [(tmp_path, replace(d, **{key: value}), text) for key, value, text in changes]
     for source, description, message in cases:
@@ -555,26 +555,6 @@ def test_lines_of_json_under_another_suffix_are_refused_until_that_is_stated(
     assert load_dataset(path, describe(path, {"format": "jsonl"})).y.tolist() == [1, 0, 1, 0]
 
 
-def test_a_column_named_part_with_short_runs_is_asked_about(tmp_path: Path) -> None:
-    path = tmp_path / "all.csv"
-    rows = [f"{i // 3},{10 if i < 29 else 0},{i / 7},OK" for i in range(30)]
-    path.write_text("\n".join(["part,travel,FZ,verdict", *rows]) + "\n", encoding="utf-8")
-    proposal = describe(path)
-    assert "part.column" in proposal.open_keys
-    assert "one of part, travel" in proposal.notes["part.column"]
-
-
-def test_times_that_repeat_are_asked_about(tmp_path: Path) -> None:
-    for i in range(5):
-        rows = [f"10:00:{k // 10:02},{k * i % 7}" for k in range(60)]
-        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text("\n".join(["time,force", *rows]))
-    proposal = describe(tmp_path)
-    assert "time.column" in proposal.open_keys
-    assert "time.column=[]" in proposal.notes["time.column"]
-    data = load_dataset(tmp_path, describe(tmp_path, {"time.column": [], "time.rate_hz": 10}))
-    assert (data.X.shape, data.rate_hz) == ((5, 60), 10.0)
-
-
 def test_stated_checks_and_headers_are_kept(tmp_path: Path) -> None:
     folder = in_files(tmp_path, "time,force")
     check = {"path": "^(.)", "good": ["1", "3", "4"], "bad": ["0", "2"]}
@@ -615,17 +595,17 @@ def test_a_resampled_recording_may_end_one_step_before_the_trace(
 
 
 def test_a_stated_key_replaces_one_and_a_stated_source_the_others() -> None:
-    d = Description(channels=(Channel("F.z", "N"), Channel("?")), label=LabelSource("verdict"))
+    d = Description(channels={"F.z": Channel("N"), "?": Channel()}, label=LabelSource("verdict"))
     stated = d.with_values({"channels.F.z.limit": 100.0, "label.path": "(OK)"})
-    assert stated.channels == (Channel("F.z", "N", limit=100.0),)
+    assert stated.channels == {"F.z": Channel("N", limit=100.0)}
     assert stated.label == LabelSource(path="(OK)")
     assert d.open_keys == ("channels",)
 
 
 def of_field(about: Any) -> Any:
     """Return what a key may be."""
-    default, choices = about.default, about.metadata.get("choices")
-    if choices:
+    default, choices = about.default, get_args(about.type)
+    if get_origin(about.type) is Literal:
         return st.sampled_from(choices)
     if isinstance(default, tuple):
         return st.lists(st.text(max_size=5), max_size=3).map(tuple)
@@ -644,11 +624,10 @@ def of_class(cls: Any) -> Any:
 def of_section(name: str, cls: Any) -> Any:
     """Return what a section may be."""
     one = of_class(cls) if cls else st.text(max_size=5)
-    several = st.lists(one, max_size=3, unique_by=lambda item: getattr(item, "column", ""))
-    if name in ("channels", "check"):
-        return several.map(tuple)
+    if name == "check":
+        return st.lists(one, max_size=3).map(tuple)
     named = st.dictionaries(st.text(max_size=8), one, max_size=3)
-    return named if name in ("rows", "ignored") else one
+    return named if name in ("rows", "channels", "ignored") else one
 
 
 NAMES = [f for f in fields(Description) if f.compare and f.name not in SECTIONS]
@@ -662,5 +641,6 @@ NOTES = st.dictionaries(st.sampled_from(["text.names", "channels.?", "files"]), 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.builds(Description, **KEYS_, **SECTIONS_, notes=NOTES))
 def test_a_description_comes_back_from_its_toml(description: Description) -> None:
-    columns = {channel.column for channel in description.channels}
-    assert "?" in columns or Description.from_toml(description.to_toml()) == description
+    assert (
+        "?" in description.channels or Description.from_toml(description.to_toml()) == description
+    )

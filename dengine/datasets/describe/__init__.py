@@ -12,18 +12,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ...errors import DataError, instead, listed
+from ...errors import DataError, listed
 from ..checks import check_text
 from ..dataset import Fault
 from ..description import UNKNOWN, Description
-from ..read.files import BAD, caught, natural_key, read_file
-from ..read.frames import part_tables, read_frame
-from ..read.split import tables_of
+from ..read.files import caught, match_files, natural_key, read_file
+from ..read.frames import read_frame, read_npz
+from ..read.places import without_suffix
+from ..read.split import table_of
 from ..read.text import read_text
-from ..table import UnreadableError
+from ..table import Table, UnreadableError
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
-from .layout import layout_of, places_of
+from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import propose_form
 
@@ -39,7 +40,6 @@ SUFFIXES = dict.fromkeys(TEXTS, "text") | {
     ".mcap": "mcap",
     ".db3": "mcap",
 }
-ENDING = re.compile(r"\.[^./]*(\.gz)?$", re.IGNORECASE)
 # Hidden files, pages for people, and descriptions.
 NO_RECORDING = re.compile(
     r"(?i)(^|/)(\.|(readme|licen[sc]e|notes|changelog)(\.[^/]*)?$|recordings\.toml$)"
@@ -77,7 +77,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     check_text(p.description.text)
     if hasattr(source, "columns"):
         p.put("format", "frame")
-        propose_tables(p, [[read_frame(source, "table")]])
+        propose_tables(p, [read_frame(source, "table")])
     elif choose_files(p, Path(source)):
         if p.description.format == "mcap":
             p.put("layout", "mcap")
@@ -88,30 +88,32 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
 
 
 def choose_files(p: Proposal, root: Path) -> bool:
-    """Find which files are the recordings, and their format; return whether that is clear.
-
-    They are those of the only suffix that several files have, or else of a bag, or of any suffix.
-    """
-    if not root.exists():
-        raise DataError(f"Expected a file or a folder of recordings, got {root}, which is none.")
+    """Find which files are the recordings, and their format; return whether that is clear."""
     stated = p.description.files
-    names = names_in(root, stated)
+    every = names_in(root, ())
+    names = names_in(root, stated) if stated else every
     if not names:
-        raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}; found none in {root}.")
-    p.base = root if root.is_dir() else root.parent
-    counts = Counter(map(suffix_of, names))
-    likely = [suffix for suffix, n in counts.items() if n > 1] or [BAG] * (BAG in counts)
-    likely = likely or [*counts]
+        state = "it has none" if root.exists() else "it does not exist"
+        raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}; {state}.")
+    likely = likely_suffixes(names)
     if len(likely) > 1 and not stated:
+        counts = Counter(map(suffix_of, names))
         text = listed(f"*{suffix} ({n} files)" for suffix, n in counts.items())
         p.put("files", UNKNOWN, f"one of {text}")
         p.notes["channels"] = "they follow from files"
         return False
+    p.base = root if root.is_dir() else root.parent
     p.names = names if stated else [name for name in names if suffix_of(name) == likely[0]]
-    p.others = [name for name in names_in(root, ()) if name not in {*p.names}]
+    p.others = [name for name in every if name not in {*p.names}]
     p.put("files", globs(p.names))
     p.put("format", SUFFIXES.get(suffix_of(p.names[0]), "text"))
     return True
+
+
+def likely_suffixes(names: Names) -> Names:
+    """Return the suffixes that several files, or bags, have; or else all."""
+    counts = Counter(map(suffix_of, names))
+    return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 
 
 def suffix_of(name: str) -> str:
@@ -128,22 +130,20 @@ def names_in(root: Path, patterns: Names) -> Names:
     """
     if root.is_file():
         return [root.name]
-    with instead(DataError, f"Expected patterns below a folder in files, got {patterns}", *BAD):
-        paths = {path for pattern in patterns or ["**/*"] for path in root.glob(pattern)}
-    names = [path.relative_to(root).as_posix() for path in paths if path.is_file()]
-    names = [name for name in names if patterns or suffix_of(name) in SUFFIXES]
+    names = match_files(root, patterns or ["**/*"])
+    names = {name for name in names if patterns or suffix_of(name) in SUFFIXES}
     return sorted((name for name in names if not NO_RECORDING.search(name)), key=natural_key)
 
 
 def globs(names: Names) -> list[str]:
     """Return the patterns of files of one suffix, or the only file."""
     folders = "**/" if any("/" in name for name in names) else ""
-    endings = {match[0] for name in names if (match := ENDING.search(name))}
+    endings = {name.removeprefix(without_suffix(name)) for name in names}
     return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]
 
 
-def read_tables(p: Proposal) -> list[Tables]:
-    """Return the first tables of some files, of those with the columns of most.
+def contents_of(p: Proposal) -> dict[str, bytes]:
+    """Return the contents of some files, by their names, in the order of all.
 
     These are files whose names are like few others but for numbers, and others evenly spread.
     """
@@ -156,51 +156,58 @@ def read_tables(p: Proposal) -> list[Tables]:
         if sum(map(len, contents.values())) < MOST_BYTES:
             with suppress(UnreadableError):
                 contents[name] = read_file(p.base / name)
+    return {name: contents[name] for name in p.names if name in contents}
+
+
+def read_tables(p: Proposal) -> list[Table]:
+    """Return the first tables of some files, of those with the columns of most."""
+    contents = contents_of(p)
     if p.description.format == "text":
         propose_form(p, contents)
-    files = list[Tables]()
+    files: list[Table] = []
     faults: list[Fault] = []
-    for name in [name for name in p.names if name in contents]:
+    for name in filter({*p.names}.__contains__, contents):
         with caught(faults, name):
-            files.append(tables_in(p, contents[name], name))
+            files.append(table_in(p, contents[name], name))
     if faults and not files:
         raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
-    heads = Counter(tuple(tables[0].columns) for tables in files if tables).most_common(1)
-    return [tables for tables in files if tables and tuple(tables[0].columns) == heads[0][0]]
+    heads = [tuple(table.columns) for table in files]
+    usual = max(heads, key=heads.count, default=())
+    return [table for table, head in zip(files, heads, strict=True) if head == usual]
 
 
-def tables_in(p: Proposal, content: bytes, name: str) -> Tables:
-    """Return the first tables of a file, of a text with all cells as words.
+def table_in(p: Proposal, content: bytes, name: str) -> Table:
+    """Return the first table of a file, of a text with all cells as words.
 
     The only archive holds all parts if its arrays hold curves. Raises DataError if it is damaged.
     """
     kind = p.description.format
-    layout = p.stated.get("layout", "")
-    if kind == "npz" and (layout == "npz" or (len(p.names) == 1 and not layout)):
-        parts = part_tables(content, name)
-        if any(len(cells) > 1 for cells in parts[0].columns.values()):
-            return parts
+    if kind == "npz":
+        is_single = len(p.names) == 1 and "layout" not in p.stated
+        table = read_npz(content, name, has_all=True)
+        if p.stated.get("layout") == "npz" or (is_single and has_lists(table)):
+            return table
     if kind in ("text", "jsonl") and len(content) > MOST_BYTES:
         content = content[: content.rfind(b"\n", 0, MOST_BYTES)]
         p.is_cut = True
-    if kind != "text":
-        return tables_of(content, name, replace(p.description, layout="files"))
-    return [read_text(content, name, p.description.text, lambda _: False, lambda _: True)]
+    if kind == "text":
+        return read_text(content, name, p.description.text).whole()
+    return table_of(content, name, replace(p.description, layout="files"))
 
 
-def propose_tables(p: Proposal, files: Sequence[Tables]) -> None:
+def propose_tables(p: Proposal, files: Tables) -> None:
     """Find the layout, and the role of each column."""
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")
-    p.is_cut |= any(len(table.lines) > MOST_ROWS for tables in files for table in tables)
-    files = [[table.take(slice(0, MOST_ROWS)) for table in tables] for tables in files]
+    p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
+    files = [table.take(slice(0, MOST_ROWS)) for table in files]
     p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"
         return
-    p.places = places_of(p, files)
-    if not p.places:
+    p.tables = parts_of(p, files)
+    if not p.tables:
         raise DataError(f"Expected recordings in {listed(p.names)}, found none.")
-    if p.description.layout != "files" or len(p.places) != len(files):
+    if p.description.layout != "files" or len(p.tables) != len(files):
         p.names = ()
     propose_roles(p)

@@ -38,7 +38,7 @@ def propose_bag(p: Proposal) -> None:
             units |= dict(_fields(message, topic))
             is_stamped &= hasattr(message, "header") and message.header.stamp.sec > 0
     propose_channels(p, units)
-    channels = [channel.column for channel in p.description.channels]
+    channels = [*p.description.channels]
     p.put("ignored", {name: unit for name, unit in units.items() if name not in channels})
     p.put("time.column", STAMP if is_stamped else LOG_TIME)
     p.put("time.format", "ns")

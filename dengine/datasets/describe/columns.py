@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
-from ..description import Description, TextForm
-from ..read.clock import ISO
-from ..read.places import Place
-from ..read.split import column_kinds
+from ..description import Clock, Description, TextForm
+from ..read.clock import ISO, times_of
+from ..read.split import column_kind
 from ..table import Table
 from ..units import bare
 
@@ -26,7 +25,7 @@ TIMES = ("%H:%M:%S.%f", "%H:%M:%S", "%H:%M:%S:%f", "%I:%M:%S.%f %p", "%I:%M:%S %
 MOMENTS = (f"{day} {time}" for day in DAYS for time in TIMES)
 ZONED = ("%Y-%m-%d %H:%M:%S.%f UTC", "%Y-%m-%d %H:%M:%S.%f")
 FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
-LIKE_A_TIME = r"^\d+[:\-./T](?:\d+|[A-Za-z]{3})[:\-./T]\d|^\d+:\d+\.\d|^\d{8}T\d{6}"
+LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
 MOST_CELLS = 20  # of a recording whose form of times is looked at
@@ -94,25 +93,22 @@ class Column:
     @cached_property
     def forms(self) -> list[str]:
         """All forms of dates and times that fit its cells."""
-        import pandas as pd
-
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
         cells = {word for words in self.words for word in (*words[:MOST_CELLS], *words[-1:])}
-        texts = pd.Series(sorted(cells), dtype=object)
-        if not cells or not texts.str.contains(LIKE_A_TIME).all():
+        if not cells or not all(map(LIKE_A_TIME.match, cells)):
             return []
-        forms = [form for form in FORMS if _fits(texts, form)]
+        table = Table(self.name, {self.name: np.array(sorted(cells), dtype=object)}, [])
+        forms = [form for form in FORMS if _fits(table, form)]
         return forms[:1] if forms[:1] in ([DAY], [ISO]) else forms
 
 
-def _fits(texts: Any, form: str) -> bool:
-    """Return whether all texts are dates or times of a form."""
-    import pandas as pd
-
-    texts = texts.str.replace(",", ".") if "%f" in form else texts
-    form = "ISO8601" if form == ISO else form
-    return not pd.to_datetime(texts, format=form, errors="coerce", utc=True).isna().any()
+def _fits(table: Table, form: str) -> bool:
+    """Return whether a column, named like its table, holds dates or times of a form."""
+    with suppress(DataError):
+        times_of(table, Clock((table.source,), (form,)), TextForm())
+        return True
+    return False
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
@@ -127,9 +123,9 @@ class Proposal:
 
     stated : keys that the user gave, with their values. description : with all keys so far. base :
     the folder. names : the recordings' files, if each is one. others : the other files. is_cut :
-    whether some file was read in part. places : the place of each recording that was looked at, by
-    its source. columns : of the rows that are samples, as far as that is known. notes : a comment
-    for each key that needs one.
+    whether some file was read in part. tables : of the recordings that were looked at. columns : of
+    the rows that are samples, as far as that is known. notes : a comment for each key that needs
+    one.
     """
 
     stated: Stated
@@ -138,7 +134,7 @@ class Proposal:
     names: Sequence[str] = ()
     others: Sequence[str] = ()
     is_cut: bool = False
-    places: Mapping[str, Place] = field(default_factory=dict)
+    tables: Tables = ()
     columns: Mapping[str, Column] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
 
@@ -149,13 +145,7 @@ class Proposal:
             self.notes |= {key: note} if note else {}
 
     @property
-    def tables(self) -> list[Table]:
-        """The table of each recording that was looked at."""
-        return [place.table for place in self.places.values()]
-
-    @property
     def unused(self) -> list[Column]:
         """The columns that have no role yet."""
-        is_number, is_word = column_kinds(self.description)
-        names = [name for name in self.columns if not (is_number(name) or is_word(name))]
-        return [self.columns[name] for name in names]
+        kind_of = column_kind(self.description)
+        return [column for name, column in self.columns.items() if not kind_of(name)]

@@ -10,13 +10,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import permutations
-from typing import Any
+from typing import Any, Literal
 
 from ...errors import DataError
 from ..description import UNKNOWN, LabelSource, PartSource
-from ..read.places import Place, listing_table, part_of, read_labels, without_suffix
+from ..read.places import listing_table, part_of, read_labels, without_suffix
 from ..table import Table, UnreadableError
-from .columns import MOST_WORDS, Column, Proposal, counts_of
+from .columns import MOST_WORDS, Column, Proposal, Tables, counts_of
 
 GOOD = (
     *("ok", "pass", "passed", "good", "success", "gut", "true", "i.o.", "i.o", "i_o", "io"),
@@ -59,9 +59,8 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
 )
 FOLDER = "([^/]+)/[^/]*$"  # of a recording
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
-KINDS = ("listing", "column", "path", "line")
+KINDS = ("listing", "key", "column", "path", "line")
 Names = Iterable[str]
-Places = Mapping[str, Place]
 Words = Mapping[str, str]  # by recording
 
 
@@ -117,14 +116,14 @@ def is_verdict(name: str, words: Names) -> bool:
     return bool(is_named) and is_label and len(words) <= MOST_WORDS
 
 
-def row_of(column: Column) -> str:
+def row_of(column: Column) -> Literal["", "same", "last"]:
     """Return which row of a recording has the label in a column, `same` or `last`; "" for none.
 
     It is the last if above it stand only words for not checked.
     """
     last = [str(words[-1]) for words in column.words if len(words)]
     above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
-    row = "same" if column.fixed else "last"
+    row: Literal["same", "last"] = "same" if column.fixed else "last"
     return row if above <= {*UNCHECKED} and is_verdict(column.name, last) else ""
 
 
@@ -134,65 +133,69 @@ def lines_of(p: Proposal, pattern: re.Pattern[str]) -> list[str]:
     return [*filter(pattern.search, (line.strip(" \"'") for line in lines))]
 
 
-def part_words(source: PartSource, places: Places) -> dict[str, str]:
+def part_words(source: PartSource, tables: Tables) -> Words:
     """Return the number of the part of each recording that states one."""
     words = dict[str, str]()
-    for name, place in places.items():
+    for table in tables:
         with suppress(DataError):
-            words[name] = part_of(source, place)
+            words[table.source] = part_of(source, table)
     return words
 
 
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
-    """Yield the sources that may hold labels: in listings, paths, columns and lines."""
+    """Yield the stated source, or those that may hold labels in listings, paths, columns, lines."""
     label = p.description.label
+    if any(getattr(label, kind) for kind in KINDS):
+        yield label
+        return
     for name in p.others:
         with suppress(DataError, ValueError):
-            table = listing_table(p.base / name, (), p.description.text)
+            table = listing_table(p.base / name, p.description.text)
             for key, column in permutations(table.columns, 2):
                 if is_verdict(column, table.words(column)):
                     yield replace(label, listing=name, key=key, column=column)
     if p.description.layout in ("files", "columns"):
         yield from (replace(label, path=path) for path in in_paths(paths))
-    rows = {column.name: row_of(column) for column in p.unused}
-    yield from (replace(label, column=name, at=row) for name, row in rows.items() if row)
+    for unused in p.unused:
+        if row := row_of(unused):
+            yield replace(label, column=unused.name, at=row)
     yield from (replace(label, line=line) for line in lines_of(p, NAME))
 
 
-def words_of(p: Proposal, source: LabelSource, places: Places, parts: Words) -> Words:
-    """Return the word of each recording that has one in a source."""
+def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
+    """Return the word of each recording that has one in a source; there must be some if stated."""
     words = dict[str, str]()
-    with suppress(*([] if source == p.description.label else [DataError])):
+    is_stated = source == p.description.label
+    with suppress(*([] if is_stated else [DataError])):
         reader = read_labels(p.base, source, p.description.text)
-        for name, place in places.items():
+        for table in tables:
             with suppress(UnreadableError):
-                words[name] = reader.words(place, parts.get(name, ""))[0]
+                words[table.source] = reader.words(table, parts.get(table.source, ""))[0]
+    if is_stated and not words:
+        raise DataError("Expected words where [label] says they stand, found none.")
     return words
 
 
 def title_of(source: LabelSource, words: Words) -> str:
     """Return what to type for a source, with the counts of its words."""
-    keys = [key for key in ("listing", "key", *KINDS[1:]) if getattr(source, key)]
-    stated = " ".join(f"label.{key}={getattr(source, key)}" for key in keys)
-    return f"{stated} ({counts_of(words.values())})"
+    stated = [f"label.{kind}={getattr(source, kind)}" for kind in KINDS if getattr(source, kind)]
+    return f"{' '.join(stated)} ({counts_of(words.values())})"
 
 
-def count_sources(p: Proposal, places: Places) -> dict[LabelSource, Words]:
+def count_sources(p: Proposal) -> dict[LabelSource, Words]:
     """Return the stated source, or all with words for most recordings, with their words.
 
     Of columns and lines, these are the recordings that were looked at.
     """
-    label = p.description.label
-    parts = part_words(p.description.part, places)
-    is_stated = any(getattr(label, kind) for kind in KINDS)
-    paths = [place.path for place in places.values()]
+    looked_at = {table.source for table in p.tables}
+    others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
+    tables = [*p.tables, *others]
+    parts = part_words(p.description.part, tables)
     counted = dict[LabelSource, Words]()
-    for source in [label] if is_stated else sources_of(p, paths):
-        words = words_of(p, source, places, parts)
-        if is_stated and not words:
-            raise DataError("Expected words where [label] says they stand, found none.")
-        looked_at = places if source.listing or source.path else p.places
-        if is_stated or len(words) > len(looked_at) / 2:
+    for source in sources_of(p, [table.path for table in tables]):
+        words = words_of(p, source, tables, parts)
+        n = len(tables if source.listing or source.path else p.tables)
+        if len(words) > n / 2 or source == p.description.label:
             counted[with_meanings(source, words.values())] = words
     return counted
 
@@ -214,25 +217,27 @@ def propose_label(p: Proposal) -> None:
     are checks if they have a word for each recording. If one disagrees, or there is none, the label
     is `?`, and the note lists them all.
     """
-    places = {name: Place(name, Table(name, {}, [])) for name in p.names} | {**p.places}
-    counted = count_sources(p, places)
-    sides = {source: sides_of(source, words) for source, words in counted.items()}
-    certain = [source for source in counted if sides[source]]
-    doubt = _disagreement([sides[source] for source in certain])
-    chosen = certain or ([*counted] if len(counted) == 1 else [])
-    chosen = [] if doubt else chosen
-    best = chosen[0] if chosen else replace(p.description.label, column=UNKNOWN)
-    checks = [source for source in chosen[1:] if counted[source].keys() >= counted[best].keys()]
-    p.description = replace(p.description, label=best, check=p.description.check or tuple(checks))
-    others = [title_of(source, words) for source, words in counted.items() if source != best]
-    if chosen:
-        counts = counts_of(counted[best].values())
-        note = "; ".join([f"{counts}, over {len(counted[best]):,} recordings", *others])
-        open_keys = ("label.good", "label.bad") if UNKNOWN in best.good + best.bad else ()
-        p.notes |= dict.fromkeys(open_keys, f"which of the words? {counts}")
-        p.notes[f"label.{next(kind for kind in KINDS if getattr(best, kind))}"] = note
-    else:
-        p.notes["label.column"] = "; ".join([*others, *_few_words(p), doubt or NO_LABEL])
+    counted = count_sources(p)
+    certain = [source for source, words in counted.items() if sides_of(source, words)]
+    doubt = _disagreement([sides_of(source, counted[source]) for source in certain])
+    if doubt or not (certain or len(counted) == 1):
+        titles = map(title_of, counted, counted.values())
+        p.put("label.column", UNKNOWN, "; ".join([*titles, *_few_words(p), doubt or NO_LABEL]))
+        return
+    best, *others = certain or counted
+    words = counted.pop(best)
+    checks = tuple(source for source in others if counted[source].keys() >= words.keys())
+    p.description = replace(p.description, label=best, check=p.description.check or checks)
+    _note_words(p, best, words, [*map(title_of, counted, counted.values())])
+
+
+def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
+    """Put the words of the label, and its other sources, into the notes."""
+    counts = counts_of(words.values())
+    if UNKNOWN in label.good + label.bad:
+        p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")
+    kind = next(kind for kind in KINDS if getattr(label, kind))
+    p.notes[f"label.{kind}"] = "; ".join([f"{counts}, over {len(words):,} recordings", *others])
 
 
 def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:

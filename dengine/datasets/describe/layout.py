@@ -2,16 +2,14 @@
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, TextForm
-from ..read.frames import join
-from ..read.places import Place
-from ..read.split import split
+from ..read.split import OBJECTS, split
 from ..table import Table
 from . import labels
 from .clock import NAME as CLOCK_NAME
@@ -23,20 +21,20 @@ PART_NAME = re.compile(
 )
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
 MOST_PARTS = 240
-Files = Sequence[Tables]  # the tables of each file
 
 
-def layout_of(p: Proposal, files: Files) -> str:
+def layout_of(p: Proposal, files: Tables) -> str:
     """Return how parts are laid out, `?` if nothing tells; find what tells rows apart.
 
     Raises DataError for a table of results without samples.
     """
-    if p.description.format == "npz" and len(files[0]) > 1:
-        return "npz"
-    if _is_wide(p.description.format, files):
-        return "wide"
-    tables = [tables[0] if len(tables) == 1 else join(tables) for tables in files]
-    columns = columns_of(tables, TextForm())
+    kind = p.description.format
+    first = files[0]
+    if kind in OBJECTS and len(files) > 1 and len(first.lines) == 1:
+        return "files"
+    if numbered_columns(first) or has_lists(first):
+        return "npz" if kind == "npz" else "wide"
+    columns = columns_of(files, TextForm())
     stated = [columns[name] for name in p.description.part.column if name in columns]
     if _propose_part(p, columns.values()) or any(len(c.counts) > 1 for c in stated):
         return "long"
@@ -47,29 +45,20 @@ def layout_of(p: Proposal, files: Files) -> str:
     return UNKNOWN
 
 
-def _is_wide(kind: str, files: Files) -> bool:
-    """Return whether a row, or an object, has all samples of a part."""
-    first = files[0][0]
-    is_json = kind in ("json", "jsonl") and (len(files) == 1 or len(files[0]) > 1)
-    has_curves = is_json and max(map(len, first.columns.values())) > 1
-    return kind == "ts" or has_curves or bool(numbered_columns(first)) or _has_lists(first)
-
-
 def _propose_part(p: Proposal, columns: Collection[Column]) -> bool:
     """Propose `part.column`, and return whether any column has runs, see `_has_runs`.
 
-    It is the first column with runs that is named like a part. If none is, it is the only column
-    with runs, or the only one of them with digits; `?` if there are several, or if a column that is
-    named like a part has no runs. Without runs nothing is proposed.
+    It is the first column with runs that is named like a part, or else the only column that has
+    runs or such a name; `?` if there are several. Without runs nothing is proposed.
     """
-    runs = [column for column in columns if _has_runs(column)]
-    numbered = [column for column in runs if re.search(r"\d", min(column.counts))]
-    certain = [column for column in runs if PART_NAME.search(column.name)]
-    named = [column for column in columns if PART_NAME.search(column.name)]
-    best = certain or [*named, *(numbered or runs)]
+    runs = [column.name for column in columns if _has_runs(column)]
+    named = [column.name for column in columns if PART_NAME.search(column.name)]
+    certain = [name for name in runs if name in named]
+    best = certain or [*named, *runs]
     if runs:
-        note = f"one of {listed(column.name for column in best)}" if len(best) > 1 else ""
-        p.put("part.column", best[0].name if certain or len(best) == 1 else UNKNOWN, note)
+        is_clear = certain or len(best) == 1
+        note = f"one of {listed(best)}" if len(best) > 1 else ""
+        p.put("part.column", best[0] if is_clear else UNKNOWN, note)
     return bool(runs)
 
 
@@ -79,15 +68,20 @@ def numbered_columns(table: Table) -> list[str]:
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
 
 
-def _has_lists(table: Table) -> bool:
+def has_lists(table: Table) -> bool:
     """Return whether cells of a column are lists."""
     cells = [column[0] for column in table.columns.values() if len(column)]
     return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
 
 
+def _n_runs(column: Column) -> list[int]:
+    """Return how many runs of equal words each table has."""
+    return [int((words[1:] != words[:-1]).sum()) + 1 for words in column.words]
+
+
 def _has_runs(column: Column) -> bool:
     """Return whether a column has one word for each of several runs of rows."""
-    n_runs = [int((words[1:] != words[:-1]).sum()) + 1 for words in column.words]
+    n_runs = _n_runs(column)
     is_unique = len(column.counts) == sum(n_runs) and "" not in column.counts
     is_long = column.counts.total() >= LEAST_RUN * sum(n_runs)
     if not is_unique or not is_long or sum(n > 1 for n in n_runs) <= len(n_runs) / 2:
@@ -100,10 +94,9 @@ def _has_runs(column: Column) -> bool:
 def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table with a row for each result, and no samples."""
     for column in columns:
-        words = column.words[0]
-        edges = np.flatnonzero(words[1:] != words[:-1])
-        is_long = min(np.diff(edges), default=LEAST_RUN) >= LEAST_RUN
-        source = labels.with_meanings(LabelSource(), column.counts if not is_long else ())
+        edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
+        is_short = min(np.diff(edges), default=LEAST_RUN) < LEAST_RUN
+        source = labels.with_meanings(LabelSource(), column.counts if is_short else ())
         if labels.is_plain(source) and source.good and source.bad:
             actual = f"a row for each result, with its verdict in {column.name}, and no curve"
             where = column.tables[0].source
@@ -111,22 +104,21 @@ def _refuse_results(columns: Iterable[Column]) -> None:
             raise DataError(f"Expected the samples of each part in {where}, got {actual}; {do}.")
 
 
-def places_of(p: Proposal, files: Files) -> dict[str, Place]:
-    """Return where each part stands that was looked at, by its source.
+def parts_of(p: Proposal, files: Tables) -> list[Table]:
+    """Return the tables of the parts that are looked at.
 
     The last part of files that were read in part may be cut.
     """
     description, layout = p.description, p.description.layout
-    patterns = [ANY] if layout == "columns" else numbered_columns(files[0][0])
+    patterns = [ANY] if layout == "columns" else numbered_columns(files[0])
     if layout == "columns":
-        clock = [*filter(CLOCK_NAME.search, files[0][0].columns)]
+        clock = [*filter(CLOCK_NAME.search, files[0].columns)]
         description = description.with_values({"time.column": clock})
     if layout in ("wide", "columns") and not description.channels:
-        description = replace(description, channels=tuple(map(Channel, patterns)))
-    places = dict[str, Place]()
-    for tables in files:
-        parts = list(split(tables, tables[0].source, description, []))
-        is_cut = p.is_cut and layout == "long" and len(parts) > 1
-        for source, path, table in parts[: len(parts) - is_cut][: MOST_PARTS - len(places)]:
-            places[source] = Place(path, table)
-    return places
+        description = replace(description, channels=dict.fromkeys(patterns, Channel()))
+    parts = list[Table]()
+    for table in files:
+        of_file = [part for part in split(table, description) if not part.damage]
+        is_cut = p.is_cut and layout == "long" and len(of_file) > 1
+        parts += of_file[: len(of_file) - is_cut]
+    return parts[:MOST_PARTS]

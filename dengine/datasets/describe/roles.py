@@ -12,8 +12,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
-from ..read.places import LabelReader
-from ..read.recordings import Reader
+from ..read.recordings import kept_rows
 from ..table import Table
 from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
@@ -40,8 +39,7 @@ FORCES = (
 def propose_roles(p: Proposal) -> None:
     """Give each column a role, one after the other; what is stated stays."""
     p.columns = columns_of(p.tables, p.description.text)
-    channels = (channel.column for channel in p.description.channels)
-    for name in (*p.description.time.column, *channels):
+    for name in (*p.description.time.column, *p.description.channels):
         expect_one_of([*p.columns, UNKNOWN], name, "the columns")
     qualify_rows(p)
     propose_clock(p)
@@ -55,17 +53,16 @@ def propose_roles(p: Proposal) -> None:
         p.put("traces.samples", UNKNOWN, "it follows from rows")
     else:
         if clock.column and UNKNOWN not in clock.column + clock.format:
-            propose_rate(p, [kept_rows(p, table) for table in p.tables])
+            propose_rate(p, [samples_only(p, table) for table in p.tables])
         propose_lengths(p)
     list_others(p)
 
 
-def kept_rows(p: Proposal, table: Table) -> Table:
+def samples_only(p: Proposal, table: Table) -> Table:
     """Return the rows of a table that are samples, as far as their words are known."""
-    stated = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
-    plain = replace(p.description, rows=stated, channels=())
+    rows = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
     with suppress(DataError):
-        return Reader(plain, LabelReader(LabelSource())).kept_rows(table)[0]
+        return kept_rows(table, rows)[0]
     return table
 
 
@@ -73,7 +70,7 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
     """Set what the words of columns mean for their rows, and leave out those that are none."""
     if rows:
         p.description = replace(p.description, rows=rows)
-        p.columns = columns_of([kept_rows(p, table) for table in p.tables], p.description.text)
+        p.columns = columns_of([samples_only(p, table) for table in p.tables], p.description.text)
 
 
 def qualify_rows(p: Proposal) -> None:
@@ -123,8 +120,8 @@ def propose_part(p: Proposal) -> None:
     """Find the column or line with the part's number, if exactly one has its name."""
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
-    least = len(p.places) / 2
-    sources = [s for s in sources if len({*part_words(s, p.places).values()}) > least]
+    least = len(p.tables) / 2
+    sources = [s for s in sources if len({*part_words(s, p.tables).values()}) > least]
     if len(sources) > 1:
         names = listed(source.line or source.column[0] for source in sources)
         p.notes["part.column"] = f"may be one of {names}"
@@ -146,7 +143,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
     others = listed(name for name in units if [name] != best)
     if len(best) == 1:
-        p.description = replace(p.description, channels=(Channel(best[0], units[best[0]]),))
+        p.description = replace(p.description, channels={best[0]: Channel(units[best[0]])})
         p.notes |= {f"channels.{best[0]}": f"others: {others}"} if others else {}
     else:
         text = f"one or several of: {others}" if units else "no column has numbers that change"
@@ -176,7 +173,7 @@ def find_lost(p: Proposal) -> None:
     """Find the words for lost samples of the channels, and rows that have none of them."""
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
-    for name in {channel.column for channel in p.description.channels} & {*p.columns}:
+    for name in p.description.channels.keys() & p.columns.keys():
         column = p.columns[name]
         lost = {word for word in column.odd if word.lower() in LOST}
         if column.counts[""] > SPARSE * column.counts.total():
@@ -190,7 +187,7 @@ def find_lost(p: Proposal) -> None:
 
 def propose_lengths(p: Proposal) -> None:
     """Find how many samples the traces have, and what happens to those of other lengths."""
-    words = [p.columns[c.column].words for c in p.description.channels if c.column in p.columns]
+    words = [p.columns[name].words for name in p.description.channels if name in p.columns]
     lengths = [n for n in map(len, words[0] if words else ()) if n]
     usual = int(np.median(lengths or 0))
     others = [n for n in lengths if n != usual]
@@ -203,7 +200,7 @@ def propose_lengths(p: Proposal) -> None:
 
 def list_others(p: Proposal) -> None:
     """List the columns without a role, and the files beside the recordings."""
-    listings = {source.listing for source in (p.description.label, *p.description.check)}
+    listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)
     if UNKNOWN not in p.description.exclude and others:
         p.put("exclude", others, f"not read, for they are of another form: {listed(others)}")

@@ -5,15 +5,16 @@ Each value follows from a count over the lines that were looked at. If two value
 
 import codecs
 import re
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ...errors import DataError, listed
-from ..description import UNKNOWN
+from ..description import UNKNOWN, TextForm
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
@@ -45,29 +46,13 @@ Rows = Sequence[Sequence[str]]
 class Look:
     """The first lines of a file.
 
-    width : cells of a row. header, units, data : the lines of the header, the units and the first
-    samples, from 1; 0 for none. line : the header. rows : the cells of the samples.
+    form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
     """
 
-    encoding: str
-    delimiter: str
+    form: TextForm
     width: int
-    header: int
-    units: int
-    data: int
     line: str
     rows: Rows
-
-    @property
-    def names(self) -> list[str]:
-        """The names in the header."""
-        line = COMMENT.sub("", self.line.lstrip())
-        return header_names(split_line(line, self.delimiter))
-
-    def is_like(self, other: "Look") -> bool:
-        """Return whether another file has this form, and a column in common."""
-        is_same = (self.delimiter, self.width) == (other.delimiter, other.width)
-        return is_same and (not self.line or not {*self.names}.isdisjoint(other.names))
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
@@ -83,11 +68,9 @@ def look(content: bytes, stated: Stated) -> Look | None:
         width = 1
     rows = [split_line(line, delimiter) if line.strip() else [] for line in lines]
     data = _first_row(rows, width)
-    heads = [i for i in range(data) if len(rows[i]) >= width and any(map(str.strip, rows[i]))]
-    units = heads.pop() + 1 if len(heads) > 1 and _are_units(rows[heads[-1]]) else 0
-    header = heads[-1] + 1 if heads else 0
-    line = lines[header - 1] if header else ""
-    return Look(encoding, delimiter, width, header, units, data + 1, line, rows[data:])
+    header, units = _head_lines(rows[:data], width)
+    form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
+    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -132,63 +115,67 @@ def _first_row(rows: Rows, width: int) -> int:
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
-def _are_units(row: Sequence[str]) -> bool:
-    """Return whether the cells of a row that are filled are units."""
-    return all(is_unit(c) or UNIT_WORDS.fullmatch(c) for c in map(str.strip, row) if c)
+def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
+    """Return the lines of the header and of the units above the samples; 0 for none."""
+    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(map(str.strip, row))]
+    units = 0
+    if len(heads) > 1:
+        cells = filter(None, map(str.strip, rows[heads[-1] - 1]))
+        if all(is_unit(cell) or UNIT_WORDS.fullmatch(cell) for cell in cells):
+            units = heads.pop()
+    return max(heads, default=0), units
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     """Find the keys of `[text]` for most of the files, and leave out files of another form.
 
-    These have another delimiter, another number of columns, or no column in common with most. If
-    several have samples, it is asked why.
+    These have another delimiter, another number of columns, or another header than most. If several
+    have samples, it is asked why.
     """
-    looks = {
-        name: form
-        for name, content in contents.items()
-        if (form := look(content, p.stated)) is not None
-    }
-    if not looks:
+    groups = defaultdict[Any, dict[str, Look]](dict)
+    for name, content in contents.items():
+        if item := look(content, p.stated):
+            groups[item.form.delimiter, item.width, item.line][name] = item
+    if not groups:
         raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
-    lines = Counter((form.width, form.line) for form in looks.values()).most_common(1)
-    usual = next(form for form in looks.values() if (form.width, form.line) == lines[0][0])
-    odd = {name: form for name, form in looks.items() if not usual.is_like(form)}
+    same = groups.pop(max(groups, key=lambda key: len(groups[key])))
+    odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
     p.names = [name for name in p.names if name not in odd]
-    if sum(len(form.rows) >= LEAST_RUN for form in odd.values()) > 1:
+    if sum(len(item.rows) >= LEAST_RUN for item in odd.values()) > 1:
         p.put("exclude", UNKNOWN, f"are {listed(odd)} recordings of another form? See files")
-    _propose_keys(p, usual, [form for name, form in looks.items() if name not in odd])
+    _propose_keys(p, [*same.values()])
 
 
-def _propose_keys(p: Proposal, usual: Look, same: Sequence[Look]) -> None:
-    """Set the keys of `[text]` for files like one; a header may stand at another line in each."""
-    is_text = isinstance(p.description.text.header, str)
-    is_same = all(form.header == usual.header for form in same) and not is_text
-    above = 0 if is_same else usual.header
-    values = {
-        "encoding": LATIN if LATIN in {form.encoding for form in same} else usual.encoding,
-        "delimiter": usual.delimiter,
-        "header": usual.line if above else usual.header,
-        "units": usual.units and usual.units - above,
-        "data": usual.data - above,
-        "names": [] if p.stated.get("text.header") else _column_names(usual),
-    }
-    for key, value in values.items():
-        p.put(f"text.{key}", value)
-    if p.description.text.encoding == LATIN:
+def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
+    """Set the keys of `[text]` for files of one form; the header may stand at any line in each."""
+    usual = looks[0]
+    form = usual.form
+    above = int(form.header)
+    is_moved = {item.form.header for item in looks} != {above}
+    if above and (is_moved or isinstance(p.description.text.header, str)):
+        units = form.units and form.units - above
+        form = replace(form, header=usual.line, units=units, data=form.data - above)
+    if any(item.form.encoding == LATIN for item in looks):
+        form = replace(form, encoding=LATIN)
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    cells = {cell.strip() for form in same for row in form.rows for cell in row}
+    names = () if p.stated.get("text.header") else tuple(_column_names(usual))
+    for key, value in asdict(replace(form, names=names)).items():
+        p.put(f"text.{key}", value)
+    cells = {cell.strip() for item in looks for row in item.rows for cell in row}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
-def _column_names(usual: Look) -> list[str]:
+def _column_names(usual: Look) -> Sequence[str]:
     """Return names for the columns where the header does not give one for each; else none.
 
     In a matrix, whose rows are parts, a first column of few whole numbers is their class.
     """
     width = usual.width
     if usual.line:
-        return usual.names[:width] if len(usual.names) > width else []
+        line = COMMENT.sub("", usual.line.lstrip())
+        names = header_names(split_line(line, usual.form.delimiter))
+        return names[:width] if len(names) > width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
@@ -205,16 +192,15 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     """
     seen = {mark: [cell for cell in cells if mark in cell] for mark in ".,"}
     proofs = {mark: len([*filter(DECIMAL[mark].fullmatch, seen[mark])]) for mark in ".,"}
-    text = "\n".join(cells)
-    group = next((mark for mark in GROUPS if re.search(rf"\d{mark}\d{{3}}", text)), "")
-    example = min(seen["."] + seen[","], default="")
-    note = f"'.' or ','; {example} may be a fraction or a thousand" if example else ""
-    decimal = UNKNOWN if example else "."
+    groups = re.findall(rf"\d([{GROUPS}])\d{{3}}", "\n".join(cells))
+    group = groups[0] if groups else ""
     for mark, other in (".,", ",."):
         repeats = any(cell.count(other) > 1 for cell in seen[other])
         if proofs[mark] > 20 * proofs[other] or (repeats and not proofs[other]):
-            decimal = mark
-            note = ""
-            group = other if seen[other] else group
-    p.put("text.decimal", decimal, note)
+            p.put("text.decimal", mark)
+            p.put("text.thousands", other if seen[other] else group)
+            return
     p.put("text.thousands", group)
+    if example := min(seen["."] + seen[","], default=""):
+        note = f"'.' or ','; {example} may be a fraction or a thousand"
+        p.put("text.decimal", UNKNOWN, note)

@@ -67,6 +67,7 @@ def read_messages(
 
 def read_bag(
     files: Files,
+    title: str,
     description: Description,
     notes: list[str],
     faults: list[Fault],
@@ -80,6 +81,8 @@ def read_bag(
     ----------
     files : sequence of (Path, str)
         In their order, each with its name for messages.
+    title : str
+        What the bag is called in messages.
     description : Description
     notes, faults : list
         Get what users should know, and the files that are damaged.
@@ -90,7 +93,7 @@ def read_bag(
         If the topic of the channels has no messages, or if a file before the last is not whole and
         a trigger cuts.
     """
-    columns = [channel.column for channel in description.channels]
+    columns = [*description.channels]
     topics = {column.partition(".")[0] for column in columns}
     if len(topics) > 1:
         raise DataError(f"Expected channels of one topic, got {listed(sorted(topics))}.")
@@ -103,7 +106,7 @@ def read_bag(
     table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
     for topic, messages in events.items():
         table[topic] = _cells_of(messages, table[LOG_TIME], topic in verdicts)
-    return Table(files[0][1], table, [])
+    return Table(title, table, [])
 
 
 def _rows_of(
@@ -115,7 +118,7 @@ def _rows_of(
     faults: list[Fault],
 ) -> list[Any]:
     """Return the times and values of each message of the channels, and put others into `events`."""
-    fields = [attrgetter(c.column.partition(".")[2]) for c in description.channels]
+    fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
     for path, name in files:
         if description.windows.trigger and (notes or faults):

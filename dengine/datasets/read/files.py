@@ -4,7 +4,7 @@ import fnmatch
 import gzip
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,6 +24,16 @@ def natural_key(text: str) -> Key:
     return [(1, int(p), "") if p.isascii() and p.isdecimal() else (0, 0, p) for p in pieces if p]
 
 
+def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
+    """Return the files below a folder that patterns match, as seen from there.
+
+    Raises DataError for a pattern that cannot be.
+    """
+    with instead(DataError, f"Expected patterns below a folder in files, got {patterns}", *BAD):
+        paths = [path for pattern in patterns for path in root.glob(pattern)]
+    return {path.relative_to(root).as_posix() for path in paths if path.is_file()}
+
+
 def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """Return the files of a description below a folder, each with its path as seen from there.
 
@@ -32,13 +42,9 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """
     if root.is_file():
         return [(root, root.name)]
-    names = set[str]()
-    for pattern in description.files:
-        with instead(DataError, f"Expected patterns below a folder in files, got {pattern}", *BAD):
-            paths = filter(Path.is_file, root.glob(pattern))
-            names |= {path.relative_to(root).as_posix() for path in paths}
-    sources = (description.label, *description.check)
-    names -= {FOLDER_FILE, description.windows.listing, *(source.listing for source in sources)}
+    names = match_files(root, description.files)
+    listings = {source.listing for source in description.labels}
+    names -= {FOLDER_FILE, description.windows.listing, *listings}
     for pattern in description.exclude:
         names -= {*fnmatch.filter(names, pattern)}
     if not names:

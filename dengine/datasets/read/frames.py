@@ -7,7 +7,8 @@ list of objects has a column for each of their keys.
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from itertools import chain, zip_longest
 from typing import Any
 
 import numpy as np
@@ -22,25 +23,41 @@ DAMAGES = (LookupError, TypeError, ValueError)  # of lists of several forms
 Columns = dict[str, Cells]
 
 
-def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> list[Table]:
-    """Return a table for each object of a JSON file: one, a list of them, or one a line."""
+def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> Table:
+    """Return the table of a JSON file: a row for the object, for each of a list, or for each line.
+
+    Its cells may be lists.
+    """
     text = to_utf8(content, form.encoding).decode()
-    tables: list[Table] = []
-    lines = enumerate(text.split("\n"), 1) if has_lines else [(0, text)]
-    for number, line in lines:
+    rows: list[Mapping[str, Any]] = []
+    numbers: list[int] = []
+    for number, line in enumerate(text.split("\n"), 1) if has_lines else [(0, text)]:
         try:
             value = json.loads(line.strip() or "[]")
         except (ValueError, RecursionError) as error:
             do = "" if has_lines else '; if each line is an object, state format="jsonl"'
             raise UnreadableError(f"Expected JSON: {error}{do}", number) from error
-        for item in value if isinstance(value, list) else [value]:
+        items = value if isinstance(value, list) else [value]
+        for item in items:
             if not isinstance(item, Mapping):
                 message = f"Expected an object of JSON, got {shortened(item)}"
                 raise UnreadableError(message, number)
-            tables.append(Table(source, columns_of("", item), [number]))
-    if not tables:
+            rows.append(flat("", item))
+        numbers += [number] * len(items)
+    if not rows:
         raise UnreadableError("Expected objects of JSON, got none")
-    return tables
+    names = dict.fromkeys(chain(*rows))
+    columns = {name: as_cells([row.get(name) for row in rows]) for name in names}
+    return Table(source, columns, numbers)
+
+
+def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the items of nested objects, with dots in their names."""
+    items: dict[str, Any] = {}
+    for name, item in value.items():
+        is_nested = isinstance(item, Mapping)
+        items |= flat(f"{prefix}{name}.", item) if is_nested else {prefix + name: item}
+    return items
 
 
 def columns_of(prefix: str, value: Any) -> Columns:
@@ -79,15 +96,6 @@ def as_cells(values: Any) -> Cells:
     return cells
 
 
-def join(tables: Sequence[Table]) -> Table:
-    """Return one table of tables with a row each, in the columns of the first."""
-    columns: Columns = {}
-    for name in tables[0].columns:
-        rows = [table.columns.get(name, np.empty(0)).tolist() for table in tables]
-        columns[name] = as_cells([cells[0] if len(cells) == 1 else None for cells in rows])
-    return Table(tables[0].source, columns, [table.line(0) for table in tables])
-
-
 def read_frame(frame: Any, source: str) -> Table:
     """Return the table of a DataFrame, whose index is a column if it has a name."""
     frame = frame.reset_index() if frame.index.name is not None else frame
@@ -103,29 +111,23 @@ def read_parquet(content: bytes, source: str) -> Table:
         return read_frame(pd.read_parquet(io.BytesIO(content)), source)
 
 
-def read_npz(content: bytes, source: str) -> Table:
-    """Return the table of a NumPy archive of one part; see `columns_of`."""
-    arrays, _ = read_archive(content, name=source)
-    squeezed = {name: np.atleast_1d(np.squeeze(x)) for name, x in arrays.items()}
-    return Table(source, columns_of("", squeezed), [])
+def read_npz(content: bytes, source: str, has_all: bool) -> Table:
+    """Return the table of a NumPy archive.
 
-
-def part_tables(content: bytes, source: str) -> list[Table]:
-    """Return a table for each part of an archive whose arrays hold all parts.
-
-    Parts are the first axis of the largest array. Arrays of another first axis hold for all parts.
+    The archive of one part has a column for each array, see `columns_of`. That of all parts has a
+    row for each of the first axis of its largest array, whose cells are arrays.
     """
     arrays, _ = read_archive(content, name=source)
-    arrays = {name: np.atleast_1d(x) for name, x in arrays.items()}
+    if not has_all:
+        squeezed = {name: np.atleast_1d(np.squeeze(x)) for name, x in arrays.items()}
+        return Table(source, columns_of("", squeezed), [])
     n = len(max(arrays.values(), key=np.size, default=()))
-    parts = [
-        {k: np.atleast_1d(x[i]) if len(x) == n else x for k, x in arrays.items()} for i in range(n)
-    ]
-    return [Table(source, columns_of("", part), []) for part in parts]
+    columns = {name: np.atleast_1d(x) for name, x in arrays.items()}
+    return Table(source, columns, range(1, n + 1))
 
 
-def read_ts(content: bytes, source: str, form: TextForm) -> list[Table]:
-    """Return a table for each series of a `.ts` file of the UCR archive.
+def read_ts(content: bytes, source: str, form: TextForm) -> Table:
+    """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
     Channels are the columns `0`, `1`, ..., the class is the column `class`.
 
@@ -135,12 +137,15 @@ def read_ts(content: bytes, source: str, form: TextForm) -> list[Table]:
     """
     lines = to_utf8(content, form.encoding).decode().split("\n")
     heads = [line.strip().lower() for line in lines]
-    if "@data" not in heads:
+    first = heads.index("@data") + 1 if "@data" in heads else len(lines)
+    below = enumerate(lines[first:], first + 1)
+    rows = {i: line.strip().rpartition(":") for i, line in below if line.strip()}
+    if not rows:
         raise UnreadableError("Expected series below a line @data, got none")
-    tables = []
-    for i in range(heads.index("@data") + 1, len(lines)):
-        if lines[i].strip():
-            *channels, label = lines[i].strip().split(":")
-            series = dict(enumerate(text.split(",") for text in channels))
-            tables.append(Table(source, columns_of("", {**series, "class": label}), [i + 1]))
-    return tables
+    series = (channels.split(":") for channels, _, _ in rows.values())
+    columns = {
+        str(c): as_cells([cell.split(",") for cell in cells])
+        for c, cells in enumerate(zip_longest(*series, fillvalue=""))
+    }
+    columns["class"] = as_cells([label for _, _, label in rows.values()])
+    return Table(source, columns, [*rows])

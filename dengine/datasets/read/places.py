@@ -11,11 +11,11 @@ from pathlib import Path, PurePosixPath
 
 from ...errors import DataError, instead, listed, shortened
 from ..dataset import Fault
-from ..description import ANY, LabelSource, PartSource, TextForm
+from ..description import LabelSource, PartSource, TextForm
 from ..table import Table, UnreadableError
 from .files import natural_key, read_file
 from .frames import read_parquet
-from .text import header_names, read_text, split_line, to_utf8
+from .text import read_text, to_utf8
 
 DELIMITERS = (",", ";", "\t", "|")
 SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
@@ -27,78 +27,68 @@ def without_suffix(path: str) -> str:
     return SUFFIX.sub("", path)
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where a recording stands: its path as seen from the folder, or its column, and its table."""
+def path_word(path: str, pattern: str) -> str:
+    """Return the group of a regular expression in a path without the file's suffix.
 
-    path: str
-    table: Table
-
-    def group(self, pattern: str) -> str:
-        """Return the group of a regular expression in the path without the file's suffix.
-
-        Raises UnreadableError if it is not found, DataError if it is no expression with one group.
-        """
-        wanted = f"Expected a regular expression with one group, got {pattern}"
-        with instead(DataError, wanted, re.error):
-            expression = re.compile(pattern)
-        if expression.groups != 1:
-            raise DataError(f"{wanted}.")
-        match = expression.search(without_suffix(self.path))
-        if match is None or match[1] is None:
-            raise UnreadableError(f"Expected {pattern} in the path, it is not found")
-        return str(match[1])
-
-    def line_word(self, beginning: str) -> str:
-        """Return the cell behind the beginning of a line above the header.
-
-        Raises UnreadableError if no line begins so.
-        """
-        for line in self.table.above:
-            text = line.lstrip(f"#%*{MARKS}")
-            if text.startswith(beginning):
-                return re.split(r"[;\t,]", text[len(beginning) :].strip(MARKS))[0].strip(MARKS)
-        raise UnreadableError(f"Expected a line above the header that begins with {beginning}")
-
-    def words(
-        self, source: PartSource | LabelSource, columns: Sequence[str], at: str = "same"
-    ) -> list[str]:
-        """Return the words of a source of parts or labels, of which these are the columns."""
-        if source.path:
-            return [self.group(source.path)]
-        if source.line:
-            return [self.line_word(source.line)]
-        return [self.table.one_word(column, at) for column in columns]
+    Raises UnreadableError if it is not found, DataError if it is no expression with one group.
+    """
+    wanted = f"Expected a regular expression with one group, got {pattern}"
+    with instead(DataError, wanted, re.error):
+        expression = re.compile(pattern)
+    if expression.groups != 1:
+        raise DataError(f"{wanted}.")
+    match = expression.search(without_suffix(path))
+    if match is None or match[1] is None:
+        raise UnreadableError(f"Expected {pattern} in the path, it is not found")
+    return str(match[1])
 
 
-def part_of(source: PartSource, place: Place) -> str:
+def line_word(lines: Sequence[str], beginning: str) -> str:
+    """Return the cell behind the beginning of one of the lines above the header.
+
+    Raises UnreadableError if no line begins so.
+    """
+    for line in lines:
+        text = line.lstrip(f"#%*{MARKS}")
+        if text.startswith(beginning):
+            return re.split(r"[;\t,]", text[len(beginning) :].strip(MARKS))[0].strip(MARKS)
+    raise UnreadableError(f"Expected a line above the header that begins with {beginning}")
+
+
+def words_of(
+    source: PartSource | LabelSource, table: Table, columns: Sequence[str], at: str = "same"
+) -> list[str]:
+    """Return the words of a source of parts or labels, of which these are the columns."""
+    if source.path:
+        return [path_word(table.path, source.path)]
+    if source.line:
+        return [line_word(table.above, source.line)]
+    return [table.one_word(column, at) for column in columns]
+
+
+def part_of(source: PartSource, table: Table) -> str:
     """Return the number of the part; "" if none is stated.
 
     Raises UnreadableError if the recording does not state it.
     """
-    words = place.words(source, source.column)
+    words = words_of(source, table, source.column)
     if not all(words):
         raise UnreadableError("Expected a part's number, got an empty one")
     return " ".join(words)
 
 
-def listing_table(path: Path, columns: Sequence[str], form: TextForm) -> Table:
+def listing_table(path: Path, form: TextForm) -> Table:
     """Return the table of a listing, whose cells are words.
 
-    A text is parted by the one of `, ; tab |` that parts its header into these columns, or into
-    most. Raises UnreadableError if it cannot be read.
+    A text is parted by the one of `, ; tab |` that its header has most of. Raises UnreadableError
+    if it cannot be read.
     """
     content = read_file(path)
     if path.suffix == ".parquet":
         return read_parquet(content, path.name)
     header = to_utf8(content, form.encoding).decode().partition("\n")[0]
-
-    def fit(mark: str) -> tuple[bool, int]:
-        names = header_names(split_line(header, mark))
-        return {*columns} <= {*names}, len(names)
-
-    plain = TextForm(form.encoding, max(DELIMITERS, key=fit))
-    return read_text(content, path.name, plain, lambda _: False, lambda _: True)
+    plain = TextForm(form.encoding, max(DELIMITERS, key=header.count))
+    return read_text(content, path.name, plain).whole()
 
 
 @contextmanager
@@ -122,16 +112,16 @@ class LabelReader:
     listing: defaultdict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
     used: set[str] = field(default_factory=set)
 
-    def words(self, place: Place, part: str) -> Sequence[str]:
+    def words(self, table: Table, part: str) -> Sequence[str]:
         """Return the words for a recording; raise UnreadableError if there is none.
 
         Its key in a listing is the part's number, the path, the file's name, or one of these
         without a suffix.
         """
         source = self.source
-        path = place.path
+        path = table.path
         if not source.listing:
-            return place.words(source, [source.column or source.topic], source.at)
+            return words_of(source, table, [source.column or source.topic], source.at)
         name = PurePosixPath(path).name
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
@@ -140,17 +130,17 @@ class LabelReader:
         self.used.add(keys[0])
         return self.listing[keys[0]]
 
-    def label(self, place: Place, part: str) -> int | None:
+    def label(self, table: Table, part: str) -> int | None:
         """Return 1 for good, 0 for bad, None for not checked.
 
         Raises UnreadableError if there is no label, several, or a word of unknown meaning.
         """
         source = self.source
-        words = self.words(place, part)
-        line = 0 if source.listing or source.path else place.table.line(0)
+        words = self.words(table, part)
+        line = 0 if source.listing or source.path else table.line(0)
         labels = {self.meaning(word, line) for word in words}
         if len(labels) > 1:
-            message = f"Expected one label for {part or place.path}, got {listed(sorted(words))}"
+            message = f"Expected one label for {part or table.path}, got {listed(sorted(words))}"
             raise UnreadableError(message, line, source.column)
         return labels.pop()
 
@@ -159,10 +149,10 @@ class LabelReader:
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
         meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
-        if word not in meanings and ANY not in meanings:
+        if word not in meanings:
             message = f"Expected a label among {listed(meanings)}, got {shortened(word)}"
             raise UnreadableError(message, line, source.column)
-        return meanings.get(word, meanings.get(ANY))
+        return meanings[word]
 
     def unused_note(self) -> str:
         """Return a note on the rows of the listing that name no recording; "" if all do."""
@@ -187,7 +177,7 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
         if not all(columns):
             raise DataError("Expected label.key and label.column, two columns of label.listing.")
         with in_listing(source.listing):
-            table = listing_table(base / source.listing, columns, form)
+            table = listing_table(base / source.listing, form)
             for key, word in zip(*map(table.words, columns), strict=True):
                 reader.listing[as_key(key)].append(word)
     return reader

@@ -8,54 +8,52 @@ from itertools import chain
 import numpy as np
 
 from ...errors import DataError
-from ..dataset import Fault
 from ..description import ANY, Description
-from ..table import Cells, Table, as_word
+from ..table import Cells, Table, UnreadableError, as_word
 from ..triggers import as_trigger
 from . import frames
 from .clock import is_dated
 from .files import natural_key
-from .text import Test, read_text
+from .text import NUMBER, WORD, Kind, read_text
 
-Parts = Iterator[tuple[str, str, Table]]  # the source, the path by which it is named, the table
-NUMBER = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
+DIGITS = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
 
 
-def tables_of(content: bytes, name: str, description: Description) -> list[Table]:
-    """Return the tables of a file: of JSON and `.ts` files one for each object or series.
+def table_of(content: bytes, name: str, description: Description) -> Table:
+    """Return the table of a file.
 
     Raises UnreadableError or DataError if it is no file of the described format.
     """
-    kind, layout, form = description.format, description.layout, description.text
+    kind, form = description.format, description.text
     if kind == "ts":
         return frames.read_ts(content, name, form)
     if kind in OBJECTS:
         return frames.read_objects(content, name, form, kind == "jsonl")
     if kind == "parquet":
-        return [frames.read_parquet(content, name)]
-    if kind == "npz" and layout == "npz":
-        return frames.part_tables(content, name)
+        return frames.read_parquet(content, name)
     if kind == "npz":
-        return [frames.read_npz(content, name)]
-    keep_damaged = layout in ("long", "wide")
-    return [read_text(content, name, form, *column_kinds(description), keep_damaged)]
+        return frames.read_npz(content, name, description.layout == "npz")
+    return read_text(content, name, form, column_kind(description))
 
 
-def column_kinds(description: Description) -> tuple[Test, Test]:
-    """Return two functions of a column's name: whether its cells are numbers, and whether words."""
+def column_kind(description: Description) -> Kind:
+    """Return the function that tells the kind of a column by its name; see `read_text`."""
     clock = zip(description.time.column, description.time.format, strict=False)
     dated = {name for name, form in clock if is_dated(form)}
     order = {description.order} - {"name", "time"}
     words = dated.union(description.part.column, description.rows, order)
-    words |= {source.column for source in (description.label, *description.check)}
-    numbers = {*description.time.column, *signals_of(description)} - words
-    patterns = [pattern_of(channel.column) for channel in description.channels]
+    words |= {source.column for source in description.labels}
+    numbers = {*description.time.column, *signals_of(description)}
+    patterns = [*map(pattern_of, description.channels)]
 
-    def is_number(name: str) -> bool:
-        return name in numbers or any(pattern.fullmatch(name) for pattern in patterns)
+    def kind_of(name: str) -> str:
+        if name in words:
+            return WORD
+        is_channel = any(pattern.fullmatch(name) for pattern in patterns)
+        return NUMBER if is_channel or name in numbers else ""
 
-    return is_number, words.__contains__
+    return kind_of
 
 
 def signals_of(description: Description) -> Sequence[str]:
@@ -66,7 +64,7 @@ def signals_of(description: Description) -> Sequence[str]:
 
 def verdicts_of(description: Description) -> set[str]:
     """Return the topics of a bag that have labels."""
-    return {source.topic for source in (description.label, *description.check)} - {""}
+    return {source.topic for source in description.labels} - {""}
 
 
 def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
@@ -74,108 +72,111 @@ def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
     return re.compile(any_text.join(map(re.escape, column.split(ANY))), re.DOTALL)
 
 
-def split(
-    tables: Sequence[Table], name: str, description: Description, faults: list[Fault]
-) -> Parts:
-    """Yield each part of a file: its source, the path or column that names it, and its table.
+def split(table: Table, description: Description) -> Iterator[Table]:
+    """Yield the table of each part of a file.
 
-    `long`: the rows of a part must stand together, unless they are sorted by time; others are put
-    into `faults`. `wide`: the cells of the columns that a channel's pattern matches, in the order
-    of their numbers, are its samples, or the list in its cell. `columns`: so is each column. Cells
-    that are empty at the end are no samples.
+    `long`: the rows of a part must stand together, unless they are sorted by time. `wide`, and each
+    object of JSON: the cells of the columns that a channel's pattern matches, in the order of their
+    numbers, are its samples, or the list in its cell. `columns`: so is each column. Cells that are
+    empty at the end are no samples. A part that cannot be told from others has `damage`.
     """
-    layout, table = description.layout, tables[0]
-    if layout == "long":
-        table = frames.join(tables) if len(tables) > 1 else table
-        yield from _split_rows(table, name, description, faults)
-    elif layout == "columns":
-        yield from _split_columns(table, name, description)
-    elif layout == "wide" and description.format not in OBJECTS:
-        yield from _split_wide(table, name, description, faults)
+    if description.layout == "long":
+        yield from _split_rows(table, description)
+    elif description.layout == "columns":
+        yield from _split_columns(table, description)
+    elif description.layout in ("wide", "npz") or description.format in OBJECTS:
+        yield from _split_wide(table, description)
     else:
-        for i, table in enumerate(tables, 1):
-            row = f", row {table.line(0) or i}" if len(tables) > 1 else ""
-            yield f"{name}{row}", name, table
+        yield replace(table, path=table.source)
 
 
-def _split_rows(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
+def _split_rows(table: Table, description: Description) -> Iterator[Table]:
     """Yield the rows of each part, by the words in its columns.
 
-    A part is a fault if a row of another number of cells stands within it or beside it.
+    A part has damage if a row of another number of cells stands within it or beside it.
     """
     import pandas as pd
 
-    columns = [*description.part.column]
+    columns = description.part.column
     if not columns:
         raise DataError("Expected part.column, the column that tells the parts apart.")
-    damaged = np.searchsorted(table.lines, [*table.damage]).tolist() if table.damage else []
+    errors = {error.line: error for error in table.damage}
+    damaged = np.searchsorted(table.lines, [*errors]).tolist() if errors else []
     kept = np.delete(np.arange(len(table.lines)), damaged)
     keys = [table.words(column)[kept] for column in columns]
     for key, group in pd.Series(kept).groupby(keys, sort=False):
         rows = group.to_numpy()
-        source = f"{name}, {' '.join(key)}"
         first = int(rows[0])
         last = int(rows[-1])
+        damage = [errors[table.line(i)] for i in damaged if first - 1 <= i <= last + 1]
         is_whole = last - first < len(rows)
-        near = [row for row in damaged if first - 1 <= row <= last + 1]
-        if near:
-            line = table.line(near[0])
-            faults.append(Fault(source, line, table.damage[line]))
-        elif is_whole or description.time.sort:
-            part = table.take(slice(first, last + 1) if is_whole else rows)
-            yield source, name, replace(part, damage={})
-        else:
+        if not (damage or is_whole or description.time.sort):
             line = table.line(int(rows[np.argmax(np.diff(rows) > 1) + 1]))
             message = "Expected the rows of a part together, others stand between them"
-            faults.append(Fault(source, line, message, columns[0]))
+            damage = [UnreadableError(message, line, columns[0])]
+        part = table.take(slice(first, last + 1) if is_whole else rows)
+        source = f"{table.source}, {' '.join(key)}"
+        yield replace(part, source=source, path=table.source, damage=damage)
 
 
-def _split_wide(table: Table, name: str, description: Description, faults: list[Fault]) -> Parts:
+def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     """Yield each row."""
-    groups: dict[str, list[str]] = {}
-    for key in [channel.column for channel in description.channels if ANY in channel.column]:
-        names = sorted(filter(pattern_of(key, NUMBER).fullmatch, table.columns), key=natural_key)
-        if names:
-            groups[key] = names
-    cells = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
+    groups = {key: _numbered(key, table) for key in description.channels if ANY in key}
+    groups = {key: names for key, names in groups.items() if names}
+    curves = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     used = {*chain(*groups.values())}
-    others = {column: c for column, c in table.columns.items() if len(c) and column not in used}
-    for i, line in enumerate(table.lines):
-        source = f"{name}, row {line}"
-        if line in table.damage:
-            faults.append(Fault(source, line, table.damage[line]))
-            continue
-        columns: frames.Columns = {}
-        for column, values in others.items():
-            columns |= frames.columns_of(column, values[i])
-        part = replace(table, columns=columns, lines=[line], damage={})
-        samples = {key: without_empty_end(rows[i]) for key, rows in cells.items()}
-        yield source, name, _with_samples(part, samples, groups)
+    others = {name: c for name, c in table.columns.items() if len(c) and name not in used}
+    rest = replace(table, columns=others)
+    for i in range(len(table.lines)):
+        samples = {key: rows[i] for key, rows in curves.items()}
+        yield _with_samples(_row_of(rest, i), samples, groups)
 
 
-def _split_columns(table: Table, name: str, description: Description) -> Parts:
+def _row_of(table: Table, i: int) -> Table:
+    """Return the part in a row, with the columns that its cells hold; it may have damage.
+
+    Columns of another number of rows hold for all parts.
+    """
+    n = len(table.lines)
+    line = table.lines[i]
+    source = f"{table.source}, row {line or i + 1}" if n > 1 else table.source
+    damage = [error for error in table.damage if error.line == line]
+    part = replace(table, source=source, path=table.source, lines=[line], damage=damage)
+    row = {name: cells[i] if len(cells) == n else cells for name, cells in table.columns.items()}
+    try:
+        return replace(part, columns=frames.columns_of("", row))
+    except UnreadableError as error:
+        return replace(part, columns={}, damage=[error])
+
+
+def _numbered(key: str, table: Table) -> list[str]:
+    """Return the columns of a table that a channel's pattern matches, by their numbers."""
+    return sorted(filter(pattern_of(key, DIGITS).fullmatch, table.columns), key=natural_key)
+
+
+def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     """Yield each column that the channel's pattern matches, with the clock beside it."""
-    channel = description.channels[0].column
+    channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}
     beside = {key: cells for key, cells in table.columns.items() if key in shared}
     for column in filter(pattern_of(channel).fullmatch, table.columns):
         if column not in shared:
-            samples = without_empty_end(table.columns[column])
-            part = replace(table, columns=beside).take(slice(0, len(samples)))
+            samples = {channel: table.columns[column]}
             origin = {channel: [column] * len(table.lines)}
-            yield (
-                f"{name}, column {column}",
-                column,
-                _with_samples(part, {channel: samples}, origin),
-            )
+            part = _with_samples(replace(table, columns=beside, path=column), samples, origin)
+            part = part.take(slice(0, len(part.columns[channel])))
+            yield replace(part, source=f"{table.source}, column {column}")
 
 
 def _with_samples(
     table: Table, samples: frames.Columns, origin: Mapping[str, Sequence[str]]
 ) -> Table:
-    """Return a table with the samples of channels, which stood in other columns."""
+    """Return a table with the samples of channels, which stood in other columns.
+
+    Cells at their end that are empty or NaN are no samples.
+    """
     units = {key: table.units.get(names[0], "") for key, names in origin.items() if names}
-    columns = {**table.columns, **samples}
+    columns = {**table.columns, **{key: without_empty_end(cells) for key, cells in samples.items()}}
     return replace(table, columns=columns, units={**table.units, **units}, origin=origin)
 
 

@@ -9,7 +9,7 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -21,17 +21,11 @@ from ..table import Cells, Table, UnreadableError
 COMMENT = re.compile(r"^[#%]+\s*")
 BLANK = " "
 REST = "*"  # at the end of the last name: it stands for all columns that remain
-Test = Callable[[str], bool]
+NUMBER, WORD = "number", "word"  # kinds of columns
+Kind = Callable[[str], str]
 
 
-def read_text(
-    content: bytes,
-    source: str,
-    form: TextForm,
-    is_numeric: Test,
-    is_word: Test,
-    keep_damaged: bool = False,
-) -> Table:
+def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambda _: WORD) -> Table:
     """Return the table of a text file.
 
     Parameters
@@ -40,32 +34,23 @@ def read_text(
     source : str
         Name of the file.
     form : TextForm
-    is_numeric : callable
-        Whether the cells of a column, by its name, are numbers; in a plain file they come as such.
-    is_word : callable
-        Whether the cells of a column are kept as they are. Of others, only their number counts.
-    keep_damaged : bool
-        Whether lines of another number of cells are the table's `damage`, instead of an error.
+    kind_of : callable
+        The kind of a column, by its name: NUMBER, which in a plain file comes as such; WORD, whose
+        cells are kept as they are; or "", of which only the number of cells counts.
 
     Returns
     -------
     Table
+        Lines of another number of cells are its `damage`.
 
     Raises
     ------
     UnreadableError
-        If the file is empty, in another encoding, has no such header, or a row of another number
-        of cells.
+        If the file is empty, in another encoding, or has no such header, or no row fits it.
     """
     content = to_utf8(content, form.encoding)
-    header = form.header
-    above = 0
-    if isinstance(header, str):
-        begin = header.encode()
-        lines = enumerate(io.BytesIO(content), 1)
-        header = above = next((i for i, line in lines if line.startswith(begin)), 0)
-        if not header:
-            raise UnreadableError(f"Expected a header that begins with {form.header!r}, got none")
+    header = _header_line(content, form.header)
+    above = header if isinstance(form.header, str) else 0
     first = form.data + above
     units = form.units and form.units + above
     end = content.rstrip(b"\n").count(b"\n") + 2
@@ -78,12 +63,11 @@ def read_text(
     stated = dict(zip(names, map(str.strip, cells), strict=False))
     columns = dict.fromkeys(names, np.empty(0))
     table = Table(source, columns, range(first, end), stated, top[: (header or first) - 1], header)
-    words = {*filter(is_word, names)}
-    numbers = {*filter(is_numeric, names)} - words
-    plain = {} if form.drop else _read_plain(content, table, form, numbers, words)
+    kinds = {name: kind_of(name) for name in names}
+    plain = {} if form.drop else _read_plain(content, table, form, kinds)
     if plain:
         return replace(table, columns={**columns, **plain})
-    return _read_strictly(content, table, form, keep_damaged)
+    return _read_strictly(content, table, form)
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
@@ -123,6 +107,16 @@ def header_names(cells: Sequence[str]) -> list[str]:
     return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
 
 
+def _header_line(content: bytes, header: int | str) -> int:
+    """Return the line of the header: the one that is stated, or that begins with a text."""
+    if isinstance(header, int):
+        return header
+    for i, line in enumerate(io.BytesIO(content), 1):
+        if line.startswith(header.encode()):
+            return i
+    raise UnreadableError(f"Expected a header that begins with {header!r}, got none")
+
+
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: as stated, or those of the header among the lines on top."""
     names = [*form.names]
@@ -139,7 +133,7 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
 
 
 def _read_plain(
-    content: bytes, table: Table, form: TextForm, numbers: set[str], words: set[str]
+    content: bytes, table: Table, form: TextForm, kinds: Mapping[str, str]
 ) -> dict[str, Cells]:
     """Return the columns of numbers and words by pandas' parser; none if anything is not plain."""
     import pandas as pd
@@ -154,7 +148,7 @@ def _read_plain(
                 skiprows=table.lines[0] - 1,
                 names=[*table.columns],
                 decimal=form.decimal,
-                dtype=dict.fromkeys(words, "category"),
+                dtype={name: "category" for name, kind in kinds.items() if kind == WORD},
                 keep_default_na=False,
             )
     except (ValueError, OverflowError):  # a row of too many cells, among others
@@ -162,30 +156,32 @@ def _read_plain(
     is_whole = len(frame) == len(table.lines) and isinstance(frame.index, pd.RangeIndex)
     if not is_whole or frame.iloc[:, -1].isin(["", np.nan]).any():  # the end of a cut row
         return {}
-    columns = {name: frame.pop(name).to_numpy() for name in numbers}
-    if not all(x.dtype.kind in "iuf" and np.isfinite(x).all() for x in columns.values()):
-        return {}
-    for name in words:
-        cells = frame.pop(name).array
-        columns[name] = np.array(cells.categories, dtype=object)[cells.codes]  # each text once
+    columns = dict[str, Cells]()
+    for name, kind in kinds.items():
+        cells = frame[name]
+        if kind == WORD:
+            columns[name] = np.array(cells.array.categories, dtype=object)[cells.array.codes]
+        elif kind == NUMBER:
+            columns[name] = cells.to_numpy()
+            if cells.dtype.kind not in "iuf" or not np.isfinite(columns[name]).all():
+                return {}
     return columns
 
 
-def _read_strictly(content: bytes, table: Table, form: TextForm, keep_damaged: bool) -> Table:
+def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     """Return the table with the cells of a text, without lines that are empty or dropped."""
-    names = [*table.columns]
-    lines = enumerate(content.decode().split("\n"), 1)
-    rows = {
-        i: split_line(line, form.delimiter)
-        for i, line in lines
-        if i in table.lines and line.strip() and not line.startswith(form.drop)
-    }
-    n = len(names)
-    wanted = f"Expected {n} cells, as there are columns"
-    damage = {i: f"{wanted}, got {len(row)}" for i, row in rows.items() if len(row) != n}
-    if damage and (not keep_damaged or len(damage) == len(rows)):
-        line = min(damage)
-        raise UnreadableError(damage[line], line)
-    cells = [[""] * n if i in damage else row for i, row in rows.items()]
-    columns = dict(zip(names, np.array(cells, dtype=object).reshape(-1, n).T, strict=True))
+    n = len(table.columns)
+    rows = dict[int, list[str]]()
+    damage = list[UnreadableError]()
+    for i, line in enumerate(content.decode().split("\n"), 1):
+        if i in table.lines and line.strip() and not line.startswith(form.drop):
+            rows[i] = split_line(line, form.delimiter)
+            if len(rows[i]) != n:
+                message = f"Expected {n} cells, as there are columns, got {len(rows[i])}"
+                damage.append(UnreadableError(message, i))
+                rows[i] = [""] * n
+    if damage and len(damage) == len(rows):
+        raise damage[0]
+    cells = np.array([*rows.values()], dtype=object).reshape(-1, n).T
+    columns = dict(zip(table.columns, cells, strict=True))
     return replace(table, columns=columns, lines=[*rows], damage=damage)

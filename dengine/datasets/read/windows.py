@@ -8,27 +8,28 @@ import numpy as np
 
 from ...errors import DataError
 from ..description import Clock, Description
-from ..table import Floats, Table
+from ..table import Floats, Table, UnreadableError
 from ..triggers import StartFinder, as_trigger
 from .clock import column_times, times_of
 from .frames import as_cells
 from .places import in_listing, listing_table
-from .split import Parts, verdicts_of
+from .split import verdicts_of
 
 EPOCH = 1e8  # seconds: smaller times of a listing count from the start of the recording
 TOLERANCE = 1e-5  # seconds: float64 rounds dates to less
 Windows = Iterator[tuple[str, slice, str]]  # the key of a part, its rows, and what is wrong
 
 
-def cut(table: Table, name: str, description: Description, base: Path) -> Parts:
-    """Yield each part of a recording: its source, the key that names it, and its table.
+def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
+    """Yield the table of each part of a recording.
 
-    The table of a part that begins in a gap, or whose window has no samples, has `damage`. Raises
+    That of a part that begins in a gap, or whose window has no samples, has `damage`. Raises
     DataError if a key is missing, or no part is found.
     """
+    name = table.source
     if not description.time.column:
         raise DataError(f"Expected time.column, the clock of {name}, which is one long recording.")
-    seconds, start = times_of(table, description.time, description.text)
+    seconds, start = times_of(table.whole(), description.time, description.text)
     find = _triggered if description.windows.trigger else _listed
     windows = [*find(table, seconds + start, description, base)]
     if not windows:
@@ -36,17 +37,12 @@ def cut(table: Table, name: str, description: Description, base: Path) -> Parts:
     ends = [*(rows.start for _, rows, _ in windows[1:]), None]
     for (key, rows, fault), end in zip(windows, ends, strict=True):
         part = table.take(rows)
-        words = {topic: table.column(topic)[rows.start : end] for topic in verdicts_of(description)}
-        labels = {
-            topic: as_cells([w for w in cells if w is not None][:1])
-            for topic, cells in words.items()
-        }
-        damage = {0: fault} if fault else {}
-        yield (
-            f"{name}, {key}",
-            key,
-            replace(part, columns={**part.columns, **labels}, damage=damage),
-        )
+        columns = {**part.columns}
+        for topic in verdicts_of(description):
+            words = table.column(topic)[rows.start : end]
+            columns[topic] = as_cells([word for word in words if word is not None][:1])
+        damage = [UnreadableError(fault)] if fault else []
+        yield replace(part, source=f"{name}, {key}", path=key, columns=columns, damage=damage)
 
 
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
@@ -76,7 +72,7 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     clock = Clock(zone=description.time.zone)
     bounds = []
     with in_listing(about.listing):
-        listing = listing_table(base / about.listing, (about.key, about.start, about.end), form)
+        listing = listing_table(base / about.listing, form)
         keys = listing.words(about.key)
         for column in (about.start, about.end):
             relative, first = column_times(listing, column, about.format, clock, form)
