@@ -37,8 +37,9 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
 def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """Return the files of a description below a folder, each with its path as seen from there.
 
-    They are in the order of their names, with numbers by their size. Of a single file, that file.
-    Raises DataError if there is none.
+    They are in the order of their names, with numbers by their size. Listings, the description
+    itself and files that it excludes are left out. Of a single file, that file. Raises DataError if
+    there is none, or for a pattern that cannot be.
     """
     if root.is_file():
         return [(root, root.name)]
