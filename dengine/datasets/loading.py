@@ -109,8 +109,8 @@ def description_of(
     Raises
     ------
     DataError
-        If the source does not exist, no description was saved, with what to type, the table has
-        none, or a description cannot be read or made.
+        If no description was saved (the message has what to type), none is given for a DataFrame,
+        the source does not exist, or a description cannot be read or proposed.
     """
     if isinstance(description, Description):
         return description

@@ -88,7 +88,10 @@ class Table:
         return self
 
     def take(self, rows: Any) -> "Table":
-        """Return a table of some rows: a slice, or an array of positions or booleans."""
+        """Return a table of some rows: a slice, or an array of positions or booleans.
+
+        Columns of one cell, which holds for all rows, stay as they are, and so does the damage.
+        """
         lines = self.lines
         if len(lines) > 1:
             lines = lines[rows] if isinstance(rows, slice) else np.asarray(lines)[rows]

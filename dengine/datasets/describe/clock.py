@@ -90,8 +90,9 @@ def find_clock(p: Proposal) -> list[Column]:
 def _kind_of(column: Column) -> str:
     """Return what a column tells of the times of samples; "" for nothing.
 
-    `moment` is a date with its time, `time` a time of day, `day` a date, `number` a number that
-    rises, and `fraction` the part of a second beside a time.
+    `moment` is a date with its time, and `time` a time of day, both only if they change within a
+    recording. `day` is a date, `number` a number that rises, and `fraction` the part of a second
+    beside a time.
     """
     if column.forms:
         if column.forms[0] != ISO and "%S" not in column.forms[0]:

@@ -250,7 +250,10 @@ def propose_label(p: Proposal) -> None:
 
 
 def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
-    """Put the words of the label, and its other sources, into the notes."""
+    """Put the words of the label, and its other sources, into the notes of `p`.
+
+    If it is open which words are good or bad, the notes ask for that.
+    """
     counts = counts_of(words.values())
     if UNKNOWN in label.good + label.bad:
         p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")

@@ -112,10 +112,10 @@ def qualify_rows(p: Proposal) -> None:
 
 
 def qualifies(column: Column) -> bool:
-    """Return whether the few words of a column tell which rows are samples.
+    """Return whether the words of a column, at most 12, tell which rows are samples.
 
     `Status` does, also if it has only one word; `TagName` does if it changes within a recording.
-    Numbers do so only in a column with such a name, and labels do not.
+    Numbers do so only in a column that is named like a status, and labels do not.
     """
     name = column.name
     words = column.counts

@@ -75,8 +75,8 @@ def read_bag(
 ) -> Table:
     """Return a table with a row for each message of the channels, in the order of the log.
 
-    The column of a topic of labels has each of its messages in the last row before it, and `None`
-    elsewhere; that of another topic has the newest message in each row.
+    The column of a topic of labels has each of its messages in the last row before it, of several
+    the first, and `None` elsewhere; that of another topic has the newest message in each row.
 
     Parameters
     ----------
@@ -91,8 +91,9 @@ def read_bag(
     Raises
     ------
     DataError
-        If the topic of the channels has no messages, or if a file before the last is not whole and
-        a trigger cuts.
+        If the channels are of several topics, or their topic has no messages, or if a file before
+        the
+        last is not whole and a trigger cuts.
     """
     columns = [*description.channels]
     topics = {column.partition(".")[0] for column in columns}

@@ -137,7 +137,7 @@ class LabelReader:
         return self.listing[keys[0]]
 
     def label(self, table: Table, part: str) -> int | None:
-        """Return 1 for good, 0 for bad, None for not checked.
+        """Return 1 for good, 0 for bad, None for not checked; adds to `used` as `words` does.
 
         Raises UnreadableError if there is no label, several, or a word of unknown meaning.
         """

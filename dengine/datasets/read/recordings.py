@@ -86,9 +86,9 @@ def recording_of(
 
 
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
-    """Return the rows of a table that are samples, and which of these are lost.
+    """Return the rows of a table that are samples, and for each of these whether it is lost.
 
-    Raises UnreadableError for a word whose meaning is not stated.
+    Raises UnreadableError for a word whose meaning is not stated, or a column that is missing.
     """
     n = max(map(len, table.columns.values()), default=0)
     is_lost: Cells = np.zeros(n, dtype=bool)
@@ -126,7 +126,10 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 
 
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
-    """Return the label of a part; UnreadableError if there is none, or two sources disagree."""
+    """Return the label of a part, 1 or 0; None if it was not checked.
+
+    Raises UnreadableError if there is no label, or the sources do not agree.
+    """
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
         if other != label:

@@ -39,7 +39,10 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 
 
 def column_kind(description: Description) -> Kind:
-    """Return the function that tells the kind of a column by its name; see `read_text`."""
+    """Return the function that tells the kind of a column by its name; see `read_text`.
+
+    Raises SettingError if `windows.trigger` cannot be.
+    """
     clock = zip(description.time.column, description.time.format, strict=False)
     dated = {name for name, form in clock if is_dated(form)}
     order = {description.order} - {"name", "time"}
