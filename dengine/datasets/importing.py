@@ -53,10 +53,10 @@ RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestam
 def in_form_of(store: "StoreLike", description: Description) -> Description:
     """Return a description by which recordings get the form of the traces in a store.
 
-    That is its number of samples, and its fit unless that is strict. Otherwise all would count
-    again if they came out in another length. The description is returned as it is for a store that
-    is new, has no traces yet or cannot be opened. The store is read, and closed if it was given by
-    its address.
+    The form is their number of samples, and their fit unless that is strict; recordings that came
+    out in another length would all count again. The description is returned as it is for a store
+    that is new, has no traces yet or cannot be opened. The store is read, and closed if it was
+    given by its address.
     """
     try:
         with opening(store, must_exist=True) as opened:

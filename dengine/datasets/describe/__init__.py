@@ -90,10 +90,10 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
 def choose_files(p: Proposal, root: Path) -> bool:
     """Set in `p` which files are the recordings, and their format; return whether that is clear.
 
-    They are the stated files, or else those of the only suffix that several files, or a bag, have;
-    if there is no such suffix, those of the only suffix at all. If several suffixes remain, `files`
-    is set to `?` with a note that lists them, the format stays as it was, and False is returned.
-    Raises DataError if there is no file of recordings.
+    They are the stated files, or else those of the only suffix that several files, or a bag
+    (`.mcap`), have; if there is no such suffix, those of the only suffix at all. If several
+    suffixes remain, `files` is set to `?` with a note that lists them, the format stays as it was,
+    and False is returned. Raises DataError if there is no file of recordings.
     """
     stated = p.description.files
     every = names_in(root, ())
@@ -117,7 +117,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
 
 def likely_suffixes(names: Names) -> Names:
-    """Return the suffixes that several files have, and that of bags; if there is none, all."""
+    """Return the suffixes that several files have, and that of a bag; if there is none, all."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 

@@ -26,9 +26,9 @@ MOST_PARTS = 240
 def layout_of(p: Proposal, files: Tables) -> str:
     """Return how parts are laid out, as `Description.layout` has it; `?` if nothing tells.
 
-    A layout `long` is told by a column with runs, which is proposed in `p` as `part.column`, or by
-    the stated one. For `?`, which only a single table gives, a note is put there. Raises DataError
-    for a table of results without samples.
+    A layout `long` is told by a column with runs of equal words, which is proposed in `p` as
+    `part.column`, or by the stated one. For `?`, which only a single table gives, a note is put
+    there. Raises DataError for a table of results without samples.
     """
     kind = p.description.format
     first = files[0]

@@ -92,8 +92,7 @@ def read_bag(
     ------
     DataError
         If the channels are of several topics, or their topic has no messages, or if a file before
-        the
-        last is not whole and a trigger cuts.
+        the last is not whole and a trigger cuts.
     """
     columns = [*description.channels]
     topics = {column.partition(".")[0] for column in columns}
