@@ -64,7 +64,7 @@ def load_dataset(
     DataError
         If there is no description, or an open one, with what to type; or if no recording is left.
     SettingError
-        If the description has a trigger, which cuts long recordings, that cannot be.
+        If `windows.trigger` of the description, which cuts long recordings, is malformed.
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))

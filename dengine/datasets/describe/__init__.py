@@ -132,7 +132,7 @@ def names_in(root: Path, patterns: Names) -> Names:
 
     Left out are hidden files, descriptions, pages for people, and, without patterns, files of
     suffixes that no format has. Of a single file it is that file, whatever it is called; the list
-    is empty if nothing is found. Raises DataError for a pattern that cannot be.
+    is empty if nothing is found. Raises DataError for a malformed pattern.
 
     patterns : of the files, if they are known.
     """

@@ -162,7 +162,7 @@ def read_recordings(
     DataError
         If a key is still open, no file is found, a listing cannot be read, or no recording is left.
     SettingError
-        If `windows.trigger` cannot be.
+        If `windows.trigger` is malformed.
     """
     check_description(description)
     notes: list[str] = []

@@ -24,7 +24,7 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
     """Return the table of a file.
 
     Raises UnreadableError or DataError if it is no file of the described format, and of a text
-    SettingError if `windows.trigger` cannot be.
+    SettingError if `windows.trigger` is malformed.
     """
     kind, form = description.format, description.text
     if kind == "ts":
@@ -41,7 +41,7 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 def column_kind(description: Description) -> Kind:
     """Return the function that tells the kind of a column by its name; see `read_text`.
 
-    Raises SettingError if `windows.trigger` cannot be.
+    Raises SettingError if `windows.trigger` is malformed.
     """
     clock = zip(description.time.column, description.time.format, strict=False)
     dated = {name for name, form in clock if is_dated(form)}
@@ -63,7 +63,7 @@ def column_kind(description: Description) -> Kind:
 def signals_of(description: Description) -> Sequence[str]:
     """Return the signals of the trigger that cuts a long recording; none without a trigger.
 
-    Raises SettingError for a trigger that cannot be.
+    Raises SettingError for a malformed trigger.
     """
     trigger = description.windows.trigger
     return as_trigger(trigger).signals if trigger else ()
