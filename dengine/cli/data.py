@@ -119,7 +119,7 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
 
 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
-    """Yield tables and sentences on what was read."""
+    """Yield tables and sentences on what was read; a sentence may be ""."""
     from ..datasets.checks import tolerance_note
     from ..decision.policy import Policy
     from ..model.neighbours import MANY_REPEATS
@@ -149,13 +149,16 @@ def _save(
 ) -> Path | None:
     """Write the description if `--save` asks for it, and return its path; else None.
 
-    It replaces another one only with `--force`.
+    It replaces another one only with `--force`; else that is an OutputError.
     """
     return description.save(source.path, bool(context.params.get("force"))) if save else None
 
 
 def _trace_line(dataset: "Dataset", i: int) -> str:
-    """Return a trace in words: its source, its label, and its first and last samples."""
+    """Return a trace in words: its source, its label, and its first and last samples.
+
+    Of several channels, these are the samples of the first.
+    """
     trace = dataset.X[i] if dataset.X.ndim == 2 else dataset.X[i, 0]
     samples = [f"{value:.4g}" for value in (*trace[:3], *trace[-2:])]
     source = "" if dataset.source is None else f"{dataset.source[i]}, "

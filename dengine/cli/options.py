@@ -285,7 +285,10 @@ class RecipeChoice:
         return recipe
 
     def load_if_given(self) -> Recipe | None:
-        """Return the recipe if a name or a setting was given; None means the store's own recipe."""
+        """Return the recipe if a name or a setting was given; None means the store's own recipe.
+
+        Raises SettingError as `load` does.
+        """
         return self.load() if self.name or self.settings else None
 
     def make_contender(self) -> Contender:
@@ -431,12 +434,20 @@ class DataChoice:
         return self.description or saved_description(self.data)
 
     def describe(self, *, propose: bool = False) -> Description | None:
-        """Return the description with the stated keys; None for a source that is ours.
+        """Return the description with the stated keys; None for a source that needs none.
+
+        These are the bundled sets, stores and files of ours, if no key and no description is given.
+        A progress bar is shown meanwhile.
 
         Parameters
         ----------
         propose : bool
             Whether a description is proposed if none was saved; else that is a DataError.
+
+        Raises
+        ------
+        DataError
+            If the source does not exist, or its description cannot be read or proposed.
         """
         from ..datasets.loading import description_of, own_reader
 
@@ -613,8 +624,10 @@ def data_options(
 
 
 def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
-    """Return those of the options in `TRACE` that a robot's recorder takes, under its names, and
-    the contract of what it records.
+    """Return a robot recorder's settings, by its own names, and the `TraceSpec` of its traces.
+
+    Both come from the options in `TRACE` that were given; others are ignored. Raises SettingError
+    for values that no trace can have.
     """
     from ..cells.ur.recorder import spec_of_recording
 
@@ -625,7 +638,7 @@ def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
 
 
 def trace_spec_from(options: Options) -> TraceSpec | None:
-    """Return the contract of live traces, by those options of `TRACE` that were given.
+    """Return what live traces look like, by those options of `TRACE` that were given.
 
     `--channels` with one number gives how many there are; with names, their columns.
 
@@ -637,12 +650,14 @@ def trace_spec_from(options: Options) -> TraceSpec | None:
     Returns
     -------
     trace_spec : TraceSpec or None
-        None if no option was given: then the first trace sets the contract.
+        None if no option was given: then the first trace sets it.
 
     Raises
     ------
     click.UsageError
         Options were given without `--samples`.
+    SettingError
+        For values that no trace can have, see `TraceSpec`.
     """
     from ..records import TraceSpec
 

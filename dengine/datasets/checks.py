@@ -28,7 +28,12 @@ __all__ = [
 
 
 def check_description(description: Description) -> None:
-    """Raise DataError unless recordings can be read by a description."""
+    """Raise DataError unless recordings can be read by a description; no file is looked at.
+
+    No key may be `?`. The zone must be known, the samples of a trace stated, the rate, if it is
+    stated, between 1 Hz and 1 MHz, and the limit the same for all channels. An order by time needs
+    a clock, and each column of the clock a format. The text form must pass `check_text`.
+    """
     clock = description.time
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
@@ -50,7 +55,11 @@ def check_description(description: Description) -> None:
 
 
 def check_text(text: TextForm) -> None:
-    """Raise DataError unless text files can be read by a form."""
+    """Raise DataError unless text files can be read by a form.
+
+    Python must know its encoding, its delimiter and decimal mark must be one character each, and
+    its samples must begin in line 1 or later.
+    """
     with instead(DataError, "Expected an encoding in text.encoding", LookupError):
         "".encode(text.encoding)  # also refuses codecs that are of no text
     marks = (text.delimiter, text.decimal)
@@ -93,7 +102,7 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
 
 
 def lost_note(recordings: Sequence[Recording]) -> str:
-    """Return a note on the recordings in which samples are lost; "" if there are none."""
+    """Return a note on lost samples, which are NaN or infinite; "" if no recording has any."""
     n_lost = {item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings}
     lost = [source for source, n in n_lost.items() if n]
     where = f"in {len(lost)} of {len(recordings)} recordings: {listed(lost)}"

@@ -28,7 +28,10 @@ expect_data = partial(expect, error=DataError)
 
 
 def expect_all(wanted: Mapping[str, Any]) -> None:
-    """Raise DataError for the first of several conditions that is not met."""
+    """Raise DataError for the first of several conditions that is not met.
+
+    wanted : conditions, each by the words for it that the message says were expected.
+    """
     for what, is_met in wanted.items():
         if not is_met:
             raise DataError(f"Expected {what}.")
@@ -166,7 +169,10 @@ class Dataset:
         return frame
 
     def select(self, channels: Names) -> "Dataset":
-        """Return a data set of some channels, in this order; DataError for unknown names."""
+        """Return a data set of some channels, in this order; DataError for unknown names.
+
+        Of one channel, X has the shape (n, T).
+        """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = {*channels} <= {*self.channels}
         expect_data(is_known, f"channels of {self.name}, {names}", [*channels])
@@ -182,8 +188,9 @@ class Dataset:
     def cut(self, samples: int) -> "Dataset":
         """Return a data set of the first `samples` samples of every trace, to decide earlier.
 
-        Raises DataError if the traces are shorter, or were resampled, so that their first samples
-        are not the first of the recordings.
+        Its `fit` is "cut" where it was "pad" and the traces became shorter. Raises DataError if the
+        traces are shorter, or were resampled, so that their first samples are not the first of the
+        recordings.
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1
@@ -213,13 +220,19 @@ def make_dataset(
     rate_hz, channels, part, cause
         As in `Dataset`; part's numbers may be integers.
     **about
-        Other fields of `Dataset`.
+        Other fields of `Dataset`, which are not checked.
+
+    Returns
+    -------
+    Dataset
+        Its X has the shape (n, T) if there is one channel, and may share its memory with the given
+        one.
 
     Raises
     ------
     DataError
-        If they do not fit together, there is no trace, a label is neither 1 nor 0, or X has more
-        channels than samples.
+        If they do not fit together, there is no trace, a label is neither 1 nor 0, X has more
+        channels than samples, or the rate is not between 1 Hz and 1 MHz.
     """
     try:
         cube = as_traces(X)

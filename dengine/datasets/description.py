@@ -295,10 +295,12 @@ class Description:
 
     @classmethod
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
-        """Return the description that nested dicts of TOML's types state.
+        """Return the description that nested dicts of TOML's types state; `?` passes for any value.
 
-        Raises DataError for a key that does not exist, with the nearest that does, and for a value
-        of the wrong type.
+        Raises DataError for a key that does not exist, with the nearest that does, for a value of
+        the wrong type, and for a newer version of this form.
+
+        where : what the description is called in errors.
         """
         version = values.get("version", VERSION)
         is_older = isinstance(version, int) and version <= VERSION
@@ -316,14 +318,20 @@ class Description:
 
     @classmethod
     def from_toml(cls, text: str, where: str = FOLDER_FILE) -> "Description":
-        """Return the description that a TOML text states; raise DataError if it is damaged."""
+        """Return the description that a TOML text states.
+
+        Raises DataError if it is no TOML, and as `from_dict` does.
+        """
         with instead(DataError, f"Expected TOML in {where}", ValueError, RecursionError):
             values = tomllib.loads(text)
         return cls.from_dict(values, where)
 
     @classmethod
     def load(cls, path: FilePath) -> "Description":
-        """Read a description from a TOML file; raise DataError if it cannot be read."""
+        """Read a description from a TOML file.
+
+        Raises DataError if the file cannot be read or has more than 1 MB, and as `from_toml` does.
+        """
         path = Path(path)
         with instead(DataError, f"Expected a description in {path}", OSError, UnicodeDecodeError):
             size = path.stat().st_size
@@ -331,11 +339,17 @@ class Description:
             return cls.from_toml(path.read_text("utf-8-sig"), str(path))
 
     def save(self, path: FilePath, force: bool = False) -> Path:
-        """Write the TOML file, over an existing one only with `force`; return its path."""
+        """Write the TOML file, over an existing one only with `force`; return its path.
+
+        Raises OutputError if the file exists, without `force`, or cannot be written.
+        """
         return write_output(path, self.to_toml().encode(), force)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return nested dicts of TOML's types, without what has its default; `?` for no channel."""
+        """Return nested dicts of TOML's types, without the notes and without what has its default.
+
+        Channels are always there: `?` is a key of theirs if there is none.
+        """
         channels = self.channels or {UNKNOWN: Channel()}
         tables = {column: {"unit": c.unit, **_plain(c)} for column, c in channels.items()}
         return {**_plain(self), "channels": tables}
@@ -353,7 +367,13 @@ class Description:
         return "\n".join(lines) + "\n"
 
     def _lines(self, prefix: str, table: Stated) -> list[str]:
-        """Return the notes on keys that are not stated, and each that is below its note."""
+        """Return the lines of one table of the file: its keys, each below the note on it.
+
+        Notes on keys that the table does not state come first.
+
+        prefix : what the names of its keys begin with in `notes`, like `label.`; "" for the keys on
+        top.
+        """
         notes = {
             key.removeprefix(prefix): "".join(c if c.isprintable() else " " for c in note)
             for key, note in self.notes.items()
@@ -374,7 +394,8 @@ class Description:
     def open_keys(self) -> Words:
         """The keys whose value is still `?`, like `label.column`; `channels` if there is none.
 
-        A word `?` of a check is none of them: it fits no recording, so others are its faults.
+        Not among them is a `?` in `[ignored]`, or in `[[check]]`: as a word it fits no recording,
+        so it makes no label, and recordings with other words become faults.
         """
         values = self.to_dict()
         values.pop("ignored", None)
@@ -384,8 +405,9 @@ class Description:
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which keys, like `label.column`, have other values.
 
-        Stating a source of labels, or of parts, clears the other sources of the same section. A
-        channel that is stated replaces `?`. Raises DataError like `from_dict`.
+        Stating one source of labels, or of parts, clears the other sources of the same section, but
+        not its words. A channel that is stated replaces `?`. The notes stay. Raises DataError like
+        `from_dict`.
         """
         values = self.to_dict()
         for section, sources in SOURCES.items():
@@ -404,9 +426,10 @@ class Description:
         return replace(Description.from_dict(values), notes=self.notes)
 
     def with_channels(self, columns: Sequence[str]) -> "Description":
-        """Return the description with those channels, or columns that it ignores, as channels.
+        """Return the description with exactly these columns as its channels, in this order.
 
-        Raises DataError for a column that it does not name.
+        Each must be one of its channels, or a column that it ignores, which gets the unit stated
+        there. Raises DataError for another column.
         """
         channels = {column: Channel(unit) for column, unit in self.ignored.items()}
         channels |= self.channels
@@ -449,7 +472,7 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     """Return what TOML states as a dataclass, or in the type of its key.
 
     Where several values are expected, a single one stands for a list of one. Raises DataError for
-    an unknown key, and for a value of another type.
+    an unknown key or choice, and for a value of another type.
     """
     origin = get_origin(kind)
     args = get_args(kind)
@@ -473,7 +496,11 @@ def _made(kind: Any, value: Any, where: str) -> Any:
 
 
 def _as_kind(kind: Any, value: Any, where: str) -> Any:
-    """Return a value in the type of its key; `?` passes for every key, a number for a text."""
+    """Return a value in the type of its key; `?` passes for every key.
+
+    A number becomes a text where one is expected. Raises DataError for a value of another type, and
+    for a number that is not finite.
+    """
     if value == UNKNOWN:
         return value
     if kind is str and isinstance(value, int | float):
@@ -520,7 +547,10 @@ def _toml_key(name: str) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """Return a value as TOML writes it; a list of one, or a table of a unit alone, like that."""
+    """Return a value as TOML writes it.
+
+    A list of one item is written as that item, and a table that has only a unit as that unit.
+    """
     if isinstance(value, Mapping) and {*value} == {"unit"}:
         return _toml_value(value["unit"])
     if isinstance(value, Mapping):

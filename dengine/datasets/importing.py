@@ -53,8 +53,10 @@ RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestam
 def in_form_of(store: "StoreLike", description: Description) -> Description:
     """Return a description by which recordings get the form of the traces in a store.
 
-    Otherwise all would count again if they came out in another length. For a new store it is
-    returned as it is. The store is read, and closed if it was given by its address.
+    The form is their number of samples, and their fit unless that is strict; recordings that came
+    out in another length would all count again. The description is returned as it is for a store
+    that is new, has no traces yet or cannot be opened. The store is read, and closed if it was
+    given by its address.
     """
     try:
         with opening(store, must_exist=True) as opened:
@@ -158,6 +160,10 @@ def import_labelled(
     ------
     TraceError
         If the traces do not agree with those of the store.
+    DataError
+        If the data set cannot be read, see `load_dataset`; then no store is created.
+    StoreError
+        If the store cannot be opened or written.
     """
     description = None
     if own_reader(dataset) is None:
@@ -264,7 +270,11 @@ def _count_unreported(store: "SqlStore", policy: Policy) -> int:
 def _as_stored(
     decision: Decision, trace: TraceArray, gate: TraceGate, policy: Policy, time: float
 ) -> StoredDecision:
-    """Return the record of a decision; a trace with a fault never trains, and is its reason."""
+    """Return the record of a decision, with the propensity that the policy gives it.
+
+    If the trace has a fault, the fault becomes the reason of the decision, and the trace never
+    trains.
+    """
     fault, content = gate(torch.from_numpy(trace))
     is_certain = decision.predicted is not Action.VERIFY
     propensity = policy.audited_share if is_certain else 1.0

@@ -48,7 +48,8 @@ def load_dataset(
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description
         names. None: all that it reads.
     samples : int, optional
-        Samples of each trace: of those that the description has, the first so many.
+        Samples of each trace: the first so many. If the description has fewer, or resamples, the
+        recordings are read as if it said this number. None: as it says.
     progress : callable, optional
         Called with 1 after each file.
 
@@ -62,6 +63,8 @@ def load_dataset(
     ------
     DataError
         If there is no description, or an open one, with what to type; or if no recording is left.
+    SettingError
+        If `windows.trigger` of the description, which cuts long recordings, is malformed.
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))
@@ -98,9 +101,16 @@ def description_of(
     description : Description, mapping or path, optional
         None: the one that was saved.
     stated : mapping, optional
-        Keys of a file that have other values, like `label.column`.
+        Keys, like `label.column`, whose values replace those in a file, or are given to a proposal.
+        They are not used if `description` is a Description or a mapping.
     propose : bool
         Whether one is proposed if none was saved; else that is a DataError.
+
+    Raises
+    ------
+    DataError
+        If no description was saved (the message has what to type), none is given for a DataFrame,
+        the source does not exist, or a description cannot be read or proposed.
     """
     if isinstance(description, Description):
         return description
@@ -121,7 +131,11 @@ def description_of(
 
 
 def count_files(source: str, description: Description | None) -> int:
-    """Return how many files of a source are read."""
+    """Return how many files of a source are read, for a progress bar.
+
+    It is 1 without a description, or if the source does not exist. Raises DataError if the
+    description fits no file.
+    """
     path = Path(source)
     return len(find_files(path, description)) if description is not None and path.exists() else 1
 
@@ -141,7 +155,8 @@ def missing_text(path: Path, proposal: Description) -> str:
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
     """Return what reads a source without a description; None for a source that needs one.
 
-    Raises DataError for a source of an unknown type.
+    A file beside which a description was saved needs it, whatever it holds. Raises DataError for a
+    source of an unknown type, and for a damaged .npz or Parquet file.
     """
     if isinstance(source, Dataset):
         return lambda: source
@@ -162,7 +177,10 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
 
 
 def _is_own_archive(path: Path) -> bool:
-    """Return whether a file is an archive with X, and labels y of 1 and 0."""
+    """Return whether a file is an archive with X, and labels y of 1 and 0.
+
+    Raises DataError for an .npz file that is damaged.
+    """
     if path.suffix.lower() != ".npz":
         return False
     arrays, names = read_archive(path, ("y",))
@@ -171,7 +189,10 @@ def _is_own_archive(path: Path) -> bool:
 
 
 def _is_own_table(path: Path) -> bool:
-    """Return whether a Parquet file was written of a table that `Dataset.to_frame` made."""
+    """Return whether a Parquet file was written of a table that `Dataset.to_frame` made.
+
+    Raises DataError for one that is damaged, or if pyarrow is not installed.
+    """
     if path.suffix.lower() != ".parquet":
         return False
     with read_errors(path, "a Parquet file", "pyarrow", "files"):
@@ -182,14 +203,14 @@ def _is_own_table(path: Path) -> bool:
 
 
 def _read_own_table(path: Path) -> Dataset:
-    """Return the data set of a Parquet file of ours."""
+    """Return the data set of a Parquet file that `_is_own_table` accepts."""
     import pandas as pd
 
     return _from_own_frame(pd.read_parquet(path), path.stem)
 
 
 def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
-    """Return the data set of a table that `Dataset.to_frame` made."""
+    """Return the data set of a table that `Dataset.to_frame` made; DataError as `make_dataset`."""
     about = frame.attrs[OWN]
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)
     X = frame.drop(columns=["label", *words]).to_numpy(np.float32)
@@ -200,7 +221,8 @@ def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
 def _read_npz(path: Path) -> Dataset:
     """Return the data set of an archive with X and labels y of 1 and 0.
 
-    X is multiplied by the number `scale` if there is one.
+    X is multiplied by the number `scale` if there is one. Raises DataError if the arrays do not fit
+    together.
     """
     arrays, _ = read_archive(path, OWN_ARRAYS)
     with read_errors(path, "an .npz file of plain arrays"):
@@ -210,7 +232,7 @@ def _read_npz(path: Path) -> Dataset:
 
 
 def _from_arrays(arrays: Stated, name: str) -> Dataset:
-    """Return the data set of arrays with the names of a `Dataset`."""
+    """Return the data set of arrays with the names of a `Dataset`; DataError as `make_dataset`."""
     units, channels = (
         tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")
     )
@@ -232,8 +254,9 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
 def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
-    Quarantined and forgotten ones are left out. Raises DataError if the store contradicts its
-    ledger, or has no labelled traces.
+    Quarantined and forgotten ones are left out. If a part came again, `part` is the hash by which
+    the store counts its traces as one. Raises DataError if the store contradicts its ledger, the
+    chain of hashes over its records, or has no labelled traces.
     """
     from ..store.opening import opening
 

@@ -88,7 +88,10 @@ class Table:
         return self
 
     def take(self, rows: Any) -> "Table":
-        """Return a table of some rows: a slice, or an array of positions or booleans."""
+        """Return a table of some rows: a slice, or an array of positions or booleans.
+
+        Columns of one cell, which holds for all rows, stay as they are, and so does the damage.
+        """
         lines = self.lines
         if len(lines) > 1:
             lines = lines[rows] if isinstance(rows, slice) else np.asarray(lines)[rows]
@@ -98,7 +101,8 @@ class Table:
     def words(self, name: str) -> Cells:
         """Return a column as texts, shape (rows,), without blanks around them.
 
-        Whole numbers have no decimal point: 1.0 is "1". NaN and None are "".
+        Whole numbers have no decimal point: 1.0 is "1". NaN and None are "". Raises UnreadableError
+        if there is no such column, or its cells are lists.
         """
         import pandas as pd
 
@@ -110,8 +114,8 @@ class Table:
     def numbers(self, name: str, form: TextForm) -> Floats:
         """Return a column as numbers, shape (rows,); a missing one is NaN.
 
-        Raises UnreadableError for a cell that is no finite number of this form, and no word for a
-        missing one.
+        Raises UnreadableError if there is no such column, and for a cell that is no finite number
+        of this form, and no word for a missing one.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
@@ -139,7 +143,8 @@ class Table:
     def one_word(self, name: str, at: str = "same") -> str:
         """Return the word of a column that holds for a recording; see `LabelSource.at`.
 
-        Raises UnreadableError if it changes although it must be the same.
+        Raises UnreadableError if there is no such column or no row, or if the word changes although
+        it must be the same.
         """
         words = self.words(name)
         if not len(words):
@@ -197,7 +202,10 @@ def _pattern(form: TextForm) -> re.Pattern[str]:
 
 
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
-    """Return the number in a cell, NaN for a word that stands for a lost one, inf for others."""
+    """Return the number in a cell, NaN for a word that stands for a lost one, inf for other words.
+
+    A float is returned as it is; None is the word `null`.
+    """
     if isinstance(cell, float):
         return cell
     text = "null" if cell is None else str(cell).strip()

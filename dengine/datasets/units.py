@@ -32,7 +32,10 @@ def bare(unit: str) -> str:
 
 
 def quantity_of(unit: str) -> tuple[str, float] | None:
-    """Return the quantity of a unit, and the factor to its first unit; None for an unknown one."""
+    """Return the quantity of a unit, and the factor to its first unit; None for an unknown one.
+
+    A unit in brackets is unknown, see `bare`.
+    """
     return UNITS.get(unit)
 
 

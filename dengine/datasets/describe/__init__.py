@@ -53,7 +53,7 @@ Names = Sequence[str]
 
 
 def describe(source: Any, stated: Stated | None = None) -> Description:
-    """Propose a description of recordings.
+    """Propose a description of recordings, by looking at some of them.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     Raises
     ------
     DataError
-        If there is no file, or none that holds samples.
+        If there is no file, or none that holds samples, or if what is stated does not exist.
     """
     p = Proposal(stated or {}, Description().with_values(stated or {}))
     check_text(p.description.text)
@@ -88,7 +88,13 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
 
 
 def choose_files(p: Proposal, root: Path) -> bool:
-    """Find which files are the recordings, and their format; return whether that is clear."""
+    """Set in `p` which files are the recordings, and their format; return whether that is clear.
+
+    They are the stated files, or else those of the only suffix that several files, or a bag
+    (`.mcap`), have; if there is no such suffix, those of the only suffix at all. If several
+    suffixes remain, `files` is set to `?` with a note that lists them, the format stays as it was,
+    and False is returned. Raises DataError if there is no file of recordings.
+    """
     stated = p.description.files
     every = names_in(root, ())
     names = names_in(root, stated) if stated else every
@@ -111,7 +117,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
 
 def likely_suffixes(names: Names) -> Names:
-    """Return the suffixes that several files, or bags, have; or else all."""
+    """Return the suffixes that several files have, and that of a bag; if there is none, all."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 
@@ -124,7 +130,9 @@ def suffix_of(name: str) -> str:
 def names_in(root: Path, patterns: Names) -> Names:
     """Return the files of a folder, each as seen from it, in their natural order.
 
-    Left out are hidden files, descriptions, pages for people, and files of other suffixes.
+    Left out are hidden files, descriptions, pages for people, and, without patterns, files of
+    suffixes that no format has. Of a single file it is that file, whatever it is called; the list
+    is empty if nothing is found. Raises DataError for a malformed pattern.
 
     patterns : of the files, if they are known.
     """
@@ -136,7 +144,7 @@ def names_in(root: Path, patterns: Names) -> Names:
 
 
 def globs(names: Names) -> list[str]:
-    """Return the patterns of files of one suffix, or the only file."""
+    """Return patterns that match files, one for each suffix; of a single file, its name."""
     folders = "**/" if any("/" in name for name in names) else ""
     endings = {name.removeprefix(without_suffix(name)) for name in names}
     return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]
@@ -145,7 +153,8 @@ def globs(names: Names) -> list[str]:
 def contents_of(p: Proposal) -> dict[str, bytes]:
     """Return the contents of some files, by their names, in the order of all.
 
-    These are files whose names are like few others but for numbers, and others evenly spread.
+    These are the 60 whose names, but for numbers, are like the fewest others, and more, evenly
+    spread, until 2 MB are read. Files that cannot be read are left out.
     """
     shapes = {name: NUMBERS.sub("0", name) for name in p.names}
     counts = Counter(shapes.values())
@@ -160,7 +169,11 @@ def contents_of(p: Proposal) -> dict[str, bytes]:
 
 
 def read_tables(p: Proposal) -> list[Table]:
-    """Return the first tables of some files, of those with the columns of most."""
+    """Return the first tables of some files, of those with the columns of most.
+
+    For texts the keys of `[text]` are set in `p` before, and files of another form leave `p.names`.
+    Damaged files are left out; raises DataError if all are.
+    """
     contents = contents_of(p)
     if p.description.format == "text":
         propose_form(p, contents)
@@ -179,7 +192,9 @@ def read_tables(p: Proposal) -> list[Table]:
 def table_in(p: Proposal, content: bytes, name: str) -> Table:
     """Return the first table of a file, of a text with all cells as words.
 
-    The only archive holds all parts if its arrays hold curves. Raises DataError if it is damaged.
+    A single .npz file holds all parts if the layout `npz` is stated, or none and its arrays hold
+    curves. Of long texts only the beginning is read, and `p.is_cut` is set. Raises DataError if the
+    file is damaged.
     """
     kind = p.description.format
     if kind == "npz":
@@ -196,7 +211,11 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 
 
 def propose_tables(p: Proposal, files: Tables) -> None:
-    """Find the layout, and the role of each column."""
+    """Find the layout, and the role of each column, and set their keys in `p`.
+
+    If the layout, or the column that tells the parts apart, is `?`, the roles stay open, with a
+    note. Raises DataError if there is no table, no part in them, or no samples.
+    """
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)

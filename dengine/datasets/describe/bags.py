@@ -22,9 +22,10 @@ LISTING = "windows={listing=FILE, key=COLUMN, start=COLUMN, end=COLUMN}"
 
 
 def propose_bag(p: Proposal) -> None:
-    """Find the channels, clock, parts and labels of a bag by its first messages.
+    """Find the channels, clock, parts and labels of a bag by the first messages of its first file.
 
-    Raises DataError if no message can be read.
+    Unless they are stated, `traces.samples`, `windows.trigger` and `label.topic` are set to `?`,
+    with a note on the topics and their words. Raises DataError if the file cannot be read.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()
@@ -57,7 +58,11 @@ def propose_bag(p: Proposal) -> None:
 
 
 def _fields(message: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Yield the fields of a message that hold numbers, `TOPIC.FIELD`, with their units."""
+    """Yield the fields of a message that hold numbers, `TOPIC.FIELD`, with their units.
+
+    The unit is that of a field `force` or `torque` in which the number stands, else "". The header
+    is left out.
+    """
     for name in getattr(message, "__slots__", ()):
         value = getattr(message, name)
         if hasattr(value, "__slots__") and name != "header":

@@ -45,7 +45,12 @@ ROUNDING = 0.005
 
 
 def propose_clock(p: Proposal) -> None:
-    """Find the columns of the clock, and their forms."""
+    """Find the columns of the clock, and their forms, and set them in `p`.
+
+    If there is none, `time.column` is set to `?`, with a note, where a column that is named like a
+    clock has cells of no known form, or where no header names the columns; else only a note says
+    that the rate is unknown.
+    """
     names = p.description.time.column
     clock = [p.columns[name] for name in names if name in p.columns] or find_clock(p)
     odd = [c for c in p.columns.values() if NAME.search(c.name) and c.odd and not c.fixed]
@@ -63,7 +68,11 @@ def propose_clock(p: Proposal) -> None:
 
 
 def find_clock(p: Proposal) -> list[Column]:
-    """Return the columns of the clock: one, seconds and nanoseconds, or a date and a time."""
+    """Return the columns of the clock: one, seconds and nanoseconds, or a date and a time.
+
+    If there are several candidates, the first is taken, and a note in `p` lists them all. The list
+    is empty if there is none.
+    """
     for first, second in pairwise(p.columns.values()):
         if _unit_in(first.name) == "s" and _unit_in(second.name) == "ns":
             return [first, second]
@@ -79,7 +88,12 @@ def find_clock(p: Proposal) -> list[Column]:
 
 
 def _kind_of(column: Column) -> str:
-    """Return what a column tells of the times of samples; "" for nothing."""
+    """Return what a column tells of the times of samples; "" for nothing.
+
+    `moment` is a date with its time, and `time` a time of day, both only if they change within a
+    recording. `day` is a date, `number` a number that rises, and `fraction` the part of a second
+    beside a time.
+    """
     if column.forms:
         if column.forms[0] != ISO and "%S" not in column.forms[0]:
             return "day"
@@ -91,16 +105,20 @@ def _kind_of(column: Column) -> str:
 
 
 def is_rising(column: Column) -> bool:
-    """Return whether numbers rise, and fall only as a counter that wraps."""
+    """Return whether the cells are numbers that rise, and fall in at most 10 % of the steps.
+
+    A counter that begins again may fall so.
+    """
     steps = column.steps
     return bool((steps > 0).any() and (steps < 0).sum() <= FEW * len(steps))
 
 
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
-    """Return the unit or form of a column of times; `?` where several fit.
+    """Return the unit or form of a column of times; `?` where several fit or none is proved.
 
-    Dates of one day read the same whether the day or the month comes first, if another column tells
-    the time; of several days, or with the time, they do not.
+    A note in `p` says why it is `?`, or which size of numbers proves the unit. Dates of one day
+    read the same whether the day or the month comes first, if another column tells the time; of
+    several days, or with the time, they do not.
     """
     forms = column.forms
     if len(forms) > 1 and (is_alone or not column.fixed):
@@ -114,7 +132,7 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
 
 def _unit_in(name: str) -> str:
-    """Return the unit of times in a name, as in `t [ms]`, or that is the name; "" for none."""
+    """Return the unit of times that a column's name has, `t [ms]`, or is, `millis`; "" for none."""
     if match := UNIT_IN_NAME.search(name):
         return match[1].replace(",", ".")
     match = NAMED_UNIT.search(name)
@@ -122,7 +140,10 @@ def _unit_in(name: str) -> str:
 
 
 def _unit_by_size(column: Column) -> tuple[str, str]:
-    """Return the unit of numbers, by their size and their steps, and what proves it."""
+    """Return the unit of numbers, by their size and their steps, and a note on what proves it.
+
+    The unit is `?` if nothing does; the note then has the units that are possible.
+    """
     rising = column.steps[column.steps > 0]
     if not len(rising):
         return UNKNOWN, "no form of times that is known fits"
@@ -140,12 +161,18 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
 
 
 def is_rate(step: float) -> bool:
-    """Return whether a step in seconds is of a rate that forces are recorded at."""
+    """Return whether a step in seconds is of a rate that forces are recorded at, 1 Hz to 1 MHz."""
     return step > 0 and LEAST_RATE_HZ <= 1 / step <= MOST_RATE_HZ
 
 
 def propose_rate(p: Proposal, tables: Tables) -> None:
-    """Find the rate of the clock; ask about times that fall, leave gaps or are not even."""
+    """Set the rate of the clock in `p`, by the median of the mean steps of recordings.
+
+    It is `?` if no force is recorded at such a rate. If times repeat, fall, leave gaps or are not
+    even in more than 10 % of the recordings, the key that says what this means is set to `?`, with
+    a note; see `QUESTIONS`. If all times are dates after the year 2000, the order is set to `time`.
+    Recordings whose times cannot be read are passed over.
+    """
     recordings, starts = list[Floats](), list[float]()
     for table in tables:
         with suppress(UnreadableError):
@@ -166,7 +193,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
 
 
 def is_uneven(steps: Floats, usual: float) -> bool:
-    """Return whether samples stand more than half a step from even times."""
+    """Return whether samples stand more than half a step from even times; not if times fall."""
     even = steps.mean() * np.arange(1, len(steps) + 1)
     return bool((steps >= 0).all() and np.abs(np.cumsum(steps) - even).max() > steps.mean() / 2)
 

@@ -39,7 +39,7 @@ Floats = NDArray[np.float64]
 
 
 def counts_of(words: Iterable[str]) -> str:
-    """Return how often each word comes, most frequent first."""
+    """Return how often each of the 12 most frequent words comes, most frequent first."""
     return ", ".join(f"{w or 'empty'}: {n:,}" for w, n in Counter(words).most_common(MOST_WORDS))
 
 
@@ -53,7 +53,7 @@ class Column:
 
     @cached_property
     def words(self) -> list[NDArray[Any]]:
-        """The words of each recording."""
+        """The words of each recording, an array each; UnreadableError if its cells are lists."""
         return [table.words(self.name) for table in self.tables]
 
     @cached_property
@@ -63,7 +63,7 @@ class Column:
 
     @cached_property
     def odd(self) -> Counter[str]:
-        """How often each word comes that is no number."""
+        """How often each word comes that is no number, with whatever decimal mark."""
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
 
     @cached_property
@@ -74,14 +74,14 @@ class Column:
 
     @cached_property
     def numbers(self) -> list[Floats]:
-        """The numbers of each recording; none if a cell is none."""
+        """The numbers of each recording; an empty list if any cell is no number of the form."""
         with suppress(DataError):
             return [table.numbers(self.name, self.form) for table in self.tables]
         return []
 
     @cached_property
     def steps(self) -> Floats:
-        """The steps from number to number within the recordings."""
+        """The steps from number to number within the recordings; none if a cell is no number."""
         return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
 
     @cached_property
@@ -92,7 +92,11 @@ class Column:
 
     @cached_property
     def forms(self) -> list[str]:
-        """All forms of dates and times that fit its cells."""
+        """All forms of dates and times that fit its cells; none if there is a cell of another kind.
+
+        It looks at the first 20 cells and the last of each recording. If an ISO date or moment
+        fits, it is the only form.
+        """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
         cells = {word for words in self.words for word in (*words[:MOST_CELLS], *words[-1:])}
@@ -112,7 +116,7 @@ def _fits(table: Table, form: str) -> bool:
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
-    """Return the columns of the first table, each with the tables that have it."""
+    """Return the columns of the first table by their names, each with the tables that have it."""
     names = tables[0].columns if tables else ()
     return {name: Column(name, [t for t in tables if name in t.columns], form) for name in names}
 
@@ -139,13 +143,13 @@ class Proposal:
     notes: dict[str, str] = field(default_factory=dict)
 
     def put(self, key: str, value: Any, note: str = "") -> None:
-        """Set a key like `time.column`, with a note on it, unless the user stated it."""
+        """Set a key like `time.column`, with a note on it; does nothing if the user stated it."""
         if key not in self.stated:
             self.description = self.description.with_values({key: value})
             self.notes |= {key: note} if note else {}
 
     @property
     def unused(self) -> list[Column]:
-        """The columns that have no role yet."""
+        """The columns that have no role yet: no clock, part, label, channel, nor words for rows."""
         kind_of = column_kind(self.description)
         return [column for name, column in self.columns.items() if not kind_of(name)]

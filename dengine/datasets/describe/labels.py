@@ -65,8 +65,9 @@ Words = Mapping[str, str]  # by recording
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
-    """Return a source with the meanings of its words; `?` for those that are not known.
+    """Return a source with the meanings of its words; those that are stated stay.
 
+    If the meaning of any word is not known, `good` and `bad` are `?` where they would be empty.
     Plain verdicts mean the same everywhere, but in a path each is one only if some part is good and
     some bad: `pass_1.csv` may be anything. In a column of only true, yes or 1 and their opposites
     they mean what its name says: good for `success`, bad for `failed`.
@@ -84,7 +85,10 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
 
 
 def _verdicts(source: LabelSource, words: set[str]) -> Sequence[Sequence[str]]:
-    """Return the words for good and for bad in a source."""
+    """Return the words for good and for bad in a source; none if its name leaves that open.
+
+    words : those in the source, in small letters.
+    """
     name = source.column or source.line or source.topic
     if not name or not words <= {*YES, *NO, *UNCHECKED}:
         return GOOD, BAD
@@ -92,7 +96,7 @@ def _verdicts(source: LabelSource, words: set[str]) -> Sequence[Sequence[str]]:
 
 
 def is_plain(source: LabelSource) -> bool:
-    """Return whether a source has words for good or bad, and the meaning of all is known."""
+    """Return whether a source has words for good or bad, and none of these is `?`."""
     words = source.good + source.bad
     return bool(words) and UNKNOWN not in words
 
@@ -109,7 +113,10 @@ def in_paths(paths: Names) -> list[str]:
 
 
 def is_verdict(name: str, words: Names) -> bool:
-    """Return whether a column has the name of a verdict, and few words; a single one is plain."""
+    """Return whether a column has the name of a verdict, and at most 12 words.
+
+    If it has only one word, that must be a verdict whose meaning is known.
+    """
     words = {*words}
     is_named = NAME.search(name) or BAD_NAME.search(name)
     is_label = len(words) > 1 or is_plain(with_meanings(LabelSource(column=name), words))
@@ -119,7 +126,8 @@ def is_verdict(name: str, words: Names) -> bool:
 def row_of(column: Column) -> Literal["", "same", "last"]:
     """Return which row of a recording has the label in a column, `same` or `last`; "" for none.
 
-    It is the last if above it stand only words for not checked.
+    The column must be a verdict, see `is_verdict`. It is the last row if above it stand only words
+    for not checked.
     """
     last = [str(words[-1]) for words in column.words if len(words)]
     above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
@@ -134,7 +142,7 @@ def lines_of(p: Proposal, pattern: re.Pattern[str]) -> list[str]:
 
 
 def part_words(source: PartSource, tables: Tables) -> Words:
-    """Return the number of the part of each recording that states one."""
+    """Return the number of the part of each recording that states one; "" if there is no source."""
     words = dict[str, str]()
     for table in tables:
         with suppress(DataError):
@@ -143,7 +151,10 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 
 
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
-    """Yield the stated source, or those that may hold labels in listings, paths, columns, lines."""
+    """Yield the stated source, or those that may hold labels in listings, paths, columns, lines.
+
+    They come in this order. A file that cannot be read as a listing is passed over.
+    """
     label = p.description.label
     if any(getattr(label, kind) for kind in KINDS):
         yield label
@@ -163,7 +174,11 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 
 
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
-    """Return the word of each recording that has one in a source; there must be some if stated."""
+    """Return the word of each recording that has one in a source.
+
+    A stated source must have one: raises DataError if it has none or cannot be read. Any other then
+    gives no words.
+    """
     words = dict[str, str]()
     is_stated = source == p.description.label
     with suppress(*([] if is_stated else [DataError])):
@@ -183,9 +198,11 @@ def title_of(source: LabelSource, words: Words) -> str:
 
 
 def count_sources(p: Proposal) -> dict[LabelSource, Words]:
-    """Return the stated source, or all with words for most recordings, with their words.
+    """Return the sources of labels, each with the word of every recording that has one.
 
-    Of columns and lines, these are the recordings that were looked at.
+    It is the stated source alone, or else each candidate that has words for more than half of the
+    recordings. For listings and paths all recordings count, whose names are enough; for columns and
+    lines only those whose tables were read. Raises DataError if the stated source has no words.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
@@ -203,7 +220,7 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
 def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
     """Return 1 for each recording with a word for good, -1 for bad, 0 for not checked.
 
-    There is none if the meaning of a word is not known, or no word is for good or bad.
+    The mapping is empty if the meaning of a word is not known, or no word is for good or bad.
     """
     is_known = {*source.good, *source.bad, *source.unchecked}.issuperset(words.values())
     sides = {name: (word in source.good) - (word in source.bad) for name, word in words.items()}
@@ -211,11 +228,12 @@ def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
 
 
 def propose_label(p: Proposal) -> None:
-    """Find the source of the labels, and those that must agree with it.
+    """Find the source of the labels, and those that must agree with it, and set them in `p`.
 
     The first source whose words are known is the label if all such agree with it, and the others
-    are checks if they have a word for each recording. If one disagrees, or there is none, the label
-    is `?`, and the note lists them all.
+    are checks if they have a word for each recording. If no words are known, a single source is the
+    label, with `?` for its words. If sources disagree, or none is certain, `label.column` is `?`,
+    and the note lists them all. Raises DataError if a stated source has no words.
     """
     counted = count_sources(p)
     certain = [source for source, words in counted.items() if sides_of(source, words)]
@@ -232,7 +250,10 @@ def propose_label(p: Proposal) -> None:
 
 
 def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
-    """Put the words of the label, and its other sources, into the notes."""
+    """Put the words of the label, and its other sources, into the notes of `p`.
+
+    If it is open which words are good or bad, the notes ask for that.
+    """
     counts = counts_of(words.values())
     if UNKNOWN in label.good + label.bad:
         p.notes |= dict.fromkeys(("label.good", "label.bad"), f"which of the words? {counts}")
@@ -241,7 +262,7 @@ def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) ->
 
 
 def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
-    """Return on how many recordings a source disagrees with the first; "" if none does."""
+    """Return in words on how many recordings a source disagrees with the first; "" if none."""
     for other in sides[1:]:
         if n := sum(side * other.get(name, 0) < 0 for name, side in sides[0].items()):
             return f"two of these disagree on {n:,} of {len(sides[0]):,} recordings"
@@ -249,7 +270,7 @@ def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
 
 
 def _few_words(p: Proposal) -> list[str]:
-    """Return the columns, and the folders, of few words that may be labels under other names."""
+    """Return texts on columns, and folders, of few words that may be labels under other names."""
     few = {column.name: column.fixed for column in p.unused}
     few[f"label.path={FOLDER}"] = [name.split("/")[-2] for name in p.names if "/" in name]
     return [

@@ -24,9 +24,11 @@ MOST_PARTS = 240
 
 
 def layout_of(p: Proposal, files: Tables) -> str:
-    """Return how parts are laid out, `?` if nothing tells; find what tells rows apart.
+    """Return how parts are laid out, as `Description.layout` has it; `?` if nothing tells.
 
-    Raises DataError for a table of results without samples.
+    A layout `long` is told by a column with runs of equal words, which is proposed in `p` as
+    `part.column`, or by the stated one. For `?`, which only a single table gives, a note is put
+    there. Raises DataError for a table of results without samples.
     """
     kind = p.description.format
     first = files[0]
@@ -63,13 +65,13 @@ def _propose_part(p: Proposal, columns: Collection[Column]) -> bool:
 
 
 def numbered_columns(table: Table) -> list[str]:
-    """Return the patterns of columns with numbers behind one name."""
+    """Return the patterns, like `x*`, of at least 20 columns with numbers behind one name."""
     counts = Counter(re.sub(r"\d+$", ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
 
 
 def has_lists(table: Table) -> bool:
-    """Return whether cells of a column are lists."""
+    """Return whether the first cell of any column is a list of several items."""
     cells = [column[0] for column in table.columns.values() if len(column)]
     return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
 
@@ -80,7 +82,11 @@ def _n_runs(column: Column) -> list[int]:
 
 
 def _has_runs(column: Column) -> bool:
-    """Return whether a column has one word for each of several runs of rows."""
+    """Return whether a column has one word for each of several runs of rows, as parts have.
+
+    No word may come in two runs, the mean run has at least 8 rows, most tables have several, and
+    the column is neither a clock nor one of fractions.
+    """
     n_runs = _n_runs(column)
     is_unique = len(column.counts) == sum(n_runs) and "" not in column.counts
     is_long = column.counts.total() >= LEAST_RUN * sum(n_runs)
@@ -92,7 +98,10 @@ def _has_runs(column: Column) -> bool:
 
 
 def _refuse_results(columns: Iterable[Column]) -> None:
-    """Raise DataError for a table with a row for each result, and no samples."""
+    """Raise DataError for a table with a row for each result, and no samples.
+
+    That is one with a column of known verdicts, good and bad, that changes within 8 rows.
+    """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
         is_short = min(np.diff(edges), default=LEAST_RUN) < LEAST_RUN
@@ -105,9 +114,10 @@ def _refuse_results(columns: Iterable[Column]) -> None:
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:
-    """Return the tables of the parts that are looked at.
+    """Return the tables of the parts that are looked at: the first 240 without damage.
 
-    The last part of files that were read in part may be cut.
+    In the layout `long` the last part of each file is left out if a file was read only in part,
+    since it may be cut. Raises DataError if the files do not split as the layout says.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])

@@ -37,7 +37,12 @@ FORCES = (
 
 
 def propose_roles(p: Proposal) -> None:
-    """Give each column a role, one after the other; what is stated stays."""
+    """Give each column a role, one after the other, by keys in `p`; what is stated stays.
+
+    Roles that nothing proves are `?`. While it is open which rows are samples, `traces.samples` is
+    `?`, and no rate is set. Raises DataError for a stated clock, channel or label that does not
+    exist.
+    """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
         expect_one_of([*p.columns, UNKNOWN], name, "the columns")
@@ -59,7 +64,10 @@ def propose_roles(p: Proposal) -> None:
 
 
 def samples_only(p: Proposal, table: Table) -> Table:
-    """Return the rows of a table that are samples, as far as their words are known."""
+    """Return the rows of a table that are samples, as far as their words are known.
+
+    All rows are returned if a word in them has no stated meaning.
+    """
     rows = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
     with suppress(DataError):
         return kept_rows(table, rows)[0]
@@ -67,7 +75,10 @@ def samples_only(p: Proposal, table: Table) -> Table:
 
 
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
-    """Set what the words of columns mean for their rows, and leave out those that are none."""
+    """Set in `p` what the words of columns mean for their rows, and leave out those that are none.
+
+    From then on `p.columns` has only the rows that are samples. Without words nothing changes.
+    """
     if rows:
         p.description = replace(p.description, rows=rows)
         p.columns = columns_of([samples_only(p, table) for table in p.tables], p.description.text)
@@ -76,7 +87,9 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
 def qualify_rows(p: Proposal) -> None:
     """Find the columns that qualify rows: few words that change within a recording.
 
-    Where the user states some words, the others are kept, or dropped if those to keep are stated.
+    They are set in `p`, with `?` for the words to keep and a note that counts them, or with the
+    word if there is only one. Where the user states some words, the others are kept, or dropped if
+    those to keep are stated.
     """
     rows = dict(p.description.rows)
     unused = p.unused
@@ -99,10 +112,10 @@ def qualify_rows(p: Proposal) -> None:
 
 
 def qualifies(column: Column) -> bool:
-    """Return whether the few words of a column tell which rows are samples.
+    """Return whether the words of a column, at most 12, tell which rows are samples.
 
     `Status` does, also if it has only one word; `TagName` does if it changes within a recording.
-    Numbers do so only in a column with such a name, and labels do not.
+    Numbers do so only in a column that is named like a status, and labels do not.
     """
     name = column.name
     words = column.counts
@@ -117,7 +130,11 @@ def qualifies(column: Column) -> bool:
 
 
 def propose_part(p: Proposal) -> None:
-    """Find the column or line with the part's number, if exactly one has its name."""
+    """Set in `p` the column or line with the part's number, if exactly one has its name.
+
+    It must tell most recordings apart. If there are several, only a note lists them; what is stated
+    stays.
+    """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
     least = len(p.tables) / 2
@@ -132,7 +149,9 @@ def propose_part(p: Proposal) -> None:
 def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     """Choose the channel: the only column, or the only one of the first rule that any fits.
 
-    These are a force along z, then any force, by its name or by a unit of force or torque.
+    These are a force along z, then any force, by its name or by a unit of force or torque. If
+    several fit, or no column does, the channels stay open, with a note that lists the columns.
+    Nothing changes if channels are stated.
 
     units : of the columns that may be channels.
     """
@@ -151,9 +170,10 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
 
 def _units(p: Proposal) -> dict[str, str]:
-    """Return the columns that may be channels, with their units.
+    """Return the columns that may be channels, with their units, "" for none.
 
-    Their numbers change, few of their words are none, and they are neither clocks nor counters.
+    Their numbers change, no word but one for a lost sample is in more than 1 % of the cells, and
+    they are neither clocks nor counters.
     """
     units = dict[str, str]()
     for column in p.unused:
@@ -170,7 +190,11 @@ def _units(p: Proposal) -> dict[str, str]:
 
 
 def find_lost(p: Proposal) -> None:
-    """Find the words for lost samples of the channels, and rows that have none of them."""
+    """Set in `p` the words for lost samples of the channels.
+
+    If more than 10 % of a channel's cells are empty, these are no lost samples: their rows are
+    dropped, since they are samples of something else.
+    """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
     for name in p.description.channels.keys() & p.columns.keys():
@@ -186,7 +210,11 @@ def find_lost(p: Proposal) -> None:
 
 
 def propose_lengths(p: Proposal) -> None:
-    """Find how many samples the traces have, and what happens to those of other lengths."""
+    """Set in `p` how many samples the traces have, the median of the recordings.
+
+    If some have other lengths, a note counts them; if they are more than 10 %, `traces.lengths`
+    becomes `pad`.
+    """
     words = [p.columns[name].words for name in p.description.channels if name in p.columns]
     lengths = [n for n in map(len, words[0] if words else ()) if n]
     usual = int(np.median(lengths or 0))
@@ -199,7 +227,10 @@ def propose_lengths(p: Proposal) -> None:
 
 
 def list_others(p: Proposal) -> None:
-    """List the columns without a role, and the files beside the recordings."""
+    """Set in `p` the columns without a role as ignored, and the other files as excluded.
+
+    Files get a note; they are left alone if it is open, `?`, whether they are recordings.
+    """
     listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)
     if UNKNOWN not in p.description.exclude and others:

@@ -56,7 +56,10 @@ class Look:
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
-    """Return how a file is written, by its first lines; None if it is no text."""
+    """Return how a file is written, by its first 200 lines; None if it is empty or no text.
+
+    stated : keys that the user gave, of which the encoding and the delimiter are used.
+    """
     encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.splitlines()[:MOST_LINES]
     if "\0" in text or not text.strip():
@@ -74,7 +77,7 @@ def look(content: bytes, stated: Stated) -> Look | None:
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
-    """Return the encoding of a text and its first part, "" if it is none.
+    """Return the encoding of a text and its first part of 400 kB; both "" if it is none.
 
     The encoding is what is stated, else UTF-16 by the mark at its beginning, UTF-8 or cp1252.
     """
@@ -109,14 +112,17 @@ def _count_numbers(cells: Sequence[str]) -> int:
 
 
 def _first_row(rows: Rows, width: int) -> int:
-    """Return the first row of samples: as many numbers as usual, as have those behind it."""
+    """Return the first row of samples: as many numbers as usual, as have those behind it.
+
+    It is counted from 0, and 0 if there is no such row.
+    """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
 def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
-    """Return the lines of the header and of the units above the samples; 0 for none."""
+    """Return the lines, from 1, of the header and of the units above the samples; 0 for none."""
     heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(map(str.strip, row))]
     units = 0
     if len(heads) > 1:
@@ -127,10 +133,13 @@ def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
-    """Find the keys of `[text]` for most of the files, and leave out files of another form.
+    """Set the keys of `[text]` in `p` for most of the files, and leave out files of another form.
 
-    These have another delimiter, another number of columns, or another header than most. If several
-    have samples, it is asked why.
+    These have another delimiter, another number of columns, or another header than most, and move
+    from `p.names` to `p.others`. If several of them have samples, `exclude` is set to `?`, with a
+    note that asks whether they are recordings. Raises DataError if no file is a text.
+
+    contents : of the files that are looked at, by their names.
     """
     groups = defaultdict[Any, dict[str, Look]](dict)
     for name, content in contents.items():
@@ -148,7 +157,11 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 
 
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
-    """Set the keys of `[text]` for files of one form; the header may stand at any line in each."""
+    """Set the keys of `[text]` in `p` for files of one form, as the first of them is written.
+
+    If the header stands at another line in some, `text.header` becomes the text of its line. A note
+    warns if an encoding is guessed, and the decimal mark is `?` if nothing proves it.
+    """
     usual = looks[0]
     form = usual.form
     above = int(form.header)
@@ -169,7 +182,11 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return names for the columns where the header does not give one for each; else none.
 
-    In a matrix, whose rows are parts, a first column of few whole numbers is their class.
+    If the header has more names than there are columns, they are its first. Without a header they
+    are `c0`, `c1`, ..., or for 20 columns or more `x*`, which stands for all. In such a matrix,
+    whose rows are parts, a first column of few whole numbers is their `class`.
+
+    usual : the first lines of a typical file.
     """
     width = usual.width
     if usual.line:
@@ -184,11 +201,11 @@ def _column_names(usual: Look) -> Sequence[str]:
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
-    """Find the decimal mark and that of groups, which numbers prove.
+    """Set in `p` the decimal mark and that of groups, which numbers prove.
 
     A mark is a decimal one where other than three digits follow it, it follows a 0 or more than
     three digits, or stands behind the other mark: `0,004` and `1.043,5` prove a comma, `1.043`
-    proves nothing. Where both fit, the decimal mark is `?`.
+    proves nothing. Where both fit, the decimal mark is `?`, with a note.
     """
     seen = {mark: [cell for cell in cells if mark in cell] for mark in ".,"}
     proofs = {mark: len([*filter(DECIMAL[mark].fullmatch, seen[mark])]) for mark in ".,"}

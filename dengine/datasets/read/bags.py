@@ -36,8 +36,9 @@ def read_messages(
 ) -> Iterator[Message]:
     """Yield the messages of some topics, or of all for None, in their order in the file.
 
-    A file that was not closed is read up to where it ends, with a note. Raises DataError if it is
-    no MCAP file, and UnreadableError if it is damaged.
+    A file that was not closed is read up to where it ends, with a note in `notes`. Raises DataError
+    if its name does not end in .mcap, or if a package that reads such files is not installed, and
+    UnreadableError if it is damaged, or ends before its first message.
     """
     if path.suffix.lower() != SUFFIX:
         do = "`ros2 bag convert` makes them of .db3 files"
@@ -74,8 +75,8 @@ def read_bag(
 ) -> Table:
     """Return a table with a row for each message of the channels, in the order of the log.
 
-    The column of a topic of labels has each of its messages in the last row before it, and `None`
-    elsewhere; that of another topic has the newest message in each row.
+    The column of a topic of labels has each of its messages in the last row before it, of several
+    the first, and `None` elsewhere; that of another topic has the newest message in each row.
 
     Parameters
     ----------
@@ -90,8 +91,8 @@ def read_bag(
     Raises
     ------
     DataError
-        If the topic of the channels has no messages, or if a file before the last is not whole and
-        a trigger cuts.
+        If the channels are of several topics, or their topic has no messages, or if a file before
+        the last is not whole and a trigger cuts.
     """
     columns = [*description.channels]
     topics = {column.partition(".")[0] for column in columns}
@@ -117,7 +118,10 @@ def _rows_of(
     notes: list[str],
     faults: list[Fault],
 ) -> list[Any]:
-    """Return the times and values of each message of the channels, and put others into `events`."""
+    """Return the times and values of each message of the channels, and put others into `events`.
+
+    A file that is damaged, or whose messages lack a field, becomes a fault. Raises as `read_bag`.
+    """
     fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
     for path, name in files:
@@ -144,7 +148,7 @@ def _stamp_of(message: Any) -> int:
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
-    """Return the column of a topic beside the rows of the log; see `read_bag`."""
+    """Return the column of a topic beside the rows of the log, see `read_bag`; sorts `messages`."""
     messages.sort(key=itemgetter(0))
     times = [time for time, _ in messages]
     words = [word for _, word in messages]

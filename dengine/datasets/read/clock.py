@@ -53,7 +53,9 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     Raises
     ------
     UnreadableError
-        For a cell that is no time of the stated form.
+        If a column is missing, empty or of another length, or a cell is no time of the stated form.
+    DataError
+        If a format is no unit of time.
     """
     seconds: Floats = np.zeros(1)
     start = 0.0
@@ -68,7 +70,12 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
 
 
 def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextForm) -> Times:
-    """Return the times of one column since its first, and the first, in seconds."""
+    """Return the times of one column since its first, and the first, in seconds.
+
+    A fall by more than half a day counts as midnight in times of day, if no column has the date;
+    one by more than half of `clock.wrap` counts as a new beginning of a counter. Raises as
+    `times_of`.
+    """
     cells = table.column(name)
     if not len(cells):
         raise UnreadableError("Expected times, got none", column=name)
@@ -90,7 +97,10 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
-    """Return the times of a column of dates, or times of day."""
+    """Return the times of a column of dates, or times of day; UnreadableError if one is neither.
+
+    The first time counts from 1970, of times of day from midnight.
+    """
     import pandas as pd
 
     has_date = "%" not in unit or has_day(unit)
@@ -112,8 +122,9 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
-    A rate of 0 stands for any that is even: steps are then compared with their mean. Equal times
-    are none that rise, unless any gap is allowed.
+    The longest step is `clock.gap` steps of the rate; 0 allows any. A rate of 0 stands for any that
+    is even: steps are then compared with their mean. Equal times are refused too, unless any gap is
+    allowed.
     """
     steps = np.diff(seconds)
     rate = clock.rate_hz

@@ -27,7 +27,7 @@ def natural_key(text: str) -> Key:
 def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
     """Return the files below a folder that patterns match, as seen from there.
 
-    Raises DataError for a pattern that cannot be.
+    Raises DataError for a malformed pattern.
     """
     with instead(DataError, f"Expected patterns below a folder in files, got {patterns}", *BAD):
         paths = [path for pattern in patterns for path in root.glob(pattern)]
@@ -37,8 +37,9 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
 def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """Return the files of a description below a folder, each with its path as seen from there.
 
-    They are in the order of their names, with numbers by their size. Of a single file, that file.
-    Raises DataError if there is none.
+    They are in the order of their names, with numbers by their size. Listings, the description
+    itself and files that it excludes are left out. Of a single file, that file. Raises DataError if
+    there is none, or for a malformed pattern.
     """
     if root.is_file():
         return [(root, root.name)]

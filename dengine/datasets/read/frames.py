@@ -26,7 +26,10 @@ Columns = dict[str, Cells]
 def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> Table:
     """Return the table of a JSON file: a row for the object, for each of a list, or for each line.
 
-    Its cells may be lists.
+    Its cells may be lists; a key that an object lacks is None. Raises UnreadableError if the text
+    is no JSON, or not one or more objects.
+
+    has_lines : whether each line is JSON by itself.
     """
     text = to_utf8(content, form.encoding).decode()
     rows: list[Mapping[str, Any]] = []
@@ -63,7 +66,10 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 def columns_of(prefix: str, value: Any) -> Columns:
     """Return the columns of a nested object, each with its cells; a scalar is a column of one.
 
-    Of an array (C, n), or (n, C) with C < n, each channel is a column.
+    Of an array (C, n), or (n, C) with C < n, each channel is a column. Raises UnreadableError if
+    the items of a list are of several forms.
+
+    prefix : of the columns' names, which go on with a dot and the key, or the channel from 0.
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
@@ -77,7 +83,10 @@ def columns_of(prefix: str, value: Any) -> Columns:
 
 
 def _turned(items: Any) -> Mapping[Any, Any]:
-    """Return objects by their keys, or lists by their channels; nothing for other items."""
+    """Return objects by their keys, or lists by their channels; nothing for other items.
+
+    Raises one of `DAMAGES` if the items are not all like the first.
+    """
     first = items[0] if len(items) else None
     if isinstance(first, Mapping):
         return {key: [item[key] for item in items] for key in first}
@@ -104,7 +113,7 @@ def read_frame(frame: Any, source: str) -> Table:
 
 
 def read_parquet(content: bytes, source: str) -> Table:
-    """Return the table of a Parquet file; raise DataError if it is none."""
+    """Return the table of a Parquet file; DataError if it is none, or pyarrow is not installed."""
     with read_errors(source, "a Parquet file", "pyarrow", "files"):
         import pandas as pd
 
@@ -114,8 +123,9 @@ def read_parquet(content: bytes, source: str) -> Table:
 def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     """Return the table of a NumPy archive.
 
-    The archive of one part has a column for each array, see `columns_of`. That of all parts has a
-    row for each of the first axis of its largest array, whose cells are arrays.
+    The archive of one part has a column for each array, see `columns_of`. That of all parts,
+    `has_all`, has a row for each of the first axis of its largest array, whose cells are arrays.
+    Raises DataError if it is damaged.
     """
     arrays, _ = read_archive(content, name=source)
     if not has_all:
@@ -129,7 +139,8 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
 def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
-    Channels are the columns `0`, `1`, ..., the class is the column `class`.
+    Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
+    `class`. Raises UnreadableError if it is no text, or has no series below a line `@data`.
 
     References
     ----------

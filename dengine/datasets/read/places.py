@@ -44,7 +44,7 @@ def path_word(path: str, pattern: str) -> str:
 
 
 def line_word(lines: Sequence[str], beginning: str) -> str:
-    """Return the cell behind the beginning of one of the lines above the header.
+    """Return the cell behind the beginning of the first line above the header that has it.
 
     Raises UnreadableError if no line begins so.
     """
@@ -58,7 +58,12 @@ def line_word(lines: Sequence[str], beginning: str) -> str:
 def words_of(
     source: PartSource | LabelSource, table: Table, columns: Sequence[str], at: str = "same"
 ) -> list[str]:
-    """Return the words of a source of parts or labels, of which these are the columns."""
+    """Return the words of a source of parts or labels, of which these are the columns.
+
+    A path or a line has one word, and without these there is one for each column. Raises
+    UnreadableError if one is not there, and DataError for a path that is no expression with one
+    group.
+    """
     if source.path:
         return [path_word(table.path, source.path)]
     if source.line:
@@ -67,9 +72,9 @@ def words_of(
 
 
 def part_of(source: PartSource, table: Table) -> str:
-    """Return the number of the part; "" if none is stated.
+    """Return the number of the part, of several columns with blanks between; "" if none is stated.
 
-    Raises UnreadableError if the recording does not state it.
+    Raises UnreadableError if the recording does not have what is stated.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -78,10 +83,10 @@ def part_of(source: PartSource, table: Table) -> str:
 
 
 def listing_table(path: Path, form: TextForm) -> Table:
-    """Return the table of a listing, whose cells are words.
+    """Return the table of a listing, a .parquet file or a text, whose cells are words.
 
-    A text is parted by the one of `, ; tab |` that its header has most of. Raises UnreadableError
-    if it cannot be read.
+    A text is parted by the one of `, ; tab |` that its header has most of. Raises UnreadableError,
+    or for a .parquet file DataError, if it cannot be read or a row has another number of cells.
     """
     content = read_file(path)
     if path.suffix == ".parquet":
@@ -116,7 +121,8 @@ class LabelReader:
         """Return the words for a recording; raise UnreadableError if there is none.
 
         Its key in a listing is the part's number, the path, the file's name, or one of these
-        without a suffix.
+        without a suffix, the first that is listed. The key is added to `used`; it has several words
+        if the listing has it in several rows.
         """
         source = self.source
         path = table.path
@@ -131,7 +137,7 @@ class LabelReader:
         return self.listing[keys[0]]
 
     def label(self, table: Table, part: str) -> int | None:
-        """Return 1 for good, 0 for bad, None for not checked.
+        """Return 1 for good, 0 for bad, None for not checked; adds to `used` as `words` does.
 
         Raises UnreadableError if there is no label, several, or a word of unknown meaning.
         """
@@ -169,7 +175,8 @@ def as_key(word: str) -> str:
 def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     """Return the reader of a source of labels; its listing stands in the folder `base`.
 
-    Raises DataError if the listing cannot be read.
+    The listing is read here. Raises DataError if it cannot be read or lacks its two columns, or
+    these are not stated.
     """
     reader = LabelReader(source)
     if source.listing:

@@ -38,7 +38,7 @@ WORDS = {1: "good", 0: "bad", None: "not checked"}
 def recording_of(
     table: Table, description: Description, labels: Sequence[LabelReader]
 ) -> Recording | None:
-    """Return the recording of a part; None if the part was not checked.
+    """Return the recording of a part; None if the part was not checked, whatever its length.
 
     Parameters
     ----------
@@ -86,9 +86,9 @@ def recording_of(
 
 
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
-    """Return the rows of a table that are samples, and which of these are lost.
+    """Return the rows of a table that are samples, and for each of these whether it is lost.
 
-    Raises UnreadableError for a word whose meaning is not stated.
+    Raises UnreadableError for a word whose meaning is not stated, or a column that is missing.
     """
     n = max(map(len, table.columns.values()), default=0)
     is_lost: Cells = np.zeros(n, dtype=bool)
@@ -106,7 +106,12 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
 
 
 def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> Floats:
-    """Return the samples of a channel in its unit, shape (n,)."""
+    """Return the samples of a channel in its unit, shape (n,).
+
+    They are converted from the unit in the file's row of units, or else in the column's name; a
+    unit in a name is passed over if it is of another quantity. Raises UnreadableError if one in the
+    row is, and for a cell that is no number.
+    """
     values = table.numbers(column, form)
     factor = 1.0
     with suppress(DataError):  # a name may have another quantity, as `U [V]` of a force
@@ -121,7 +126,10 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 
 
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
-    """Return the label of a part; UnreadableError if there is none, or two sources disagree."""
+    """Return the label of a part, 1 or 0; None if it was not checked.
+
+    Raises UnreadableError if there is no label, or the sources do not agree.
+    """
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
         if other != label:
@@ -153,6 +161,8 @@ def read_recordings(
     ------
     DataError
         If a key is still open, no file is found, a listing cannot be read, or no recording is left.
+    SettingError
+        If `windows.trigger` is malformed.
     """
     check_description(description)
     notes: list[str] = []
@@ -192,7 +202,11 @@ def read_recordings(
 def files_of(
     source: Any, description: Description, notes: list[str], faults: list[Fault]
 ) -> tuple[str, Path, Sequence[tuple[Path | Table, str]]]:
-    """Return the name of a data set, its folder, and its files or its table, each with a name."""
+    """Return the name of a data set, its folder, and its files or its table, each with a name.
+
+    A bag is read as one table here, which adds to `notes` and `faults`. Raises DataError if there
+    is no file, or as `read_bag`.
+    """
     if not isinstance(source, Path):
         return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
     is_folder = source.is_dir()
@@ -208,7 +222,10 @@ def files_of(
 def parts_of(
     file: Path | Table, name: str, description: Description, base: Path
 ) -> Iterator[Table]:
-    """Yield the tables of the parts in a file or a table."""
+    """Yield the tables of the parts in a file or a table, cut as `[windows]` says, if it does.
+
+    Raises UnreadableError if the file cannot be read, and DataError if it cannot be split or cut.
+    """
     table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
     for part in split(table, description):
         if description.windows.trigger or description.windows.listing:
@@ -218,7 +235,11 @@ def parts_of(
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
-    """Return the data set of recordings in their order."""
+    """Return the data set of recordings in their order.
+
+    It counts as not ordered if the label changes only once. Recordings that were resampled at the
+    rate of their clock have the fit `strict`.
+    """
     labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
         for key in ("label", "part", "source", "length")

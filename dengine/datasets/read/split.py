@@ -23,7 +23,8 @@ OBJECTS = ("json", "jsonl", "ts")
 def table_of(content: bytes, name: str, description: Description) -> Table:
     """Return the table of a file.
 
-    Raises UnreadableError or DataError if it is no file of the described format.
+    Raises UnreadableError or DataError if it is no file of the described format, and of a text
+    SettingError if `windows.trigger` is malformed.
     """
     kind, form = description.format, description.text
     if kind == "ts":
@@ -38,7 +39,10 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 
 
 def column_kind(description: Description) -> Kind:
-    """Return the function that tells the kind of a column by its name; see `read_text`."""
+    """Return the function that tells the kind of a column by its name; see `read_text`.
+
+    Raises SettingError if `windows.trigger` is malformed.
+    """
     clock = zip(description.time.column, description.time.format, strict=False)
     dated = {name for name, form in clock if is_dated(form)}
     order = {description.order} - {"name", "time"}
@@ -57,7 +61,10 @@ def column_kind(description: Description) -> Kind:
 
 
 def signals_of(description: Description) -> Sequence[str]:
-    """Return the signals of the trigger that cuts a long recording."""
+    """Return the signals of the trigger that cuts a long recording; none without a trigger.
+
+    Raises SettingError for a malformed trigger.
+    """
     trigger = description.windows.trigger
     return as_trigger(trigger).signals if trigger else ()
 
@@ -73,12 +80,15 @@ def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
 
 
 def split(table: Table, description: Description) -> Iterator[Table]:
-    """Yield the table of each part of a file.
+    """Yield the table of each part of a file, by the layout of the description.
 
-    `long`: the rows of a part must stand together, unless they are sorted by time. `wide`, and each
-    object of JSON: the cells of the columns that a channel's pattern matches, in the order of their
-    numbers, are its samples, or the list in its cell. `columns`: so is each column. Cells that are
-    empty at the end are no samples. A part that cannot be told from others has `damage`.
+    `long`: a part is the rows with one word in its columns; they must stand together, unless they
+    are sorted by time. `columns`: each column that the channel's pattern matches is a part. `wide`,
+    `npz`, and the formats json, jsonl and ts: each row is a part, whose samples are the list in a
+    cell, or the cells of the columns that the channel's pattern matches, in the order of their
+    numbers. Else the file is one part. Cells that are empty at the end are no samples. A part that
+    cannot be told from others, or has a damaged row, has `damage`. Raises DataError if `long` has
+    no column of parts.
     """
     if description.layout == "long":
         yield from _split_rows(table, description)
@@ -93,7 +103,8 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
     """Yield the rows of each part, by the words in its columns.
 
-    A part has damage if a row of another number of cells stands within it or beside it.
+    A part has damage if a row of another number of cells stands within it or beside it, or if rows
+    of others stand between its own. Raises DataError if the columns are not stated or not there.
     """
     import pandas as pd
 
@@ -120,7 +131,7 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
-    """Yield each row."""
+    """Yield each row as a part, with samples from numbered columns or from lists in its cells."""
     groups = {key: _numbered(key, table) for key in description.channels if ANY in key}
     groups = {key: names for key, names in groups.items() if names}
     curves = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
@@ -133,9 +144,10 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _row_of(table: Table, i: int) -> Table:
-    """Return the part in a row, with the columns that its cells hold; it may have damage.
+    """Return the part in a row, with the columns that its cells hold.
 
-    Columns of another number of rows hold for all parts.
+    Columns of another number of rows hold for all parts. It has damage if the row had another
+    number of cells, or items in a cell are of several forms.
     """
     n = len(table.lines)
     line = table.lines[i]
@@ -150,12 +162,12 @@ def _row_of(table: Table, i: int) -> Table:
 
 
 def _numbered(key: str, table: Table) -> list[str]:
-    """Return the columns of a table that a channel's pattern matches, by their numbers."""
+    """Return the columns that a channel's pattern matches with numbers for `*`, by the numbers."""
     return sorted(filter(pattern_of(key, DIGITS).fullmatch, table.columns), key=natural_key)
 
 
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
-    """Yield each column that the channel's pattern matches, with the clock beside it."""
+    """Yield each column that the first channel's pattern matches, with the clock beside it."""
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}
     beside = {key: cells for key, cells in table.columns.items() if key in shared}

@@ -73,7 +73,8 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
 def to_utf8(content: bytes, encoding: str) -> bytes:
     """Return a text in UTF-8 with plain line ends, without a mark at its beginning.
 
-    Raises UnreadableError, with the line, if it is not in its encoding, or has a zero byte.
+    Raises UnreadableError, with the line, if it is not in its encoding, or has a zero byte;
+    LookupError for an encoding that Python does not know.
     """
     is_utf8 = codecs.lookup(encoding).name == "utf-8"
     try:
@@ -108,7 +109,10 @@ def header_names(cells: Sequence[str]) -> list[str]:
 
 
 def _header_line(content: bytes, header: int | str) -> int:
-    """Return the line of the header: the one that is stated, or that begins with a text."""
+    """Return the line of the header, from 1: the one that is stated, or that begins with a text.
+
+    Raises UnreadableError if no line begins so.
+    """
     if isinstance(header, int):
         return header
     for i, line in enumerate(io.BytesIO(content), 1):
@@ -118,7 +122,10 @@ def _header_line(content: bytes, header: int | str) -> int:
 
 
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
-    """Return the names of the columns: as stated, or those of the header among the lines on top."""
+    """Return the names of the columns: as stated, or those of the header among the lines on top.
+
+    Raises UnreadableError if there is neither.
+    """
     names = [*form.names]
     if names and names[-1].endswith(REST):
         rest = names.pop()[: -len(REST)]
@@ -169,7 +176,11 @@ def _read_plain(
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
-    """Return the table with the cells of a text, without lines that are empty or dropped."""
+    """Return the table with the cells of a text, without lines that are empty or dropped.
+
+    A line of another number of cells is damage, and its row has empty cells. Raises UnreadableError
+    if all lines are.
+    """
     n = len(table.columns)
     rows = dict[int, list[str]]()
     damage = list[UnreadableError]()

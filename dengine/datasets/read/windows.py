@@ -23,8 +23,10 @@ Windows = Iterator[tuple[str, slice, str]]  # the key of a part, its rows, and w
 def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the table of each part of a recording.
 
-    That of a part that begins in a gap, or whose window has no samples, has `damage`. Raises
-    DataError if a key is missing, or no part is found.
+    That of a part that begins in a gap, or whose window has no samples, overlaps the one before or
+    goes beyond the recording, has `damage`. A topic of labels has the first word from the start of
+    a part up to the next part. Raises DataError if a key is missing, no part is found, or the
+    listing or the times cannot be read.
     """
     name = table.source
     if not description.time.column:
@@ -46,7 +48,11 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
 
 
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
-    """Yield the number, the rows and the fault of each part that a trigger begins."""
+    """Yield the number, the rows and the fault of each part that a trigger begins.
+
+    The parts are numbered from 1, and have the samples that `[traces]` states; a start within the
+    part before is passed over. Raises DataError without a rate.
+    """
     samples = description.traces.samples
     rate = description.time.rate_hz
     if not rate:
@@ -66,7 +72,11 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
 
 
 def _listed(table: Table, times: Floats, description: Description, base: Path) -> Windows:
-    """Yield the key, the rows and the fault of each window, in the order of their starts."""
+    """Yield the key, the rows and the fault of each window, in the order of their starts.
+
+    Times below 1e8 s count from the start of the recording if its own are dates. A window without
+    samples has the first row. Raises DataError if the listing cannot be read.
+    """
     about = description.windows
     form = description.text
     clock = Clock(zone=description.time.zone)
