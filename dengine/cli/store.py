@@ -182,7 +182,7 @@ def rollback(version: int, **changing: Any) -> None:
 @verb("dengine release engine.db")
 @store_options
 def release(**changing: Any) -> None:
-    """Let retrains replace a version again that `dengine rollback` pinned.
+    """Let retrains replace the version that `rollback` pinned.
 
     If none is pinned, nothing changes. The verb is refused while an engine runs on the cell.
     """

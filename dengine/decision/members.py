@@ -284,10 +284,12 @@ class MemberEvidence(nn.Module):
         known, every part counts as checked. Elsewhere `inclusion_probability`, with which the
         outcome would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0
         only the drift detectors see it. A wrong outcome may raise an alarm, which starts the safe
-        mode: every part is verified. A safe mode ends only here. After an alarm of a side
-        (accepting or rejecting) it ends when that side has a threshold again that is not `CLOSED`;
-        after too many novel traces (unlike all references), when they are few again and either side
-        has such a threshold.
+        mode: both sides (accepting, rejecting) are closed, so every part is verified until one has
+        a threshold again that is not `CLOSED`.
+
+        A safe mode ends only here: after an alarm of a side when that side has such a threshold
+        (the other side may have one before, and then decides again); after too many novel traces
+        (unlike all references), when they are few again and either side has one.
         """
         side = Detector.ACCEPTED_PARTS.value
         self.count_outcome(side, lower, not success, predicted, inclusion_probability)

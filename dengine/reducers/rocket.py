@@ -546,9 +546,11 @@ class RocketReducer(Reducer):
     def _compute_components(self, raw: Tensor) -> None:
         """Set feature scales, principal components and second axis anew from raw features (n, P).
 
-        At most about 1000 rows, evenly spaced, are read. The heads in `towers_` become the nearest
-        ones on the new components; those of the products begin at 0, since they are products of
-        other components now. The heads in `net_` are not written.
+        At most about 1000 rows, evenly spaced, are read; `n_component_traces_` becomes n. The heads
+        in `towers_` (a `Tower` for each group of features, the last for products of components)
+        become the nearest ones on the new components; those of the products begin at 0, since they
+        are products of other components now. Scales, leading components and second axis are written
+        to `net_` at once, the heads not: call `_set_heads` before `net_` is used.
         """
         net = self.net_
         encoder = net.encoder

@@ -399,12 +399,11 @@ class HttpApi:
     async def course(
         self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0, batch: Batch = ""
     ) -> Json:
-        """Return counts of the decisions in stretches, oldest first, and the retrains and safe
-        modes meanwhile.
+        """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
-        A stretch is a shift, a batch, or without these a share of the decisions, 20 or more, the
-        newest perhaps fewer. The newest 120 stretches are returned. 422: hours below one second,
-        unless 0.
+        A stretch is a shift, a batch (`batch` goes before `hours`), or without these a share of the
+        decisions, 20 or more, the newest perhaps fewer. The newest 120 stretches are returned; the
+        cell's retrains and safe modes may be older. 422: hours below one second, unless 0.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,

@@ -424,7 +424,9 @@ class CellService:
     def _enqueue(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
         """Put work into the queue for the engine's thread, and return a future of its result.
 
-        Raises BusyError if the service is closing or the queue is full, which is counted in `busy`.
+        `work` gets the engine, and whether the future was cancelled: it runs then, too, and its
+        result is dropped. After work that is `read_only` listeners are not notified. Raises
+        BusyError if the service is closing, or if the queue is full; the latter counts in `busy`.
         """
         job = Job(Future(), work, read_only)
         if self._closing or not self._thread.is_alive():

@@ -300,7 +300,7 @@ class LabelTable(CellTable):
         return outcomes
 
     def unreported_total(self, since_version: int = 0) -> int:
-        """Return how many accepted parts went on without a report, as the cell's labels count them.
+        """Return how many accepted parts before the newest label went on without a report.
 
         Parameters
         ----------
@@ -310,7 +310,8 @@ class LabelTable(CellTable):
         Returns
         -------
         int
-            The sum of `silent`; labels of quarantined traces are left out.
+            The sum of `silent`, the number of such parts that each of the cell's labels keeps since
+            the label before it; labels of quarantined traces are left out.
         """
         return int(
             self._read(

@@ -133,7 +133,8 @@ class DecisionGroup:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
         "overdue": a check was asked for, has brought no label, and so many decisions followed that
-        it is too late. "none": no label, for another reason, or of a quarantined trace.
+        it is too late. "none": there is no label and that is not overdue, as it never is for a
+        quarantined trace.
         """
         if self.source is not None:
             if self.success is None:

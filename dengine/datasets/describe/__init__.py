@@ -213,8 +213,10 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 def propose_tables(p: Proposal, files: Tables) -> None:
     """Find the layout, and the role of each column, and set their keys in `p`.
 
-    If the layout, or the column that tells the parts apart, is `?`, the roles stay open, with a
-    note. Raises DataError if there is no table, no part in them, or no samples.
+    Of each file at most `MOST_ROWS` rows are read; `p.is_cut` says so. `p.tables` becomes the
+    recordings, and `p.names` is emptied unless each file is one. If the layout, or the column that
+    tells the parts apart, is `?`, the roles stay open, with a note, and tables and names as they
+    were. Raises DataError if there is no table, no part in them, or no samples.
     """
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")

@@ -65,12 +65,12 @@ Words = Mapping[str, str]  # by recording
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
-    """Return a source with the meanings of its words; those that are stated stay.
+    """Return a source with its words' meanings, good, bad and unchecked; stated ones stay.
 
-    If the meaning of any word is not known, `good` and `bad` are `?` where they would be empty.
-    Plain verdicts mean the same everywhere, but in a path each is one only if some part is good and
-    some bad: `pass_1.csv` may be anything. In a column of only true, yes or 1 and their opposites
-    they mean what its name says: good for `success`, bad for `failed`.
+    Words of known meaning, whatever their case, fill the others. `good` and `bad` are `?` where
+    they would be empty if the meaning of any word is not known, and in a path if either is empty:
+    `pass_1.csv` alone may be anything. In a column of only true, yes or 1 and their opposites (and
+    words for unchecked) they mean what its name says: good for `success`, bad for `failed`.
     """
     words = sorted({*words})
     verdicts = (*_verdicts(source, {word.lower() for word in words}), UNCHECKED)

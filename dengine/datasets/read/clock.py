@@ -97,9 +97,10 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
-    """Return the times of a column of dates, or times of day; UnreadableError if one is neither.
+    """Return the seconds of each row since the first, and the first, of dates or times of day.
 
-    The first time counts from 1970, of times of day from midnight.
+    The first counts from 1970 (UTC), of times of day from midnight. Dates without a time zone are
+    in `clock.zone`, or else UTC. Raises UnreadableError if a cell is neither.
     """
     import pandas as pd
 

@@ -50,8 +50,9 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
     """Yield the number, the rows and the fault of each part that a trigger begins.
 
-    The parts are numbered from 1, and have the samples that `[traces]` states; a start within the
-    part before is passed over. Raises DataError without a rate.
+    The parts are numbered from 1, and have the samples that `[traces]` states; the rows of the last
+    may go beyond the table, which is no fault here. One that begins in a gap has a fault. A start
+    within the part before is passed over. Raises DataError without a rate.
     """
     samples = description.traces.samples
     rate = description.time.rate_hz
