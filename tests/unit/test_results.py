@@ -1,5 +1,7 @@
 """Figures that pages repeat from the results are those of docs/results."""
 
+import hashlib
+import json
 from pathlib import Path
 
 import pandas as pd
@@ -48,3 +50,12 @@ def test_the_table_of_streams_that_change_has_the_figures_of_the_results(
             f"{mean['rejected']:.0f}",
             f"{mean['false_negative']:.1f}",
         ]
+
+
+def test_each_published_file_of_the_evidence_is_the_one_that_its_manifest_names(repo: Path) -> None:
+    manifest = json.loads((repo / "docs" / "results" / "manifest.json").read_text("utf-8"))
+    assert manifest["parts"]
+    for name, part in manifest["parts"].items():
+        for file, digest in part["files"].items():
+            content = (repo / file).read_bytes()
+            assert hashlib.sha256(content).hexdigest() == digest, f"{file} is not of {name}"
