@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from dengine import DataEngine
+from tests.slow.faults.__main__ import MUTATIONS
 from tests.support.faults import read_faults
 
 REPO = Path(__file__).resolve().parents[2]
@@ -125,6 +126,8 @@ def test_no_module_is_imported_by_a_string() -> None:
 
 def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there() -> None:
     assert len(read_faults([])) == 64
+    for name, file, before, *_ in MUTATIONS:
+        assert (REPO / file).read_text("utf-8").count(before) == 1, f"{name}: {before!r} in {file}"
 
 
 def test_tests_go_through_public_faces() -> None:
