@@ -6,19 +6,16 @@ history and the export use these helpers.
 
 import threading
 import warnings
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ..errors import StoreError
+from ..records import Arrays, State
 from .code import remember_code
 
-State = dict[str, NDArray[Any]]
-Arrays = Mapping[str, NDArray[Any]]
 _SCRIPTING = threading.Lock()
 # Attributes in which torch keeps parameters, submodules and hooks; scripting adds the last.
 INTERNAL = {*vars(nn.Module()), "__overloads__"} - {"training"}

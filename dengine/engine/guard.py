@@ -5,11 +5,11 @@ Predictions and trainings catch their exceptions where a failure is recorded: a 
 `decide`, a training in `trainer`, a new version in `candidate`.
 """
 
-import logging
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-log = logging.getLogger("dengine")
+from ..errors import log
+
 P = ParamSpec("P")
 T = TypeVar("T")
 

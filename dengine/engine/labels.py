@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..model.base import EngineModel
-from ..records import TraceArray
-from ..reducers.base import State
+from ..records import State, TraceArray
 from ..store.records import NewLabel, StoredDecision
 from .guard import NO_REFERENCE, guarded
 from .live_model import LiveModel

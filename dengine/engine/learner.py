@@ -9,7 +9,6 @@ product made; none of them knows the learner.
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,7 +21,7 @@ from typing import Any
 import torch
 
 from ..decision.policy import Policy
-from ..errors import StoreError
+from ..errors import StoreError, log
 from ..model.base import EngineModel
 from ..records import RetrainReport
 from ..store.outbox import Outbox
@@ -37,7 +36,6 @@ from .resume import add_labels_since, find_clean_start, refit
 from .settings import EvidenceWindow
 from .trainer import Clock, Retrainer, Trained, TrainedOn, TrainingWindow
 
-log = logging.getLogger("dengine")
 # So many labels without any retrain were imported, and the first training is worth preparing.
 IMPORTED = 500
 PATIENCE = 20  # steps that a candidate leaves to the thread that stores its labels

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..model.base import EngineModel
-from ..records import ACTIONS, Decision, Reason
-from ..reducers.base import State
+from ..records import ACTIONS, Decision, Reason, State
 from ..store.outbox import Outbox
 from ..store.records import (
     ModelVersion,

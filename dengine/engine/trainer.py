@@ -6,7 +6,6 @@ The retrainer trains a successor of the present model, on a snapshot of the wind
 training or of the executor stops the cell.
 """
 
-import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -19,13 +18,12 @@ import torch
 from numpy.typing import NDArray
 
 from ..decision.scripting import reason_of
-from ..errors import DengineError, SettingError
+from ..errors import DengineError, SettingError, log
 from ..model.base import EngineModel
 from ..records import TRAINED, TraceArray
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
 
-log = logging.getLogger("dengine")
 HUNG = 60.0  # seconds after which a training in the executor is given up
 # Share of the budget after which no step begins. It is smaller, down to the second, where the work
 # after the steps takes longer. A model that lacks a few steps decides a little less often.

@@ -24,8 +24,8 @@ from ..decision.policy import Policy
 from ..errors import SettingError, shortened
 from ..limits import ForceLimits
 from ..recipe import Recipe
-from ..records import ACTIONS, REASONS, Action, Reason, TraceSpec
-from ..reducers.base import Arrays, FitReport, Floats, Ints, State, StopRule
+from ..records import ACTIONS, REASONS, Action, Arrays, Reason, State, TraceSpec
+from ..reducers.base import FitReport, Floats, Ints, StopRule
 from ..traces import clip_extremes
 
 Embedding = tuple[tuple[float, ...], ...]  # (K, d)

@@ -13,7 +13,6 @@ compiles to TorchScript. Compiled deciders are copied from templates, because sc
 """
 
 import copy
-import logging
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -46,19 +45,17 @@ from ..decision.scripting import (
     restore,
     script,
 )
-from ..errors import ExportError, StoreError, expect, listed
+from ..errors import ExportError, StoreError, expect, listed, log
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, describe_estimator
-from ..records import ACTIONS, REASONS, REPEATS, Reason, TraceSpec, as_success
+from ..records import ACTIONS, REASONS, REPEATS, Arrays, Reason, State, TraceSpec, as_success
 from ..reducers import class_default, make_reducer
 from ..reducers.base import (
     SAME_POINTS,
-    Arrays,
     FitReport,
     Floats,
     Ints,
     Reducer,
-    State,
     StopRule,
     as_reducer,
     space_scale,
@@ -74,7 +71,6 @@ from .base import (
     Prediction,
 )
 
-log = logging.getLogger("dengine")
 NEWEST = 500  # traces that are searched for repeats: the work does not grow
 NEIGHBOURS = 10
 # A nearest neighbour within this share of the distance to the tenth one is a near repeat; of

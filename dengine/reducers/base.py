@@ -17,7 +17,7 @@ fold k. A reducer that uses no labels has one space.
 
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -36,14 +36,13 @@ from sklearn.utils.validation import (
 from ..decision.classifier import classes_of
 from ..errors import SettingError, TraceError, expect
 from ..folds import content_fold
+from ..records import Arrays, State
 
 if TYPE_CHECKING:
     from torch import nn
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
-State = dict[str, NDArray[Any]]
-Arrays = Mapping[str, NDArray[Any]]  # of a state that is read
 OUTLIER_DISTANCE = 50.0  # times the median distance from the median point
 OUTLIER_SHARE = 0.05  # more points than this share are not outliers
 SMALLEST = 1e-12  # that the largest sample must reach

@@ -32,7 +32,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F  # noqa: N812  # PyTorch's own documentation calls it so
 
 from ..decision.scripting import arrays_with_prefix, incompatible_model_error
-from .base import Arrays, Floats, Ints, State, StopRule
+from ..records import Arrays, State
+from .base import Floats, Ints, StopRule
 from .encoder import Encoder, FoldableSequential, NetworkFactory
 from .rocket import FeatureEmbedding, RocketReducer
 from .torch_reducer import TorchReducer

@@ -13,7 +13,8 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor, nn
 
 from ..errors import SettingError
-from .base import Arrays, Floats, Reducer, State, as_rows
+from ..records import Arrays, State
+from .base import Floats, Reducer, as_rows
 
 
 @dataclass(eq=False, repr=False, kw_only=True)

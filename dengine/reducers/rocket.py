@@ -39,14 +39,12 @@ from torch import Tensor, nn
 
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import expect
-from ..records import is_whole
+from ..records import Arrays, State, is_whole
 from .base import (
-    Arrays,
     FitReport,
     Floats,
     Ints,
     Reducer,
-    State,
     StopRule,
     binary_labels,
     check_classes,

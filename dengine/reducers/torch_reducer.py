@@ -20,7 +20,6 @@ al. (2018), Double/debiased machine learning, Econometrics Journal 21: cross-fit
 """
 
 import copy
-import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, lru_cache
@@ -44,16 +43,14 @@ from ..decision.scripting import (
     restore,
     script,
 )
-from ..errors import SettingError, expect
-from ..records import is_number, is_whole
+from ..errors import SettingError, expect, log
+from ..records import Arrays, State, is_number, is_whole
 from .base import (
     SAME_POINTS,
-    Arrays,
     FitReport,
     Floats,
     Ints,
     Reducer,
-    State,
     StopRule,
     binary_labels,
     draw_seed,
@@ -62,8 +59,6 @@ from .base import (
 from .checkpoints import load_checkpoint
 from .encoder import Encoder, Members, NetworkFactory, fold_batch_norms
 from .preprocessing import Preprocessor, averaging
-
-log = logging.getLogger("dengine")
 
 MIN_TRACES = 20  # of the first training
 CHUNK = 64  # traces that are embedded at once: what they need stays in the cache

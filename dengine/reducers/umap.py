@@ -36,8 +36,8 @@ from torch import Tensor, nn
 
 from ..decision.scripting import arrays_with_prefix, module_state, restore
 from ..errors import SettingError, expect
-from ..records import is_number, is_whole
-from .base import Arrays, FitReport, Floats, Ints, Reducer, State, StopRule, as_points, draw_seed
+from ..records import Arrays, State, is_number, is_whole
+from .base import FitReport, Floats, Ints, Reducer, StopRule, as_points, draw_seed
 from .umap_graph import (
     CHUNK,
     Frames,
