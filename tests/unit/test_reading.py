@@ -644,3 +644,10 @@ def test_a_description_comes_back_from_its_toml(description: Description) -> Non
     assert (
         "?" in description.channels or Description.from_toml(description.to_toml()) == description
     )
+
+
+def test_two_marks_that_both_stand_twice_in_a_number_are_a_question(tmp_path: Path) -> None:
+    rows = "".join(f"1.{i:03d}.000;1,{i:03d},000\n" for i in range(100, 140))
+    for name in ("1_OK.csv", "2_NOK.csv"):
+        (tmp_path / name).write_text(f"force;path\n{rows}", encoding="utf-8")
+    assert "text.decimal" in describe(tmp_path).open_keys

@@ -211,12 +211,17 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     proofs = {mark: len([*filter(DECIMAL[mark].fullmatch, seen[mark])]) for mark in ".,"}
     groups = re.findall(rf"\d([{GROUPS}])\d{{3}}", "\n".join(cells))
     group = groups[0] if groups else ""
-    for mark, other in (".,", ",."):
-        repeats = any(cell.count(other) > 1 for cell in seen[other])
-        if proofs[mark] > 20 * proofs[other] or (repeats and not proofs[other]):
-            p.put("text.decimal", mark)
-            p.put("text.thousands", other if seen[other] else group)
-            return
+    repeats = {mark: any(cell.count(mark) > 1 for cell in seen[mark]) for mark in ".,"}
+    likely = [
+        (mark, other)
+        for mark, other in (".,", ",.")
+        if proofs[mark] > 20 * proofs[other] or (repeats[other] and not proofs[other])
+    ]
+    if len(likely) == 1:
+        mark, other = likely[0]
+        p.put("text.decimal", mark)
+        p.put("text.thousands", other if seen[other] else group)
+        return
     p.put("text.thousands", group)
     if example := min(seen["."] + seen[","], default=""):
         note = f"'.' or ','; {example} may be a fraction or a thousand"
