@@ -307,8 +307,6 @@ class RecipeChoice:
 
 
 # No option of a policy has a default here: the recipe, or the store, has it.
-
-
 POLICY = {
     "alpha": click.option(
         "--alpha",
@@ -715,6 +713,11 @@ allow_import_option = click.option(
         "Import your own reducer and rule, module:Class, that STORE names. Only for "
         "a store that you trust."
     ),
+)
+verify_all_option = click.option(
+    "--shadow",
+    is_flag=True,
+    help="Verify every part; what the model would have done is only recorded.",
 )
 force_option = click.option(
     "--force", is_flag=True, help="Replace files that exist; a store is never replaced."

@@ -96,11 +96,7 @@ class DrivenRun(NamedTuple):
 @options.recipe_options
 @options.new_seed_option
 @options.allow_import_option
-@click.option(
-    "--shadow",
-    is_flag=True,
-    help="Verify every part; what the model would have done is only recorded.",
-)
+@options.verify_all_option
 @explain_option
 @options.out_option
 def run(

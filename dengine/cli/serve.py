@@ -88,11 +88,7 @@ DEMO_DEADLINE = 5.0
     show_default=True,
     help="Largest request body, in bytes.",
 )
-@click.option(
-    "--shadow",
-    is_flag=True,
-    help="Verify every part; what the model would have done is only recorded.",
-)
+@options.verify_all_option
 @click.option(
     "--xmlrpc/--no-xmlrpc",
     default=True,

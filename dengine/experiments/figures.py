@@ -328,8 +328,8 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     highest = max(errors.get_ylim()[1], 1.5 * tolerances[0])
     finish(errors, ylim=(0, highest), ylabel="bad of accepted, good of\nrejected (dashed) [%]")
     errors.set(
-        xlabel=f"cycle ("
-        f"end of a window of {window}; a share of fewer than {FEWEST} parts is not drawn)"
+        xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not "
+        "drawn)"
     )
     figure.legend(handles=handles, loc="outside lower center", frameon=False, fontsize=SMALL)
     return figure

@@ -179,7 +179,7 @@ def read_tables(p: Proposal) -> list[Table]:
         propose_form(p, contents)
     files: list[Table] = []
     faults: list[Fault] = []
-    for name in filter({*p.names}.__contains__, contents):
+    for name in [name for name in p.names if name in contents]:
         with caught(faults, name):
             files.append(table_in(p, contents[name], name))
     if faults and not files:
