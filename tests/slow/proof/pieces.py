@@ -7,7 +7,6 @@ these and a hash of the source of dengine and of this folder: if the code change
 again.
 """
 
-import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,12 +20,13 @@ import dengine
 
 from .certificate import share_ever_wrong
 from .garbage import garbage
+from .keeping import PACKAGE, PROOF, digest_of, source_files
 from .replays import judge, spend
 
 Row = dict[str, Any]
 FinishedPiece = tuple["Piece", list[Row]]
 # Files and folders whose source does not influence a result.
-UNRELATED = {"__main__", "cli", "export", "store", "figures", "tables", "report"}
+UNRELATED = ("cli", "export", "store", "figures", "tables")
 N_STREAMS = 100  # of the certificate, for each seed
 N_STREAM_PARTS = 2000
 
@@ -86,17 +86,6 @@ class Piece:
         return ", ".join(str(getattr(value, "name", value)) for value in self.settings.values())
 
 
-def digest_of_source() -> str:
-    """Return the SHA-256 of every source file that influences a result."""
-    here = Path(__file__).parent
-    package = Path(dengine.__file__).parent
-    digest = hashlib.sha256()
-    for path in [*sorted(here.glob("*.py")), *sorted(package.rglob("*.py"))]:
-        if path.stem not in UNRELATED and path.parent.name not in UNRELATED:
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
 def run_piece(piece: Piece, source: str) -> list[Row]:
     """Return the rows of a piece, with its seed; they are kept under both arguments."""
     result = FUNCTIONS[piece.kind](seed=piece.seed, **piece.settings)
@@ -121,7 +110,7 @@ def finish(
         configuration.
     """
     run = Memory(out, verbose=0).cache(run_piece)
-    source = digest_of_source()
+    source = digest_of([*PROOF.glob("*.py"), *source_files(PACKAGE, UNRELATED)])
     begin = time.perf_counter()
     n_kept = sum(run.check_call_in_cache(piece, source) for piece in pieces)
     print_line(f"{n_kept} of {len(pieces)} pieces are there already.")

@@ -29,7 +29,7 @@ SECTIONS = {
         "Planted truths: what the cost guarantee spent",
         "At 5 for a check and 120 for a false accept. Account: the members' cost beyond their "
         "checks, in false accepts, at the worst moment of all replays at which a part passed; the "
-        "rule allows 1. Saved: by the accepted parts' true failure probabilities. Bound: what the "
+        "rule allows 2. Saved: by the accepted parts' true failure probabilities. Bound: what the "
         "certificate said of it at the end. Broke: it said more at any moment.",
     ),
     "noise": ("Labels of noise", "As above. Certain: decisions per 1503 cycles."),

@@ -5,10 +5,19 @@ interruption.
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from tests.slow.proof.null.__main__ import append, read_finished, summarize
-from tests.slow.proof.null.shuffles import FOLDS, LEAKS, N_TWICE, Shuffle, agreement, play
+from tests.slow.proof.keeping import play_kept
+from tests.slow.proof.null.__main__ import summarize
+from tests.slow.proof.null.shuffles import LEAKS, N_TWICE, Shuffle, play
+
+
+def log_call(path: str, number: int) -> int:
+    """Add a line to a file, and return the number."""
+    with Path(path).open("a", encoding="utf-8") as file:
+        file.write(f"{number}\n")
+    return number
 
 
 def test_no_label_of_a_fold_moves_what_is_counted_for_it() -> None:
@@ -38,29 +47,27 @@ def test_a_shuffle_has_near_repeats_with_the_fold_and_the_label_of_their_part() 
     assert 0.008 < shuffle.leaking.mean() < 0.02
 
 
-def test_z_is_standard_for_shuffled_labels_and_large_for_scores_that_saw_them() -> None:
-    rng = np.random.default_rng(0)
-    part = np.concatenate([np.arange(400), np.arange(100)])
-    folds = (part * 7919) % FOLDS
-    zs = []
-    for _ in range(400):
-        good = (rng.random(400) < 0.8)[part]
-        score = rng.normal(size=400)[part] + 0.1 * rng.normal(size=500)
-        zs.append(agreement(score, good, part, folds))
-    assert abs(np.mean(zs)) < 0.2
-    assert 0.85 < np.std(zs) < 1.15
-    assert agreement(score + good, good, part, folds) > 5.0
+def test_a_row_of_the_table_sums_the_shuffles_of_its_leak() -> None:
+    row = {"seed": 0, "leak": "", "labels": 100, "moved": 0, "traces": 0, "misplaced": 0}
+    row |= {"certain": 1}
+    rows = [row, row | {"seed": 1}, row | {"leak": "trained", "moved": 3}]
+    honest, trained = summarize(pd.DataFrame(rows)).to_dict("records")
+    assert (honest["leak"], honest["shuffles"], honest["found"], honest["labels"]) == (
+        "none",
+        2,
+        0,
+        200,
+    )
+    assert honest["certain of 1,000"] == 2.0
+    assert (trained["found"], trained["moved"]) == (1, 3)
 
 
-def test_what_is_finished_is_read_again(tmp_path: Path) -> None:
-    path = tmp_path / "shuffles.csv"
-    assert read_finished(path) == []
-    row = {"seed": 0, "leak": "", "labels": 100, "moved": 0, "traces": 0}
-    row |= {"misplaced": 0, "z": 0.5, "certain": 1}
-    rows = [row, row | {"seed": 1, "z": 1.5}, row | {"leak": "trained", "moved": 3}]
-    for finished in rows:
-        append(path, finished)
-    assert read_finished(path) == rows
-    honest = summarize(rows, "")
-    assert (honest["shuffles"], honest["found"], honest["z"]) == (2, 0, 1.0)
-    assert summarize(rows, "trained")["found"] == 1
+def test_finished_work_is_kept_and_other_source_is_played_anew(tmp_path: Path) -> None:
+    def played(source: str, n: int) -> list[str]:
+        calls = [(str(tmp_path / "log"), i) for i in range(n)]
+        list(play_kept(log_call, calls, source, tmp_path / "kept", 1))
+        return (tmp_path / "log").read_text().split()
+
+    assert played("a", 2) == ["0", "1"]
+    assert played("a", 3) == ["0", "1", "2"]
+    assert played("b", 1) == ["0", "1", "2", "0"]

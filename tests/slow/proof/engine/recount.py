@@ -462,6 +462,12 @@ class Recount:
             self.expect("certificate", f"bound to {verb}", round(group.upper, 8), round(upper, 8))
 
 
+def _padded(counts: Floats, length: int) -> list[int]:
+    """Return the counts of the one replay; where all outcomes are known, no part was audited: 0."""
+    values = counts[:, 0].astype(int).tolist()
+    return [*values, *[0] * (length - len(values))]
+
+
 class RuleReplay:
     """The rule of a cell, updated with the outcomes that were known at a moment.
 
@@ -514,13 +520,13 @@ class RuleReplay:
             threshold = evidence.thresholds[i].item()
             recount.expect("account", "threshold", threshold, float(side.threshold[0]))
             since = evidence.member_counts_since_alarm[i].flatten().tolist()
-            expected = side.members_since.n[:, 0].astype(int).tolist()
-            recount.expect("account", "members since an alarm", since[: len(expected)], expected)
+            expected = _padded(side.members_since.n, len(since))
+            recount.expect("account", "members since an alarm", since, expected)
             if rules.kind == "local":
                 continue
             members = evidence.member_counts[i].flatten().tolist()
-            expected = side.members.n[:, 0].astype(int).tolist()
-            recount.expect("account", "members", members[: len(expected)], expected)
+            expected = _padded(side.members.n, len(members))
+            recount.expect("account", "members", members, expected)
 
     def _update(self, at: Moment) -> None:
         """Update the rule to a moment; anew if outcomes were taken back or corrected meanwhile."""

@@ -6,16 +6,14 @@ Finished pieces are kept in --out, so that an interrupted run continues. Writes 
 row for each case, into the folder that --docs names, by default --out.
 """
 
-import argparse
-import hashlib
 import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from joblib import Memory, Parallel, delayed
 
+from ..keeping import digest_of, make_parser, play_kept, source_files, write_table
 from .implementation import ENDINGS
 from .replays import ALPHA, OUTCOMES, Case, play
 
@@ -115,44 +113,22 @@ def summarize(case: Case, pieces: list[dict[str, float]]) -> dict[str, Any]:
     return row
 
 
-def digest_of_source() -> str:
-    """Return the SHA-256 of this folder's source, without this file."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        if path.name != "__main__.py":
-            digest.update(path.read_bytes())
-    return digest.hexdigest()
-
-
-def play_piece(case: Case, n_replays: int, seed: int, source: str) -> dict[str, float]:
-    """Play one piece of a case; it is kept under all arguments."""
-    return play(case, n_replays, seed)
-
-
 def main() -> None:
     """Play what is not kept yet, write the table, print its conclusion."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=Path("out/rules"), help="finished pieces")
-    parser.add_argument("--docs", type=Path, help="folder for rules_proof.csv; by default --out")
+    parser = make_parser(__doc__, "out/rules", "finished pieces")
     parser.add_argument("--pieces", type=int, default=4, help=f"of {N_REPLAYS:,} replays, per row")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
     arguments = parser.parse_args()
     cases = list(all_cases())
     seeds = range(arguments.pieces)
-    run = Memory(arguments.out, verbose=0).cache(play_piece)
-    source = digest_of_source()
-    parallel = Parallel(n_jobs=arguments.jobs, return_as="generator", batch_size=1)
-    played = parallel(delayed(run)(case, N_REPLAYS, s, source) for case in cases for s in seeds)
+    source = digest_of(source_files(Path(__file__).parent))
+    calls = [(case, N_REPLAYS, seed) for case in cases for seed in seeds]
+    played = play_kept(play, calls, source, arguments.out, arguments.jobs)
     rows = []
     for case in cases:
         rows.append(summarize(case, [next(played) for _ in seeds]))
         print(f"[{len(rows)}/{len(cases)}]", *rows[-1].values(), flush=True)
     table = pd.DataFrame(rows)
-    docs = arguments.docs or arguments.out
-    docs.mkdir(parents=True, exist_ok=True)
-    table.to_csv(docs / "rules_proof.csv", index=False, float_format="%.4g")
+    write_table(table, arguments.docs or arguments.out, "rules_proof.csv", "%.4g")
     honest = table[(table["fault"] == "") & table["verdict"].notna()]
     certificates = table[table["fault"] == ""]
     print(f"{(honest['verdict'] == 'kept').sum()} of {len(honest)} promises kept;")
