@@ -3,12 +3,15 @@
     python training/list_figures.py             # how many figures each page has, and what is wrong
     python training/list_figures.py --all       # each figure with its source
 
-A figure is a number with a unit or a percent sign, or a number in a cell of a table. It is checked
-in one of three ways. `docs/results/index.md` is written again from its CSV files, so each of its
-lines must be there. In a table of another page that has files, a number must be a value in one of
-the rows that share a word with the first cell of its line; else it is wrong. In a sentence, a
-number must be one of `settings`, which are read from the package, or of `totals`, which are
-computed from the files. What is left is listed as "not checked". Exit code 1 if a checked figure is
+A figure is a number with a unit or a percent sign, or a number in a cell of a table.
+
+- `docs/results/index.md` is written again from its CSV files; each of its lines must be there.
+- A table of another page that has files is computed again: its lines must have the same numbers in
+  the same order. The table of `KEYED` alone joins rows of several streams: each of its numbers must
+  stand in a row whose name begins with a word of the line.
+- A sentence must have each of `totals`, which are computed from the files.
+
+What is left is a setting of the package, or listed as "not checked". Exit code 1 if anything is
 wrong, or if fewer than two thirds of all figures are checked.
 """
 
@@ -16,10 +19,12 @@ import argparse
 import re
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from evidence import read_replays
 from evidence_page import write_results
@@ -28,8 +33,6 @@ from dengine import Recipe
 from dengine.experiments.metrics import Costs
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-RESULTS = DOCS / "results"
-EXPLANATION = DOCS / "explanation"
 UNIT = (
     r"%|s|ms|min|minutes?|hours?|seconds?|MB|GB|kB|MiB|Hz|kHz|N|points?|parts|labels|replays|times|"
     r"retrains|cycles|streams|shuffles|kinds|faults"
@@ -39,6 +42,10 @@ FIGURE = re.compile(rf"({NUMBER})\s?({UNIT})(?!\w)")
 CELL = re.compile(rf"{NUMBER}(?![\w.]|-[A-Za-z])")
 LEAST_CHECKED = 2 / 3
 UNCHECKED = "not checked"
+RESULTS = "docs/results/index.md"
+PROOF = "docs/explanation/proof.md"
+KEYED = "| stream | `conv`: certain |"  # how the head of that table begins
+Tables = Mapping[str, Sequence[Sequence[float]]]  # beginning of a head -> the numbers of each line
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,7 @@ class Figure:
     Parameters
     ----------
     page, line : str, int
-        Where it stands.
+        Where it stands; line 0 if it is missing.
     text : str
         The number with its unit.
     source : str
@@ -62,6 +69,81 @@ class Figure:
     source: str
 
 
+def read(name: str) -> pd.DataFrame:
+    """Read a CSV file of the documentation."""
+    return pd.read_csv(DOCS / name)
+
+
+def mean_replays(n_shuffles: int) -> pd.DataFrame:
+    """Return the means of each method on insertion at (0.1, 90 %), as in the README."""
+    replays = read_replays(DOCS / "results/replays.csv")
+    settings = "set == 'insertion' and interval == 'wilson' and alpha == 0.1 and lower_bound == 0.9"
+    chosen = replays.query(settings).query(f"seed < {100 + n_shuffles}")
+    return chosen.groupby("recipe")[["certain", "accepted", "false_positive"]].mean()
+
+
+def tables_of_readme() -> Tables:
+    """Return the numbers of the table of reducers."""
+    means = mean_replays(30).loc[["conv", "rocket", "umap", "umap-learn", "pca"]]
+    return {"| reducer |": means[["certain", "false_positive"]].to_numpy().tolist()}
+
+
+def tables_of_faults() -> Tables:
+    """Return the counts of the faults by store and by what failed."""
+    faults = read("explanation/faults.csv")
+    is_kill = faults["fault"].str.startswith("SIGKILL")
+    groups = faults.groupby(["store", is_kill], sort=False)
+    table = groups[["times", "labels", "lost", "wrong", "raised"]].sum()
+    table.insert(0, "kinds", groups.size())
+    return {"| store | what fails |": table.to_numpy().tolist()}
+
+
+def tables_of_proof() -> Tables:
+    """Return the numbers of the tables about rules, safe modes, histories and shuffles."""
+    rules = read("explanation/rules_proof.csv")
+    rules = rules[rules["fault"].isna()]
+    endings = rules[rules["parts"] == 1500].set_index(["rule", "safe mode ends by", "stream"])
+    endings = endings.sort_index()
+    rules = rules[rules["parts"] == 600]
+    columns = ["accepted", "a perfect bet", "broke", "account above 2"]
+
+    def streams_of(rule: str, audited: Sequence[str]) -> list[list[float]]:
+        of_rule = rules[rules["rule"] == rule].set_index("stream")
+        known = of_rule[of_rule["outcomes"] == "all"]
+        parts = of_rule[of_rule["outcomes"] == "audited, late, missing"].loc[known.index]
+        both = pd.concat([known[columns[:3]], parts[list(audited)]], axis=1).to_numpy()
+        return [[value for value in row if not np.isnan(value)] for row in both]
+
+    ends = []
+    for rule, ending in (
+        ("local", "likelihood"), ("local", "bet"), ("local", "account"),
+        ("cost", "account"), ("cost", "bet"), ("pooled", "bet"),
+    ):  # fmt: skip
+        of_ending = endings.loc[rule, ending]
+        long = of_ending["parts of a safe mode"]
+        more = of_ending["replays with more than 300"]["at the tolerance"]
+        accepted = of_ending["accepted"]["doubling"]
+        ends.append([long["constant, good"], long["at the tolerance"], more, accepted])
+    engine = read("explanation/engine_proof.csv")
+    engine["taken back"] = engine["corrected"] + engine["forgotten"]
+    engine["opened again"] = engine["restarts"] + engine["killed"]
+    shown = [
+        "histories", "decisions", "accepted", "late reports", "taken back", "versions",
+        "opened again", "comparisons", "faults",
+    ]  # fmt: skip
+    null = read("explanation/null_proof.csv")
+    in_null = ["shuffles", "found", "moved", "labels", "certain of 1,000"]
+    head = "| stream | all: accepted | best | broke | audited: accepted | best | broke |"
+    return {
+        f"{head}\n": streams_of("pooled", columns[:3]),
+        f"{head} above two": streams_of("cost", columns),
+        "| rule, and what ends safe mode |": ends,
+        "| histories of |": engine[shown].to_numpy().tolist(),
+        "| leak |": null[in_null].to_numpy().tolist(),
+    }
+
+
+@cache
 def settings() -> dict[str, str]:
     """Return figures that are no measurements, each with the name under which it is set."""
     recipe = Recipe()
@@ -75,177 +157,147 @@ def settings() -> dict[str, str]:
         "500 Hz": "the bundled set",
         "1,503 parts": "the bundled set",
         "1,503 labels": "the bundled set",
-        **{f"{level} %": "a level of LB or alpha" for level in (5, 10, 80, 90, 95)},
     }
 
 
-def totals() -> dict[str, dict[str, str]]:
-    """Return figures that stand in sentences, by page: each with the file that it comes from."""
-    soak = pd.read_csv(RESULTS / "soak_totals.csv").iloc[0]
-    course = pd.read_csv(RESULTS / "soak.csv")
-    full = course[course["cycle"] >= 36_000]
-    rules = pd.read_csv(EXPLANATION / "rules_proof.csv")
-    replays = read_replays(RESULTS / "replays.csv")
-    # The variants of conv have ten shuffles.
-    means = mean_replays(replays[replays["seed"] < 110]).set_index("recipe")
+def totals_of_readme() -> dict[str, str]:
+    """Return the figures of the README's sentences: each with the file that it comes from."""
+    means = mean_replays(10)  # so many shuffles have the variants of conv
     bad = 100 * means["false_positive"] / means["accepted"]
     known = "conv, every stop known"
-    planted = rules[rules["fault"] != ""]["broke"].dropna()
-    megabytes = {name: full[f"{name}_bytes"] / 1e6 for name in ("server", "trainer")}
-    source = "soak.csv"
-    return {
-        "README.md": {
-            f"{means['certain'][known]:,.0f} parts": "replays.csv",
-            f"{bad[known]:.1f} %": "replays.csv",
-            f"{bad['conv']:.1f} %": "replays.csv",
-        },
-        "docs/explanation/speed.md": {
-            f"{course['cycle'].max():,} parts": source,
-            f"{soak['acknowledged']:,.0f} labels": "soak_totals.csv",
-            f"{soak['retrains']:,.0f} retrains": "soak_totals.csv",
-            f"{soak['retrain_worst_s']:.3f} s": "soak_totals.csv",
-            f"{course['decide_worst_s'].max():.2f} s": source,
-            f"{course['page_worst_s'].max():.2f} s": source,
-            **{f"{values.max():.0f} MB": source for values in megabytes.values()},
-        },
-        "docs/explanation/proof.md": {
-            **{f"{100 * broke:.0f} %": "rules_proof.csv" for broke in planted},
-            "10,000 replays": "rules_proof.csv",
-        },
-    }
+    texts = (f"{means['certain'][known]:,.0f} parts", f"{bad[known]:.1f} %", f"{bad['conv']:.1f} %")
+    return dict.fromkeys(texts, "replays.csv")
 
 
-def mean_replays(replays: pd.DataFrame) -> pd.DataFrame:
-    """Return the means of each method on insertion at (0.1, 90 %), as in the README."""
-    settings = "set == 'insertion' and interval == 'wilson' and alpha == 0.1 and lower_bound == 0.9"
-    columns = ["certain", "accepted", "false_positive"]
-    return replays.query(settings).groupby("recipe", as_index=False)[columns].mean()
+def totals_of_proof() -> dict[str, str]:
+    """Return the figures of sentences about the rules."""
+    planted = read("explanation/rules_proof.csv").dropna(subset=["fault"])
+    return {f"{100 * broke:.0f} %": "rules_proof.csv" for broke in planted["broke"]}
 
 
-def sum_faults() -> pd.DataFrame:
-    """Return the counts of faults by store and by what failed, as on the page about faults."""
-    faults = pd.read_csv(EXPLANATION / "faults.csv")
-    faults["fails"] = (
-        faults["fault"].str.startswith("SIGKILL").map({True: "sigkill", False: "other"})
+def totals_of_speed() -> dict[str, str]:
+    """Return the figures of the paragraph about a long run."""
+    totals = read("results/soak_totals.csv").iloc[0]
+    course = read("results/soak.csv")
+    full = course[course["cycle"] >= 36_000]
+    texts = (
+        f"{course['cycle'].max():,} parts",
+        f"{totals['retrains']:,.0f} retrains",
+        f"{totals['retrain_worst_s']:.3f} s",
+        f"{course['decide_worst_s'].max():.2f} s",
+        f"{course['page_worst_s'].max():.2f} s",
+        f"{full['server_bytes'].max() / 1e6:.0f} MB",
+        f"{full['trainer_bytes'].max() / 1e6:.0f} MB",
     )
-    counts = {name: (name, "sum") for name in ("times", "labels", "lost", "wrong", "raised")}
-    groups = faults.groupby(["store", "fails"], as_index=False)
-    return groups.agg(kinds=("fault", "size"), **counts)
+    return dict.fromkeys(texts, "soak.csv, soak_totals.csv")
 
 
-def number(text: str) -> float:
-    """Return the value of a number with commas between thousands."""
-    return float(text.replace(",", ""))
+def is_shown_as(text: str, value: float) -> bool:
+    """Return whether a number is a value, or a share in per cent, rounded as it is written."""
+    half = 0.5 * 10.0 ** -len(text.partition(".")[2]) + 1e-9
+    shown = float(text.replace(",", ""))
+    return any(abs(shown - factor * value) <= half for factor in (1.0, 100.0))
 
 
-def decimals(text: str) -> int:
-    """Return how many digits a number has behind its point."""
-    return len(text.partition(".")[2])
-
-
-def is_among(text: str, values: list[float]) -> bool:
-    """Return whether a number, rounded as it is written, is a value or its hundredfold."""
-    half = 0.5 * 10.0 ** -decimals(text) + 1e-9
-    shown = number(text)
-    return any(abs(shown - factor * value) <= half for value in values for factor in (1.0, 100.0))
-
-
-def read_rows(tables: list[pd.DataFrame]) -> list[tuple[set[str], list[float]]]:
-    """Return for each row of the tables the words of its texts, and its numbers with their counts.
-
-    A share also stands for the number of replays that it is of.
-    """
-    rows = []
-    for table in tables:
-        numeric = table.select_dtypes("number").columns
+def keyed_values() -> dict[str, list[float]]:
+    """Return what the table of the pooled guarantee may show, by the first word of a stream."""
+    values: dict[str, list[float]] = {}
+    for name in ("proof", "proof_rocket"):
+        table = read(f"explanation/{name}.csv").query("part == 'planted'")
         for _, row in table.iterrows():
-            texts = " ".join(str(value) for name, value in row.items() if name not in numeric)
-            values = [float(row[name]) for name in numeric if pd.notna(row[name])]
-            if "broke" in numeric and pd.notna(row["broke"]) and "replays" in numeric:
-                values.append(round(row["broke"] * row["replays"], 6))
-            rows.append((words_of(texts), values))
-    return rows
-
-
-def words_of(text: str) -> set[str]:
-    """Return the words of a text that tell one row from another."""
-    return set(re.findall(r"[a-z0-9.]{3,}", text.lower()))
+            word = re.split(r"\W", row["configuration"])[0]
+            n_broke = round(row["broke"] * row["replays"], 6)
+            shown = [row["certain per 1503"], n_broke, row["replays"], row["alpha"], row["LB"]]
+            values.setdefault(word, []).extend(shown)
+    return values
 
 
 def generated_lines() -> set[str]:
     """Return the lines of the results' page, written anew from its files."""
+    results = DOCS / "results"
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder, "guarantees.csv")
-        copy.write_bytes((RESULTS / "guarantees.csv").read_bytes())
-        write_results(read_replays(RESULTS / "replays.csv"), Path(folder))
+        copy.write_bytes((results / "guarantees.csv").read_bytes())
+        write_results(read_replays(results / "replays.csv"), Path(folder))
         return set(Path(folder, "index.md").read_text("utf-8").splitlines())
 
 
-def lines_of(page: Path) -> Iterator[tuple[int, str]]:
-    """Yield number and text of each line outside code, but not the heads of tables."""
+def lines_of(page: str) -> Iterator[tuple[int, str, str]]:
+    """Yield number, text and, in a table, the head of each line outside code, but no heads."""
     is_code = False
-    lines = page.read_text("utf-8").splitlines()
+    head = ""
+    lines = (DOCS.parent / page).read_text("utf-8").splitlines()
     for i, (line, following) in enumerate(zip(lines, [*lines[1:], ""], strict=True), 1):
         if line.startswith("```"):
             is_code = not is_code
-        elif not is_code and not following.startswith("| ---"):
-            yield i, line
+        elif following.startswith("| ---"):
+            head = line + "\n"
+        elif not is_code and not line.startswith("| ---"):
+            head = head if line.startswith("|") else ""
+            yield i, line, head
+
+
+def figures_in(line: str) -> list[str]:
+    """Return the figures of a line: numbers of a table's cells, or numbers with a unit."""
+    if line.startswith("|"):
+        return CELL.findall(line.strip("| ").partition("|")[2])
+    return [" ".join(match) for match in FIGURE.findall(line)]
 
 
 def figures_of_results() -> Iterator[Figure]:
     """Yield the figures of the results' page."""
     expected = generated_lines()
-    page = RESULTS / "index.md"
-    for i, line in lines_of(page):
-        found = CELL.findall(line.partition("|")[2]) if line.startswith("|") else []
+    for i, line, _ in lines_of(RESULTS):
         source = "written anew" if line in expected else "WRONG: the files give another line"
-        for text in found or [" ".join(match) for match in FIGURE.findall(line)]:
-            yield Figure("docs/results/index.md", i, text, source)
+        for text in figures_in(line):
+            yield Figure(RESULTS, i, text, source)
 
 
-def figures_of_page(name: str, tables: list[pd.DataFrame]) -> Iterator[Figure]:
-    """Yield the figures of another page, whose tables show rows of these."""
-    rows = read_rows(tables)
-    known = settings() | totals().get(name, {})
-    for i, line in lines_of(DOCS.parent / name):
-        if line.startswith("|"):
-            yield from figures_of_row(name, i, line, rows)
-            continue
-        for match in FIGURE.finditer(line):
-            text = " ".join(match.groups())
-            yield Figure(name, i, text, known.get(text, UNCHECKED))
-
-
-def figures_of_row(
-    name: str, i: int, line: str, rows: list[tuple[set[str], list[float]]]
-) -> Iterator[Figure]:
-    """Yield the figures of a table's line, checked against the rows that its first cell names."""
-    label, _, cells = line.strip("| ").partition("|")
-    words = words_of(label)
-    values = [value for texts, numbers in rows if words & texts for value in numbers]
-    for text in CELL.findall(cells):
-        source = UNCHECKED if not rows else "WRONG: no row has it"
-        if is_among(text, values):
-            source = "a row of its file"
-        yield Figure(name, i, text, source)
+def figures_of_page(page: str, tables: Tables, totals: Mapping[str, str]) -> Iterator[Figure]:
+    """Yield the figures of another page."""
+    known = settings() | dict(totals)
+    found = set[str]()
+    keyed = keyed_values()
+    left = {head: list(lines) for head, lines in tables.items()}
+    for i, line, head in lines_of(page):
+        lines = next((left[beginning] for beginning in left if head.startswith(beginning)), None)
+        texts = figures_in(line)
+        if lines is not None:
+            values = lines.pop(0) if lines else []
+            is_right = len(texts) == len(values) and all(map(is_shown_as, texts, values))
+            source = "computed anew" if is_right else f"WRONG: the file gives {values}"
+            sources = dict.fromkeys(texts, source)
+        elif head.startswith(KEYED):
+            words = re.findall(r"\w+", line.strip("| ").partition("|")[0])
+            near = [value for word in words for value in keyed.get(word, [])]
+            sources = {
+                text: "a row of its stream"
+                if any(is_shown_as(text, value) for value in near)
+                else "WRONG: no row has it"
+                for text in texts
+            }
+        else:
+            sources = {text: known.get(text, UNCHECKED) for text in texts}
+            found |= sources.keys()
+        for text in texts:
+            yield Figure(page, i, text, sources[text])
+    for text in totals.keys() - found:
+        yield Figure(page, 0, text, f"WRONG: {totals[text]} has it, the page has not")
+    for head, lines in left.items():
+        if lines:
+            yield Figure(page, 0, head.strip(), f"WRONG: lines of the table are missing: {lines}")
 
 
 PAGES: dict[str, Callable[[], Iterator[Figure]]] = {
-    "README.md": lambda: figures_of_page(
-        "README.md", [mean_replays(read_replays(RESULTS / "replays.csv"))]
-    ),
-    "docs/results/index.md": figures_of_results,
-    "docs/explanation/proof.md": lambda: figures_of_page(
-        "docs/explanation/proof.md",
-        [
-            pd.read_csv(EXPLANATION / f"{name}.csv")
-            for name in ("proof", "proof_rocket", "rules_proof")
-        ],
-    ),
+    "README.md": lambda: figures_of_page("README.md", tables_of_readme(), totals_of_readme()),
+    RESULTS: figures_of_results,
+    PROOF: lambda: figures_of_page(PROOF, tables_of_proof(), totals_of_proof()),
     "docs/explanation/faults.md": lambda: figures_of_page(
-        "docs/explanation/faults.md", [sum_faults()]
+        "docs/explanation/faults.md", tables_of_faults(), {}
     ),
-    "docs/explanation/speed.md": lambda: figures_of_page("docs/explanation/speed.md", []),
+    "docs/explanation/speed.md": lambda: figures_of_page(
+        "docs/explanation/speed.md", {}, totals_of_speed()
+    ),
 }
 
 

@@ -1,4 +1,4 @@
-"""Play what the documentation's figures come from, all of it with one commit.
+"""Play what the tables of the documentation come from, with one commit.
 
     python training/make_evidence.py --list
     python training/make_evidence.py --screw screw_driving.npz
@@ -7,9 +7,10 @@
 
 The commit is checked out into OUT/source, so that the working tree may change meanwhile, and each
 part is a command in that folder. OUT/manifest.json has for each finished part the commit, the
-command, the machine, when it ended, its hours, and the SHA-256 of each file that it wrote. A part
-that was interrupted continues with the next call, since its command keeps what is finished. A
-finished part is not played again. A run of another commit needs another OUT.
+command, the machine, when it ended, its hours, and the SHA-256 of its inputs and of each file that
+goes into the documentation. A part that was interrupted continues with the next call, since its
+command keeps what is finished. A finished part is not played again. A run of another commit needs
+another OUT; without --commit it is the one of the manifest, or the last one.
 
 `screw driving` is a file that `make_screw_driving.py` writes. The part "faults" needs a PostgreSQL
 server, whose address stands in DENGINE_TEST_POSTGRES (see .ci/postgres.sh).
@@ -33,7 +34,7 @@ from typing import Any
 REPO = Path(__file__).resolve().parents[1]
 MANIFEST = Path("docs/results/manifest.json")
 POSTGRES = "DENGINE_TEST_POSTGRES"
-INPUTS = {"insertion": REPO / "dengine/data/insertion.npz"}
+INSERTION = "dengine/data/insertion.npz"
 
 
 @dataclass(frozen=True)
@@ -64,11 +65,19 @@ def results(*names: str) -> dict[str, str]:
 REPLAYS = "training/evidence.py{screw} --keep {out}/kept --out {out} --n-jobs {jobs} --seeds"
 PAGE = results("index.md", "replays.csv", "differences.csv", "curves.png", "net_seconds.png")
 PROOF = "-m tests.slow.proof --jobs {jobs} --docs {out} --out {out}/kept"
-# In the order in which they are played. Each ends within two hours on two cores.
+# In the order in which they are played. Each is to end within two hours on two idle cores.
 PARTS = {
     "rules": Part(
         "-m tests.slow.proof.rules --jobs {jobs} --docs {out} --out {out}/kept",
         {"rules_proof.csv": "docs/explanation/rules_proof.csv"},
+    ),
+    "engine": Part(
+        "-m tests.slow.proof.engine --jobs {jobs} --docs {out} --out {out}/kept",
+        {"engine_proof.csv": "docs/explanation/engine_proof.csv"},
+    ),
+    "null": Part(
+        "-m tests.slow.proof.null --jobs {jobs} --docs {out} --out {out}/kept",
+        {"null_proof.csv": "docs/explanation/null_proof.csv"},
     ),
     "guarantees": Part(
         "training/evidence_guarantees.py{screw} --keep {out}/kept --out {out} --n-jobs {jobs}",
@@ -95,7 +104,7 @@ PARTS = {
         {"faults.csv": "docs/explanation/faults.csv"},
     ),
     "speed": Part("training/benchmark_cycle.py --replays 30 --out {out}", {}),
-    "reading": Part("training/benchmark_reading.py", {}),
+    "reading": Part("training/benchmark_reading.py --folder {out}", {}),
     "soak": Part(
         "training/soak.py --out {out}",
         {"soak.csv": "docs/results/soak.csv", "soak_totals.csv": "docs/results/soak_totals.csv"},
@@ -104,9 +113,12 @@ PARTS = {
 
 
 def git(*arguments: str) -> str:
-    """Run git in the repository; return what it printed."""
+    """Run git in the repository; return what it printed. Raises SystemExit if it fails."""
     command = ["git", "-C", str(REPO), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"git {' '.join(arguments)} failed: {done.stderr.strip()}")
+    return done.stdout.strip()
 
 
 def digest(path: Path) -> str:
@@ -133,29 +145,33 @@ class Run:
     ----------
     out : Path
         Folder of everything that is played.
-    commit : str
-        What is played, as git names it. Raises SystemExit if `out` has parts of another commit.
+    commit : str or None
+        What is played, as git names it. None: what `out` has parts of, or the last commit.
+
+    Raises
+    ------
+    SystemExit
+        If git knows no such commit, or `out` has parts of another one.
     """
 
-    def __init__(self, out: Path, commit: str) -> None:
+    def __init__(self, out: Path, commit: str | None) -> None:
         self.out = out.resolve()
-        self.checkout = git("rev-parse", "--short=8", commit)
-        # As the tables name it: the last commit until then that changed dengine.
-        self.commit = git("log", "-1", "--format=%h", "--abbrev=8", commit, "--", "dengine")
         self.source = self.out / "source"
         self.path = self.out / "manifest.json"
-        self.manifest: dict[str, Any] = self._about() | {"parts": {}}
+        self.manifest: dict[str, Any] = {}
         if self.path.exists():
             self.manifest = json.loads(self.path.read_text("utf-8"))
-        theirs = self.manifest["checkout"]
-        if theirs != self.checkout:
+        theirs = self.manifest.get("checkout")
+        checkout = git("rev-parse", "--short=8", commit or theirs or "HEAD")
+        if theirs not in (None, checkout):
             raise SystemExit(
-                f"{out} has parts of commit {theirs}, not of {self.checkout}; go on with "
-                f"--commit {theirs}, or give another --out."
+                f"{out} has parts of commit {theirs}, not of {checkout}; leave out --commit, or "
+                "give another --out."
             )
-        if not self.source.exists():
-            git("worktree", "prune")
-            git("worktree", "add", "--detach", str(self.source), self.checkout)
+        # As the tables name it: the last commit until then that changed dengine.
+        changed = git("log", "-1", "--format=%h", "--abbrev=8", checkout, "--", "dengine")
+        self.about = {"commit": changed, "checkout": checkout}
+        self.manifest = self.about | {"parts": self.manifest.get("parts", {})}
 
     def is_finished(self, name: str) -> bool:
         """Return whether a part was played to its end."""
@@ -168,8 +184,13 @@ class Run:
     def play(self, name: str, screw: Path | None, jobs: int) -> None:
         """Play a part, from where it was interrupted, and note it in the manifest.
 
-        Raises SystemExit if its command fails, or is stopped. The hours until then are noted.
+        The commit is checked out first, as a git worktree, unless it is there. Raises SystemExit
+        if the command fails, or is stopped, and FileNotFoundError if it did not write one of its
+        `files`. The hours until then are noted.
         """
+        if not self.source.exists():
+            git("worktree", "prune")
+            git("worktree", "add", "--detach", str(self.source), self.about["checkout"])
         part = PARTS[name]
         words = part.command.format(
             out=self.folder(name),
@@ -189,7 +210,9 @@ class Run:
         finally:
             entry["hours"] = round(entry["hours"] + (time.monotonic() - began) / 3600, 3)
             self._write()
-        inputs = INPUTS | ({"screw driving": screw} if screw and "{screw}" in part.command else {})
+        inputs = {"insertion": self.source / INSERTION}
+        if screw and "{screw}" in part.command:
+            inputs["screw driving"] = screw
         entry |= {
             "finished": f"{finished:%Y-%m-%d %H:%M}",
             "command": part.command,
@@ -204,7 +227,7 @@ class Run:
 
     def publish(self) -> None:
         """Copy the files of all finished parts, and the manifest, into the documentation."""
-        published: dict[str, Any] = self._about() | {"parts": {}}
+        published: dict[str, Any] = self.about | {"parts": {}}
         for name in filter(self.is_finished, PARTS):
             entry = self.manifest["parts"][name]
             for file, place in PARTS[name].files.items():
@@ -212,9 +235,6 @@ class Run:
                 entry["files"][place] = digest(REPO / place)  # later parts may write it again
             published["parts"][name] = entry
         write_json(REPO / MANIFEST, published)
-
-    def _about(self) -> dict[str, str]:
-        return {"commit": self.commit, "checkout": self.checkout}
 
     def _write(self) -> None:
         write_json(self.path, self.manifest)
@@ -236,7 +256,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--out", type=Path, default=Path("out/all_evidence"))
-    parser.add_argument("--commit", default="HEAD", help="what is played; by default the last one")
+    parser.add_argument("--commit", help="what is played, if OUT has no parts yet")
     parser.add_argument("--screw", type=Path, help="the screw-driving set, an .npz file")
     parser.add_argument(
         "--only", default=";".join(PARTS), help="names of parts, with semicolons between"
@@ -245,7 +265,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the parts; play nothing")
     parser.add_argument("--publish", action="store_true", help="copy finished parts into docs/")
     arguments = parser.parse_args()
-    names = arguments.only.split(";")
+    names = [name.strip() for name in arguments.only.split(";")]
     if unknown := [name for name in names if name not in PARTS]:
         parser.error(f"expected parts of {'; '.join(PARTS)}, got {'; '.join(unknown)}")
     arguments.out.mkdir(parents=True, exist_ok=True)

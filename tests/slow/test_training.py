@@ -176,11 +176,15 @@ def test_every_figure_that_a_file_holds_is_as_in_the_file_and_a_changed_one_is_f
     shutil.copytree(FOLDER.parent / "docs", copy)
     shutil.copy(FOLDER.parent / "README.md", tmp_path)
     monkeypatch.setattr(figures, "DOCS", copy)
-    monkeypatch.setattr(figures, "RESULTS", copy / "results")
-    monkeypatch.setattr(figures, "EXPLANATION", copy / "explanation")
     for page, text, other in (
         (tmp_path / "README.md", "| 992 |", "| 993 |"),
         (copy / "explanation" / "faults.md", "| 24,369 |", "| 24,396 |"),
+        (
+            copy / "explanation" / "proof.md",
+            "| informative | 330 | 341 |",
+            "| informative | 330 | 340 |",
+        ),
+        (copy / "explanation" / "speed.md", "0.357 s", "0.375 s"),
         (copy / "results" / "index.md", "| insertion | 1503 | 992 |", "| insertion | 1503 | 929 |"),
     ):
         content = page.read_text("utf-8")
@@ -201,7 +205,8 @@ def test_a_part_of_the_evidence_is_played_at_its_commit_once_and_its_files_are_i
     monkeypatch.setattr(evidence, "PARTS", {"one": part, "two": evidence.Part("-c 1/0", {})})
     monkeypatch.setattr(evidence, "REPO", tmp_path / "repository")
     repository = tmp_path / "repository"
-    (repository / "dengine").mkdir(parents=True)
+    (repository / "dengine" / "data").mkdir(parents=True)
+    (repository / "dengine" / "data" / "insertion.npz").touch()
     (repository / "dengine" / "code.py").touch()
     for words in ("init -q", "add .", "-c user.name=a -c user.email=a@b commit -qm first"):
         subprocess.run(["git", *words.split()], cwd=repository, check=True)
@@ -225,5 +230,8 @@ def test_a_part_of_the_evidence_is_played_at_its_commit_once_and_its_files_are_i
     (repository / "dengine" / "code.py").write_text("changed = 1\n")
     command = "git -c user.name=a -c user.email=a@b commit -qam second"
     subprocess.run(command.split(), cwd=repository, check=True)
+    assert "one                  finished" in run("make_evidence", "--out", out, "--list")
     with pytest.raises(SystemExit, match="give another --out"):
-        run("make_evidence", "--out", out)
+        run("make_evidence", "--out", out, "--commit", "HEAD")
+    with pytest.raises(SystemExit, match="unknown revision"):
+        run("make_evidence", "--out", tmp_path / "other", "--commit", "nowhere")
