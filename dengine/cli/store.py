@@ -134,9 +134,9 @@ def correct(part: str, label: str, **changing: Any) -> None:
 
     The part is named as for `dengine report`. From now on its decision counts with the corrected
     label. The label as it was reported stays in the store, and so does the decision; the correction
-    is a later row. A correction makes a forgotten label count again. A label that counts so already
-    changes nothing; a decision without a label is refused. The verb is refused while an engine runs
-    on the cell.
+    is a later row. A correction makes a forgotten label count again. If the label that counts
+    is this one already, nothing changes. A decision without a label is refused. The verb is refused
+    while an engine runs on the cell.
     """
     from ..history.explain import find_decision_id
 

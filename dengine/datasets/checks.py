@@ -75,8 +75,10 @@ def check_text(text: TextForm) -> None:
 def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Fault]]:
     """Return the recordings without repeats of others, and the faults of those left out.
 
-    Of equal traces (C, T) with one label the first is kept; if their labels differ, none is.
-    Constant traces are no repeats, since a dead sensor gives the same whatever the part.
+    Traces (C, T), all of one shape, are equal if they have one `content_hash`, so up to 1/65,536 of
+    their unit. Of equal traces with one label the first is kept; if their labels differ, none is.
+    Traces without two different finite samples are kept, since a dead sensor gives the same
+    whatever the part.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []

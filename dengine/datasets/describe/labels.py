@@ -124,10 +124,10 @@ def is_verdict(name: str, words: Names) -> bool:
 
 
 def row_of(column: Column) -> Literal["", "same", "last"]:
-    """Return which row of a recording has the label in a column, `same` or `last`; "" for none.
+    """Return which row of a recording has the label in a column; "" if the column is no verdict.
 
-    The column must be a verdict, see `is_verdict`. It is the last row if above it stand only words
-    for not checked.
+    `same`: each recording has one word. `last`: only words for not checked stand above the last
+    row. See `is_verdict`.
     """
     last = [str(words[-1]) for words in column.words if len(words)]
     above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}

@@ -26,9 +26,10 @@ MOST_PARTS = 240
 def layout_of(p: Proposal, files: Tables) -> str:
     """Return how parts are laid out, as `Description.layout` has it; `?` if nothing tells.
 
-    A layout `long` is told by a column with runs of equal words, which is proposed in `p` as
-    `part.column`, or by the stated one. For `?`, which only a single table gives, a note is put
-    there. Raises DataError for a table of results without samples.
+    It is `long` if a column has runs of equal words, which `part.column` then becomes in `p` (`?`
+    if there are several), or if the stated column has several words. Nothing tells for a single
+    table without such a column; `p.notes` then says what to state. Raises DataError for a table
+    with one row for each verdict and no samples.
     """
     kind = p.description.format
     first = files[0]

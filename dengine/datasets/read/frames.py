@@ -123,9 +123,9 @@ def read_parquet(content: bytes, source: str) -> Table:
 def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     """Return the table of a NumPy archive.
 
-    The archive of one part has a column for each array, see `columns_of`. That of all parts,
-    `has_all`, has a row for each of the first axis of its largest array, whose cells are arrays.
-    Raises DataError if it is damaged.
+    Of one part each array, without its axes of length 1, becomes columns, see `columns_of`. Of all
+    parts (`has_all`) row i has item i of each array; the largest array says how many rows there
+    are. Raises DataError if it is damaged, and UnreadableError for items of several forms.
     """
     arrays, _ = read_archive(content, name=source)
     if not has_all:

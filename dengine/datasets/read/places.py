@@ -118,11 +118,12 @@ class LabelReader:
     used: set[str] = field(default_factory=set)
 
     def words(self, table: Table, part: str) -> Sequence[str]:
-        """Return the words for a recording; raise UnreadableError if there is none.
+        """Return the words for a recording.
 
-        Its key in a listing is the part's number, the path, the file's name, or one of these
-        without a suffix, the first that is listed. The key is added to `used`; it has several words
-        if the listing has it in several rows.
+        In a listing these are the words of all rows with the recording's key: its part's number,
+        path or file name, or one of the last two without a suffix, the first that is listed. This
+        key is added to `used`. Raises UnreadableError if there are no words, and DataError for a
+        path that is no expression with one group.
         """
         source = self.source
         path = table.path

@@ -268,15 +268,15 @@ def fitted(
 ) -> NDArray[np.float32]:
     """Return the trace (C, T) of samples (C, n), as `[traces]` says.
 
-    With `resample` and a clock it is interpolated in time: at the stated rate from the first time
-    on, up to one step beyond the last, so that the end of a longer recording is left out; without
-    a rate the whole recording, to that number of samples. Otherwise it is fitted like a live trace.
+    With `resample` and a clock it is interpolated at the stated rate, from the first time on: the
+    rest of a longer recording is left out, and the last time may be up to one step short. Without a
+    stated rate the whole recording is interpolated to `samples` samples. Otherwise it is fitted
+    like a live trace; `pad-all` repeats the last sample, however short the recording is.
 
     Raises
     ------
     UnreadableError
-        If the recording is too short, or too long, to be fitted without making up data; with
-        `pad-all` its last sample is repeated all the same.
+        If the recording is too short, or too long, to be fitted without making up data.
     """
     about = description.traces
     rate = description.time.rate_hz

@@ -23,10 +23,10 @@ Windows = Iterator[tuple[str, slice, str]]  # the key of a part, its rows, and w
 def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the table of each part of a recording.
 
-    That of a part that begins in a gap, or whose window has no samples, overlaps the one before or
-    goes beyond the recording, has `damage`. A topic of labels has the first word from the start of
-    a part up to the next part. Raises DataError if a key is missing, no part is found, or the
-    listing or the times cannot be read.
+    A part has `damage` if it begins in a gap, or if its window has no samples, overlaps the window
+    before, or goes beyond the recording. A topic of labels has the first word from the start of a
+    part up to the next part, or to the end. Raises DataError if `time.column`, or for a trigger the
+    rate, is not stated, if no part is found, or if the listing or the times cannot be read.
     """
     name = table.source
     if not description.time.column:

@@ -373,7 +373,11 @@ class History:
         self._look(step)
 
     def _kill(self, step: Step) -> None:
-        """End a cell's process: what was in memory alone is lost."""
+        """Open a cell again without closing its engine, after its store wrote all that waited.
+
+        What the engine alone knew is lost, as confirmations are. `tests.slow.faults` ends processes by
+        SIGKILL.
+        """
         with self._call(step.cell, "killed") as engine:
             engine.store.flush()
             engine.store.close()
