@@ -651,3 +651,20 @@ def test_two_marks_that_both_stand_twice_in_a_number_are_a_question(tmp_path: Pa
     for name in ("1_OK.csv", "2_NOK.csv"):
         (tmp_path / name).write_text(f"force;path\n{rows}", encoding="utf-8")
     assert "text.decimal" in describe(tmp_path).open_keys
+
+
+def test_results_without_curves_are_refused_although_most_are_good(tmp_path: Path) -> None:
+    rows = [f"{i},{40 + i % 7 / 10},{'NOK' if i % 40 == 3 else 'OK'}" for i in range(400)]
+    path = tmp_path / "results.csv"
+    path.write_text("\n".join(["serial,torque,report", *rows]) + "\n", encoding="utf-8")
+    with pytest.raises(DataError, match="with its verdict in report, and no curve"):
+        describe(path)
+
+
+def test_a_clock_that_no_header_names_is_asked_for(tmp_path: Path) -> None:
+    for i in range(4):
+        table = np.c_[1.7e9 + 10 * i + np.arange(60) * 0.004, np.sin(np.arange(60.0) + i)]
+        np.savetxt(tmp_path / f"{i}_{WORDS[i % 2]}.csv", table, delimiter=",")
+    proposal = describe(tmp_path)
+    assert "time.column" in proposal.open_keys
+    assert "of c0, c1, or time.column=[]" in proposal.notes["time.column"]
