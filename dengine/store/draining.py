@@ -89,8 +89,8 @@ class Drainer:
     def fault(self) -> str:
         """Why the store cannot be written or read at present; "" if it can.
 
-        This is a fault of the journal, the last error of the database, or a lag above both the
-        limit and LAG_SECONDS.
+        This is a fault of the journal, the last error of the database, or that a record has waited
+        for the database longer than both `limit` and LAG_SECONDS.
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
@@ -108,11 +108,11 @@ class Drainer:
             self._recorder.request_sync()
 
     def drain(self) -> None:
-        """Wait until the database has everything recorded so far, at most the limit.
+        """Have everything recorded so far copied to the database, and wait for it.
 
-        Raise StoreError if that takes too long, or the store has a `fault`. The records stay in the
-        journal and are copied later. After a timeout the store has a `fault` until it answers
-        again.
+        Raise StoreError if this takes longer than `limit`, or as soon as the store has a `fault`.
+        The records then stay in the journal and are copied later. After a timeout the store has a
+        `fault` until the database takes records again.
         """
         with self._changed:
             if self.is_drained:
@@ -134,7 +134,11 @@ class Drainer:
         )
 
     def pop_label_numbers(self) -> LabelNumbers:
-        """Return the label numbers since the last call, as `Outbox.pop_label_numbers` says."""
+        """Return (decision id, label number) of each label that was drained since the last call.
+
+        They are in the order in which they were drained. A report that repeats a stored label has
+        the number of that label. Without a product the list is empty.
+        """
         with self._changed:
             numbers = self._label_numbers
             self._label_numbers = []
@@ -143,7 +147,8 @@ class Drainer:
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """Have the thread make a call, and return without waiting for it.
 
-        Records that are on disk by then are copied to the database before, if it takes them.
+        Before the call, the thread copies the synced records to the database. If this fails, the
+        call is made nevertheless.
 
         Returns
         -------
@@ -169,9 +174,9 @@ class Drainer:
         Raises
         ------
         StoreError
-            If it takes longer than the limit. The call is then cancelled, so that it commits
-            nothing. A call that is already committing is waited for COMMIT_SECONDS more; if
-            StoreError is raised after these, it may still have committed, or do so later.
+            If the call takes longer than `limit`. It is then cancelled, so that it commits nothing.
+            A call that is already committing cannot be cancelled, and gets COMMIT_SECONDS more; if
+            StoreError is raised after these, the call may still have committed, or do so later.
         """
         if not wait([future], self._limit).done and not future.cancel():
             wait([future], COMMIT_SECONDS)
@@ -198,8 +203,8 @@ class Drainer:
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
-        Before, it copies what is synced to the database, if that takes it, and makes the calls that
-        wait.
+        Before it ends, the thread copies the synced records to the database, unless the database
+        fails, and makes the calls that wait.
         """
         with self._changed:
             self._stopped = True
@@ -220,10 +225,10 @@ class Drainer:
     def _run(self) -> None:
         """Copy synced records to the database and make submitted calls, until stopped.
 
-        Before a call everything synced is copied, if the database takes it; the call is made in
-        either case. An error of the database is logged once and kept for `fault`; a second later
-        the database is tried again. Once stopped, it ends when all waiting calls are made and the
-        synced records are copied, or the database refuses them.
+        Before a call all synced records are copied; if this fails, the call is made nevertheless.
+        An error of the database is logged once and kept for `fault`; a second later the database is
+        tried again. Once stopped, it ends when all waiting calls are made, and the synced records
+        are copied or the database has failed.
         """
         while True:
             call = self._wait_for_work()
@@ -243,9 +248,9 @@ class Drainer:
     def _wait_for_work(self) -> tuple[Future[Any], Callable[[], Any]] | None:
         """Wait until there is a call, or until there are records and it is time to drain them.
 
-        Return the oldest call, None if there is none. It is time DRAIN_SECONDS after the first
-        record came, or at once if somebody waits for the database, the journal is long, or `stop`
-        was called.
+        Return the oldest call, None if there is none. Records are drained DRAIN_SECONDS after the
+        first of them came, or at once if somebody waits for the database, the journal is long, or
+        `stop` was called.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._calls or self._recorder.synced or self._stopped)
@@ -272,10 +277,10 @@ class Drainer:
             self._changed.notify_all()
 
     def _drain_synced(self) -> None:
-        """Copy everything that is synced by now to the database; then clear its last error.
+        """Copy all records that are synced by now to the database; then clear its last error.
 
-        What is synced meanwhile waits for the next time, or each record would be a transaction.
-        Raise StoreError if the database refuses it.
+        Records that are synced meanwhile wait for the next call, so that they share a transaction.
+        Raise StoreError if the database fails.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:
@@ -287,10 +292,11 @@ class Drainer:
     def drain_chunk(self) -> None:
         """Commit the oldest synced records, at most DRAIN_CHUNK, in one transaction.
 
-        Decisions that were replaced are left out. Records that are damaged on disk are taken from
-        memory and reported by an event; a decision that is in neither is lost, and that event is an
-        alarm. Journal, counters and index are updated. Raise StoreError if the database refuses
-        records or event; nothing is updated then, and the next call commits the same records again.
+        A decision is left out if a later record with the same id replaces it. Records that are
+        damaged on disk are taken from memory and reported by an event. If a decision is not in
+        memory either, it is lost, and the kind of that event is DATA_LOST, an alarm. Journal,
+        counters and index are updated. Raise StoreError if the database fails; nothing is updated
+        then, and the next call commits the same records again.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))
@@ -339,7 +345,8 @@ class Drainer:
     def save_newest_entry(self) -> None:
         """Write the ledger's newest entry to the journal's header and its head; errors are ignored.
 
-        By it a store that was cut off is recognized at the next start.
+        The next engine compares the store's ledger with it, to find out whether the store was cut
+        off.
         """
         with self._changed, suppress(StoreError):  # a broken journal is reported by its next record
             self._journal.save_newest_entry(self._store.database.newest_entry)

@@ -66,11 +66,12 @@ class RecordInsertion:
         self._corrections = corrections
 
     def commit(self, records: Sequence[Record]) -> LabelNumbers:
-        """Commit records, as `SqlStore.apply_records` says.
+        """Commit records in one transaction; return (decision id, label number) of their labels.
 
-        If the database refuses a value, the records are halved, each half in a transaction of its
-        own, until the refused record is alone; that becomes a dead letter, an event that says what
-        was in it. Raise StoreError if the database fails otherwise.
+        A record that is stored already changes nothing. A record that contradicts the store becomes
+        a dead letter, an event that says what was in it. If the database refuses a value, the
+        records are halved, each half in a transaction of its own, until the refused record is
+        alone; it becomes a dead letter, too. Raise StoreError if the database fails in another way.
         """
         try:
             return self._database.write(lambda connection: self._insert(connection, records))
@@ -85,11 +86,12 @@ class RecordInsertion:
         return []
 
     def _insert(self, connection: sa.Connection, records: Sequence[Record]) -> LabelNumbers:
-        """Insert into the tables what is not stored yet, without a commit.
+        """Insert the records that are not stored yet; nothing is committed.
 
-        A record that contradicts what is stored becomes an event, "dead letter"; a line stop of a
-        part that had counted as good (`_is_late_stop`) corrects its label. Return (decision id,
-        number) of the labels that are stored now, those of before included.
+        A record that contradicts the store becomes an event, "dead letter". A line stop of a part
+        that had counted as good (`_is_late_stop`) corrects the label of that part. Return (decision
+        id, number) of each label among the records, also of one that was stored before, but not of
+        a dead letter.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -109,7 +111,8 @@ class RecordInsertion:
     ) -> list[str]:
         """Insert the decisions that are not stored yet, with their traces; nothing is committed.
 
-        Return, in words, each whose id is stored with other values; these stay as they are stored.
+        Return a text for each decision whose id is stored with other values. The stored values are
+        not changed.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
@@ -135,7 +138,7 @@ class RecordInsertion:
     def _insert_labels(
         self, connection: sa.Connection, labels: dict[str, NewLabel], stored: dict[str, Any]
     ) -> dict[str, int]:
-        """Insert new labels; return the numbers of these and of stored ones, by decision.
+        """Insert new labels; return their numbers and those of the labels in `stored`, by decision.
 
         `stored` has the rows of `CorrectionTable.stored_labels`. A label is quarantined (kept out
         of training) if its decision is.
@@ -183,11 +186,11 @@ class RecordInsertion:
 def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLabels:
     """Sort labels by what the store does with them; nothing is written.
 
-    The first label of a decision is new. One that repeats the success and source of the first
-    counts as taken, and changes nothing. A late stop (`_is_late_stop`) corrects the first, unless
-    that is corrected to a failure already. Any other second label, and one whose decision is not
-    stored or is another, is a problem. `stored` has, by decision, the rows of
-    `CorrectionTable.stored_labels`.
+    The first label of a decision is new. A second label that repeats success and source of the
+    first changes nothing. A late stop (`_is_late_stop`) corrects the first label, unless this was
+    corrected to a failure already. Any other second label is a problem. So is a late stop whose
+    first label was forgotten, and a label whose decision is not stored with the same trace and
+    time. `stored` has, by decision, the rows of `CorrectionTable.stored_labels`.
     """
     result = SortedLabels()
     for label in labels:
@@ -210,9 +213,11 @@ def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLa
 def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     """Return in words why the store cannot take a label; "" if it can.
 
-    `row` is that of its decision, None if it is not stored; `first` is the label that the decision
-    has, None if it has none. A label that repeats it is no problem, nor is a late stop
-    (`_is_late_stop`), unless a person had the first label forgotten.
+    `row` is the stored row of its decision, or None; `first` is the label that the decision has, or
+    None. The row must be there, with the same trace and time as the label's decision. A second
+    label is a problem, with two exceptions: it repeats the first, or it is a late stop, a line stop
+    of a part that was confirmed as good before. A late stop is a problem if a person had the first
+    label forgotten.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"

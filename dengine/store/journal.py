@@ -67,10 +67,11 @@ Record = StoredDecision | NewLabel | Event
 
 
 def encode_record(record: Record) -> bytes:
-    """Return a record (decision, label or event) as bytes, without the journal's frame.
+    """Return a record (decision, label or event) as bytes.
 
     They are the length of a JSON text, this text with the record's kind and fields, and the float32
-    samples of a decision's trace or a label's point.
+    values of a decision's trace or of a label's `point`. The frame that stands before each record
+    in a journal is not included.
     """
     if isinstance(record, StoredDecision):
         row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
@@ -196,8 +197,8 @@ class Journal:
     def append(self, records: Sequence[bytes], time: float) -> list[int]:
         """Append encoded records behind the last one, and return when they are synced to the disk.
 
-        The head then names the newest of them. If it fails, the journal's end stays where it was,
-        and the same records can be appended again.
+        The head then names the newest of them. After an error the journal's end is where it was
+        before, and the same records can be appended again.
 
         Parameters
         ----------
@@ -349,10 +350,10 @@ class Journal:
     def close(self, waiting: bool = True) -> None:
         """Cut off the reserved space, and the records if all are drained; close, unlock the file.
 
-        With `waiting=False` no disk is waited for, and the records stay.
+        With `waiting=False` the file is not synced, and the records stay even if all are drained.
 
-        The file stays with its header, for the next engine to compare with the ledger. A journal
-        that was opened for reading is only closed, and so is one whose disk fails.
+        The header stays in the file, so that the next engine can compare it with the ledger. A
+        journal that was opened for reading is only closed, and so is one whose disk fails.
         """
         if self._owning and not self._file.closed:
             with suppress(OSError):
@@ -534,10 +535,10 @@ def head_path(journal: Path) -> Path:
 def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
-    The records are oldest first, whoever owns the journal; of several decisions with one id only
-    the last is returned, and damaged records are left out. Nothing is locked or changed.
-    Raise StoreError if the file cannot be read or is no journal, and for a record that another
-    release of dengine wrote.
+    The records are oldest first. If several decisions have one id, only the last is returned.
+    Damaged records are left out. Nothing is locked or changed, so an engine may be using the
+    journal. Raise StoreError if the file cannot be read or is no journal, and for a record that
+    another release of dengine wrote.
     """
     journal = Journal(path, owning=False)
     try:
@@ -561,7 +562,7 @@ def read_head(journal: Path) -> Head:
 
 
 def _parse_header(header: bytes) -> dict[str, Any]:
-    """Return the fields of a header by name; for a damaged one an error of DAMAGES is raised."""
+    """Return the fields of a header by name; raise one of the types in DAMAGES if it is damaged."""
     return {"n_drained": 0} | _unpack_fields(header[len(MAGIC) :])
 
 
@@ -572,9 +573,9 @@ def _pack_fields(fields: dict[str, Any]) -> bytes:
 
 
 def _unpack_fields(content: bytes) -> dict[str, Any]:
-    """Return the fields of a header or head; those of earlier releases have no CRC-32.
+    """Return the fields of a header or head; raise one of the types in DAMAGES if it is damaged.
 
-    An error of DAMAGES is raised if they are damaged.
+    The CRC-32 is compared only if there is one: headers of earlier releases have none.
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):

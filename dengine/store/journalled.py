@@ -87,9 +87,10 @@ class JournalledStore(Outbox):
         """Check that the store's ledger has the entries that the journal and its head name.
 
         If one is missing, the store was cut off or restored from an older copy: an event DATA_LOST
-        (an alarm) is stored, and the journal is set to be copied to the database from its
-        beginning. An event is also stored if the journal or its head is new though the store is
-        not. Raise StoreError only if the database cannot be read or written.
+        (an alarm) is stored, and all records of the journal count as undrained, so that they are
+        copied to the database again. An event that is no alarm is stored if the journal or its head
+        is new though the store is not. Raise StoreError only if the database cannot be read or
+        written.
         """
         journal = self._journal
         database = self.store.database
@@ -112,10 +113,10 @@ class JournalledStore(Outbox):
     def _drain_leftovers(self) -> None:
         """Copy to the database what an earlier process left in the journal, and clear the journal.
 
-        Records that are damaged or missing in the journal become an event DATA_LOST, which is an
-        alarm until a person acknowledges it. If a process was killed as it wrote a record, that is
-        cut off, and an event without an alarm says so. Raise StoreError if the database does not
-        take the records; they then stay in the journal.
+        If records are damaged or missing in the journal, an event DATA_LOST says so, which is an
+        alarm until a person acknowledges it. If a process was killed as it wrote a record, this
+        unfinished record is cut off, and an event that is no alarm says so. Raise StoreError if the
+        database fails; the records then stay in the journal.
         """
         newest = self.store.decisions.select(HistoryFilter(), limit=1)
         since = "".join(
@@ -138,10 +139,10 @@ class JournalledStore(Outbox):
         self._journal.clear()
 
     def _begin_check(self) -> None:
-        """Check the store's integrity; an error becomes `integrity_error`, and is logged.
+        """Check the store's integrity; a difference is put into `integrity_error`, and logged.
 
-        The check of the pages by SQLite is waited for only CHECK_SECONDS and goes on in a thread.
-        Raise StoreError if the database cannot be read.
+        SQLite's own check of the file runs in a thread. It is waited for only CHECK_SECONDS; later
+        it may still set `integrity_error`. Raise StoreError if the database cannot be read.
         """
         check = threading.Thread(
             target=lambda: self._note_integrity(self.store.database.check_pages()), daemon=True
@@ -170,11 +171,10 @@ class JournalledStore(Outbox):
 
     @contextmanager
     def try_lock(self) -> Iterator[bool]:
-        """Context manager that tries to take the records' lock, and gives whether it has it.
+        """Context manager that tries to take the outbox's lock, and yields whether it has the lock.
 
         It waits at most a millisecond, and the block runs in either case. While the block holds the
-        lock, the threads wait, and so do calls from other threads. The lock is released after the
-        block.
+        lock, all calls to this outbox from other threads wait, and so do its own threads.
         """
         # A thread that only looks has it for an instant.
         locked = self._changed.acquire(timeout=LOCK_SECONDS)
@@ -208,11 +208,11 @@ class JournalledStore(Outbox):
         return item
 
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
-        """Record a decision in the place of one that is not in the journal yet, and return it.
+        """Record a decision in the place of an earlier one that is not on disk yet, and return it.
 
-        It keeps the first one's time, trace and number. If that is on disk by now, it is returned,
-        and nothing is recorded. Raise KeyError for an id that is neither in memory nor in the
-        journal.
+        The new decision keeps time, trace and number of the earlier one. If the earlier one is on
+        disk by now, nothing is recorded, and the earlier one is returned. Raise KeyError for an id
+        that is neither in memory nor in the journal.
         """
         id_ = item.decision.id
         with self._changed:
@@ -259,10 +259,10 @@ class JournalledStore(Outbox):
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
         """Return a decision with its label from memory, journal or database, or None if unknown.
 
-        With `unsynced` the label may be one that is not on disk yet. Raise StoreError if the
-        database is needed and does not answer within `limit` seconds, and for an id that was
-        answered by VERIFY without recording a decision, since it could not be looked up or the disk
-        hung.
+        A label that is not on disk yet is returned only with `unsynced`. Raise StoreError if the
+        database is needed and does not answer within `limit` seconds. Raise it also for an id
+        whose last decision was VERIFY and was not recorded, because the id could not be looked up
+        or the disk hung.
         """
         with self._changed:
             if decision_id in self._unrecorded:
@@ -279,11 +279,11 @@ class JournalledStore(Outbox):
         return item
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
-        """Return the decision that an id already has, with its label if that is on disk, else None.
+        """Return the decision that an id already has, or None for a new id.
 
-        Raise StoreError if the id cannot be looked up. It is then remembered as answered but
-        unrecorded: until a decision is recorded for it, `find_decision` raises StoreError, and only
-        this method looks it up again.
+        The decision has its label if the label is on disk. Raise StoreError if the id cannot be
+        looked up. From then on `find_decision` raises StoreError for this id too, until a decision
+        is recorded for it or this method has looked it up.
         """
         with self._changed:
             self._unrecorded.discard(decision_id)
@@ -296,7 +296,7 @@ class JournalledStore(Outbox):
     def load_ids(self) -> None:
         """Read the ids of all decisions from the database into a Bloom filter in memory.
 
-        It takes about a second for a million ids; the lock is held for a page of them at a time.
+        It takes about a second for a million ids; other calls to this outbox may go on meanwhile.
         Once all are loaded, another call does nothing. Raise StoreError if the database cannot be
         read.
         """
@@ -337,9 +337,9 @@ class JournalledStore(Outbox):
     def close(self) -> None:
         """Drain, end the threads, close store and journal, within seconds unless `patient`.
 
-        What the database does not take stays in the journal, and the next engine drains it. What
-        the disk does not take is given up, and an error is logged: whoever waited for that was told
-        so. A second call does nothing, nor does one in a forked process.
+        Records that the database does not take stay in the journal, and the next engine drains
+        them. Records that the disk does not take are given up, and an error is logged; no report of
+        them was acknowledged. A second call does nothing, nor does one in a forked process.
         """
         if not self.is_usable:
             return
@@ -356,9 +356,10 @@ class JournalledStore(Outbox):
             self._leave_store(can_close=seconds > 0.0)
 
     def _end_threads(self, seconds: float) -> bool:
-        """Mark this as closed, and end the threads, which first write once what waits for them.
+        """Mark this as closed, and end the threads of the recorder and the drainer.
 
-        Return whether recorder and drainer have both ended, each within these seconds.
+        Each thread first tries once to write the records that wait for it. Return whether both have
+        ended, each within these seconds.
         """
         with self._changed:
             self._closed = True
@@ -366,10 +367,10 @@ class JournalledStore(Outbox):
         return self._drainer.stop(seconds) and has_recorder_ended
 
     def _leave_store(self, can_close: bool) -> None:
-        """Log that the journal holds what the database lacks.
+        """Log that the journal holds records that the database lacks.
 
-        If `can_close`, since the disk answers, disconnect and close the journal without waiting, so
-        that another engine can own the cell; else both stay open until the process ends.
+        If `can_close` (the disk answers), disconnect and close the journal without waiting, so that
+        another engine can own the cell. If not, both stay open until the process ends.
         """
         log.warning(
             "the store was left, its journal %s holds what it lacks: %s",

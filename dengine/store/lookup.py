@@ -94,7 +94,7 @@ class DecisionIndex:
     def add(self, record: Record, entry: Entry) -> None:
         """Add a record that was just recorded; an event, which has no id, changes nothing.
 
-        Of more than N_RECENT decisions in memory the oldest is dropped.
+        If there are more than N_RECENT decisions in memory, the oldest is dropped from memory.
         """
         if isinstance(record, StoredDecision):
             id_ = record.decision.id
@@ -113,7 +113,8 @@ class DecisionIndex:
     def remove_drained(self, entry: Entry) -> None:
         """Forget a record that the database has now, or that is lost.
 
-        A decision among the newest N_RECENT stays in memory, and has its label from now on.
+        The newest N_RECENT decisions stay in memory. If the record is a label, its decision there
+        gets the label.
         """
         if not self.is_replaced(entry):
             self._decisions.pop(entry.decision_id, None)
@@ -129,10 +130,21 @@ class DecisionIndex:
     def find(
         self, decision_id: str, unsynced: bool = False
     ) -> tuple[StoredDecision | None, NewLabel | None]:
-        """Return a decision from memory or from the journal, and its undrained label.
+        """Return a decision and its label, as far as they are in memory or in the journal.
 
-        None for each that is in neither, and for a label that is not on disk yet unless `unsynced`.
-        Raise StoreError if the journal is damaged where the decision stands.
+        Returns
+        -------
+        decision : StoredDecision or None
+            From the newest N_RECENT decisions, drained or not, or from the journal if it is not
+            drained; otherwise None. A label that is drained stands in it.
+        label : NewLabel or None
+            The undrained label of the decision. None if there is none, or if it is not on disk yet
+            and `unsynced` is False.
+
+        Raises
+        ------
+        StoreError
+            If the journal is damaged where the decision stands.
         """
         item = self.recent.get(decision_id)
         entry = self._decisions.get(decision_id)

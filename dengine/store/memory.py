@@ -108,9 +108,10 @@ class MemoryStore(Outbox):
         """Keep a retrain with copies of its arrays in memory; the future that is returned is done.
 
         Its result is the report's version number. The retrain is written to the database together
-        with the other records, when somebody uses the store, or when 40 retrains wait: packing one
-        takes as long as many decisions. Raise StoreError for an accepted version without arrays,
-        and for an array of Python objects.
+        with the other records, when somebody uses the store, or when 40 retrains wait: packing a
+        retrain takes as long as many decisions. Raise StoreError if `report.accepted` is True and
+        there are no arrays, for an array of Python objects, and if 40 retrains wait and the
+        database cannot be written.
         """
         self._versions.append((report, last_seq, check_state(report, state), self.store.clock()))
         if len(self._versions) == MAX_UNWRITTEN_VERSIONS:

@@ -45,9 +45,9 @@ def open_store(
         Raise a StoreError for a file or cell that does not exist, instead of creating it. Without
         effect on None and on an open store.
     wait : float or None
-        Seconds that an engine on this store waits for the disk or database at most, as `SqlStore`
-        takes it; pass `LONG_WAIT` where no cell waits for it. Not used for a store in memory or an
-        open one.
+        Seconds that an engine on this store waits for the disk or database at most. None: the
+        environment's DENGINE_STORE_WAIT, or 0.4. Pass `LONG_WAIT` if no cell runs meanwhile. Not
+        used for a store in memory or an open one.
 
     Returns
     -------
@@ -82,10 +82,10 @@ def open_store(
 def opening(
     store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None
 ) -> Iterator[SqlStore]:
-    """Context manager that opens a store as `open_store` does, and gives it.
+    """Context manager that opens a store with `open_store`, and yields it.
 
-    The store stays open after the block. If the block raises, a store that was opened here is
-    closed; one that was passed open is never closed.
+    The store stays open after the block. Only if the block raises, a store that was opened here is
+    closed; a store that was passed open is never closed.
     """
     opened = open_store(store, must_exist=must_exist, wait=wait)
     try:

@@ -100,7 +100,7 @@ class Outbox(ABC):
         self._note_integrity(self.store.database.check_integrity(self._window, since))
 
     def _note_integrity(self, error: str) -> None:
-        """Keep and log an integrity error, if it is the first; "" changes nothing.
+        """Set `integrity_error` and log it, unless it is set already; "" changes nothing.
 
         From then on every part must be verified, until the store is opened again.
         """
@@ -151,9 +151,10 @@ class Outbox(ABC):
         Returns
         -------
         StoredDecision
-            The same with its number. If the id already has a decision in memory, that one, and
-            nothing is recorded. `item` as it came, with number 0, if it cannot be recorded since
-            the disk hangs; `find_decision` then raises StoreError for its id.
+            A copy of `item` with its number. If the id already has a decision in memory, that
+            decision is returned, and nothing is recorded. If the disk hangs and `item` cannot be
+            recorded, it is returned as it came, with number 0; `find_decision` then raises
+            StoreError for its id.
         """
 
     @abstractmethod
@@ -165,8 +166,8 @@ class Outbox(ABC):
         Returns
         -------
         StoredDecision
-            The new decision; or the first one, unchanged, if that is in the journal or the database
-            by now.
+            The new decision; or the first decision, unchanged, if it is in the journal or the
+            database by now.
 
         Raises
         ------
@@ -276,9 +277,10 @@ class Outbox(ABC):
         return False
 
     def pop_label_numbers(self) -> LabelNumbers:
-        """Return (decision id, label number) of a product's labels that the store has numbered.
+        """Return (decision id, label number) of each label that was drained since the last call.
 
-        They are those since the last call, in the order of their numbers. Empty without a product.
+        They are in the order in which they were drained. A report that repeats a stored label has
+        the number of that label. Without a product the list is empty.
         """
         return []
 
@@ -306,8 +308,8 @@ class Outbox(ABC):
         Raises
         ------
         StoreError
-            If the database is needed and unavailable, and if the id was answered by VERIFY without
-            recording a decision, since the disk hung or it could not be looked up.
+            If the database is needed and unavailable. Also if the last decision for this id was
+            VERIFY and was not recorded, because the disk hung or the id could not be looked up.
         """
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:
@@ -318,8 +320,8 @@ class Outbox(ABC):
         Raises
         ------
         StoreError
-            If that cannot be looked up. The id is then remembered as answered but unrecorded: until
-            a decision is recorded for it, `find_decision` raises StoreError.
+            If the id cannot be looked up. From then on `find_decision` raises StoreError for this
+            id too, until a decision is recorded for it or this method has looked it up.
         """
         return self.find_decision(decision_id)
 
@@ -368,9 +370,9 @@ class Outbox(ABC):
         Raises
         ------
         StoreError
-            If it takes longer than `limit`. The commit is then cancelled. One that is under way is
-            waited for some seconds more; if StoreError is raised after these, the version may still
-            have been committed, or be so later.
+            If it takes longer than `limit`. The commit is then cancelled. A commit that is already
+            under way cannot be cancelled, and gets some seconds more; if StoreError is raised after
+            these, the version may still have been committed, or be committed later.
         """
         return future.result()
 

@@ -165,9 +165,10 @@ class OwnedFile:
     def reserve(self, size: int) -> None:
         """Reserve disk space for `size` bytes in total, and sync the file.
 
-        It becomes at least `size` bytes long, with zeros at its end. If the system cannot reserve
-        them, for example on a full disk, the file keeps its size and nothing is raised; OSError
-        only if the sync or the cut back to that size fails.
+        The file becomes at least `size` bytes long, with zeros at its end. If the system cannot
+        reserve the space, for example on a full disk, the file keeps its size and nothing is
+        raised. OSError is raised only if the sync fails, or the file cannot be cut back to its
+        size.
         """
         before = self.size
         try:

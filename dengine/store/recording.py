@@ -116,9 +116,9 @@ class Recorder:
 
     @property
     def oldest(self) -> float | None:
-        """When the oldest record was recorded that is not drained, by `time.monotonic`.
+        """Time of recording of the oldest record that is not drained, by `time.monotonic`.
 
-        None if there is none.
+        None if all are drained.
         """
         for entries in (self.synced, self.unwritten):
             if entries:
@@ -160,8 +160,8 @@ class Recorder:
     def sync(self, seconds: float | None = None) -> None:
         """Wait until everything recorded so far is synced, at most `seconds`, or the limit if None.
 
-        Raise NotTakenError if that takes longer, or a write fails meanwhile. The records stay, and
-        are tried again.
+        Raise NotTakenError if that takes longer, or a write fails meanwhile. The records are not
+        dropped: the thread tries to write them again.
         """
         limit = self._limit if seconds is None else seconds
         with self.changed:
@@ -182,8 +182,8 @@ class Recorder:
     def start(self, kept: object = None) -> None:
         """Start the thread that writes, and keep an object alive as long as it runs.
 
-        If a sync hangs when the process ends, nothing else that syncs may be freed with it: SQLite
-        does so as it frees a connection, and the process would never end.
+        Keep the object that owns the SQLite connection: SQLite syncs when it frees a connection,
+        and if the disk hangs when the process ends, the process would never end.
         """
         self._thread = threading.Thread(
             target=self._run, args=(kept,), name="dengine-journal", daemon=True
@@ -193,8 +193,8 @@ class Recorder:
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
-        Before, it tries once to write what waits; if that fails, those records stay unwritten, and
-        nothing is raised.
+        Before it ends, the thread tries once to write the records that wait. If this fails, they
+        stay unwritten, and nothing is raised.
         """
         with self.changed:
             self._stopped = True
@@ -233,10 +233,10 @@ class Recorder:
     def _write(self, batch: Sequence[Entry]) -> None:
         """Append a batch to the journal, sync it, and move it from `unwritten` to `synced`.
 
-        A journal of more than 8 MiB is cleared first, if the drainer copies the rest of it to the
-        database within BATCH_SECONDS. If the journal's file was deleted, moved or replaced, it is
-        created again, and an event says so. Raise StoreError if the disk fails; the entries then
-        stay in `unwritten`.
+        A journal of more than 8 MiB is cleared first, if the drainer copies its undrained records
+        to the database within BATCH_SECONDS. If the journal's file was deleted, moved or replaced,
+        it is created again, and an event says so. Raise StoreError if the disk fails; the entries
+        then stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
@@ -263,7 +263,7 @@ class Recorder:
             self.changed.notify_all()
 
     def _recreate(self, error: LostJournalError) -> None:
-        """Create the journal again whose file was lost; log that, and record an event about it.
+        """Create a new file for a journal whose file was lost; log this, and record an event.
 
         Records that the database lacks are copied into it. Raise StoreError if it cannot be
         written.

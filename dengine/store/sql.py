@@ -165,16 +165,17 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def apply_records(self, records: Sequence[Record]) -> LabelNumbers:
         """Commit records of a journal, in one transaction unless the database refuses a record.
 
-        A record that is stored already and is the same counts as taken. A line stop of a part that
-        counted as good, since none had come before the next part, corrects its label. Another
-        decision with the same id, a label without its decision, or any other second label becomes
-        an event, "dead letter": which one is right is never guessed. A record that the database
-        refuses becomes one, too.
+        A record that repeats a stored one changes nothing. A line stop that is reported after its
+        part was confirmed as good corrects the label of the part. Another decision with the same
+        id, a label without its decision, and any other second label become an event, "dead letter":
+        the store never guesses which of two is right. A record that the database refuses becomes a
+        dead letter, too.
 
         Returns
         -------
         list of (str, int)
-            Decision id and number of each label, also of one stored before; none of a dead letter.
+            Decision id and number of each label, also of one that was stored before, but not of a
+            dead letter.
 
         Raises
         ------
@@ -195,9 +196,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 
 
 def _checked_wait(wait: float | None) -> float:
-    """Return a store's time limit in seconds; StoreError if it is not above 0, or infinite.
+    """Return a store's time limit in seconds; raise StoreError unless it is above 0 and finite.
 
-    It is the argument, else the environment's DENGINE_STORE_WAIT, else 0.4.
+    It is `wait`, or if that is None the environment's DENGINE_STORE_WAIT, or 0.4.
     """
     value = (os.environ.get(WAIT_VARIABLE) or WAIT) if wait is None else wait
     seconds = math.nan
