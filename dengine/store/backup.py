@@ -70,9 +70,9 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     Raises
     ------
     StoreError
-        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), if a journal cannot
-        be read, and if one holds records while the cell's ledger has another key than the
-        environment names.
+        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), and if a journal
+        cannot be read. If a journal holds records, and the ledger of its cell was begun with
+        another key than the one in the file that DENGINE_LEDGER_KEY names.
     OutputError
         If `out` exists, or cannot be written.
     """
@@ -109,10 +109,11 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
 
 
 def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
-    """Copy a backup to the place of a store, on this or another machine, with a journal per cell.
+    """Copy a backup to the place of a store, on this or another machine, and make its journals.
 
-    The journal names the newest ledger entry, so that the first engine knows that nothing is
-    missing. A journal that is there stays: that engine takes from it what the copy lacks.
+    Each cell gets a journal that names its newest ledger entry, so that the engine that opens the
+    cell next can tell that nothing is missing. A journal that is already beside `store` is not
+    changed: the engine of its cell later takes from it the records that the copy lacks.
 
     Parameters
     ----------
@@ -128,9 +129,9 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     Raises
     ------
     StoreError
-        If `copy` is no store, or its history is not as it was written; if its ledger has another
-        key than the environment names; and if a journal cannot be made, when the store is there
-        already.
+        If `copy` is no store, if its history is not as it was written, and if a ledger was begun
+        with another key than the one in the file that DENGINE_LEDGER_KEY names. If a journal
+        cannot be made; the store has been copied by then, and stays.
     OutputError
         If `store` exists, or cannot be written.
     """

@@ -223,10 +223,11 @@ ROW_ERRORS = (sa.exc.IntegrityError, sa.exc.DataError, OverflowError, ValueError
 
 @contextmanager
 def _store_errors(verb: str, name: str) -> Iterator[None]:
-    """Context manager that raises StoreError for an error of the database, a file or a value.
+    """Context manager that turns an error of its block into StoreError.
 
-    Its message is "Could not `verb` `name`", the error, and what to do. Errors of dengine pass
-    unchanged.
+    It does so for errors of the database, and for OSError, ValueError, TypeError and OverflowError.
+    The message is "Could not `verb` `name`", the error, and what to do. dengine's own errors and
+    all others pass unchanged.
     """
     try:
         yield
@@ -371,9 +372,10 @@ class Database:
     def _open(self, product: str | None) -> Scope:
         """Create the tables or check them, enter the cell if it is new, and set `newest_entry`.
 
-        A new cell gets its product, and the key of its ledger. Return the cell with its product.
-        Raise StoreError, and disconnect, if the database cannot be opened or is no store of this
-        schema, and if the cell has another ledger key or another product.
+        A new cell gets its product, and its ledger begins with the key that DENGINE_LEDGER_KEY
+        names. Return the cell with its product. Raise StoreError, and disconnect, if the database
+        cannot be opened or is no store of this schema, if the ledger of the cell was begun with
+        another key, and if the cell has another product.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -406,11 +408,14 @@ class Database:
         """Context manager that opens a write transaction, locks the cell and gives the connection.
 
         After the block a ledger entry for the rows that it added is inserted, and both are
-        committed; then `newest_entry` is set and `on_entry` called. Without such rows, or changed
-        settings, there is no entry. On an error everything is rolled back; dengine's own errors
-        pass, those of the database, a file or a value become StoreError, any other passes.
-        StoreError is raised, too, if `commit_if` no longer wants the commit, and if the SQLite file
-        was replaced; if that is noticed only after the commit, the lost file has the rows.
+        committed; then `newest_entry` is set and `on_entry` called. If the block added no rows and
+        changed no settings, there is no entry. On an error everything is rolled back. Errors of the
+        database, and OSError, ValueError, TypeError and OverflowError, become StoreError; dengine's
+        own errors and all others pass unchanged.
+
+        StoreError is raised, too, if the function given to `commit_if` returns False, and if the
+        SQLite file was replaced. If this is noticed only after the commit, the rows are in the
+        file that was replaced.
         """
         with _store_errors("write to", self.name), self._writer.connect() as connection:
             connection.execution_options(dengine_write=True)
@@ -447,8 +452,8 @@ class Database:
     def commit_if(self, is_wanted: Callable[[], bool]) -> Iterator[None]:
         """Context manager in which this thread commits a transaction only if `is_wanted()`.
 
-        `is_wanted` is called just before each commit. If it is false, the transaction is rolled
-        back, and `write` raises StoreError.
+        `is_wanted` is called just before each commit. If it returns False, the transaction is
+        rolled back, and `write` raises StoreError.
         """
         self._commits.is_wanted = is_wanted
         try:
@@ -466,23 +471,28 @@ class Database:
         return [row.digest.hex() for row in rows] == [digest]
 
     def check_integrity(self, window: int, since: int | None = None) -> str:
-        """Compare what an engine reads of this cell and of its product's others with their ledgers.
+        """Compare the rows that an engine reads with the ledgers of their cells.
 
-        These are settings, corrections, labels and model versions. Of the labels only the newest
-        are checked, everything else in full but for the versions' arrays.
+        These are the settings, corrections, labels and model versions of this cell, and of the
+        other cells of its product. Of the labels only the newest are checked. The rest is checked
+        in full, except for the arrays of the versions.
 
         Parameters
         ----------
         window : int
             Number of newest labels that are checked.
         since : int or None
-            Labels after this number are checked instead.
+            If given, the labels after this number are checked instead of the newest `window`.
 
         Returns
         -------
         str
-            The first difference, in words; "" if there is none. Only a database that cannot be read
-            raises StoreError.
+            The first difference, in words; "" if there is none.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be read.
         """
         with self.reading() as connection:
             first = self.scope.first_label(connection, window) if since is None else since + 1
@@ -494,8 +504,8 @@ class Database:
     def check_pages(self) -> str:
         """Run SQLite's integrity check on the tables that engines read, all but traces and events.
 
-        Return its first finding, or the error if that fails; "" if all is well, and for PostgreSQL
-        and a store in memory, which are not checked.
+        Return its first finding, or the text of the error if the check fails; "" if all is well.
+        PostgreSQL and a store in memory are not checked: "".
         """
         for name in CHECKED_TABLES if self._file is not None else ():
             try:
@@ -585,8 +595,9 @@ class Database:
         ------
         StoreError
             If the database fails or is closed, and for a ValueError, TypeError or OSError of
-            `add_rows` that is not dengine's own. Other errors pass unchanged. Whatever is raised,
-            nothing is written, except to an SQLite file that was replaced meanwhile.
+            `add_rows` that is not dengine's own. Other errors pass unchanged. After an error
+            nothing is written; only if the SQLite file was replaced meanwhile, the old file may
+            have the rows.
         """
         self.check_open()
         self.before_use()  # before the lock is taken: it may write
@@ -629,7 +640,8 @@ class Database:
     ) -> list[int]:
         """Insert rows of this cell into a table, each with a number; return these numbers.
 
-        That is the next number, or the one that the row has if that is larger.
+        Each row gets the number that follows the one before it. A row that already has a larger
+        number keeps it.
 
         Parameters
         ----------

@@ -55,9 +55,9 @@ class CorrectionTable(CellTable):
         SettingError
             If the settings of another cell of the product contradict the new ones.
         StoreError
-            For data that JSON does not have, for a setting that is the store's own, for a version
-            without arrays, if another cell of the product stored a version meanwhile, and if the
-            database fails.
+            For data that JSON does not have, for a setting that only the store itself may write
+            (`schema.RESERVED`), for a version without arrays, if another cell of the product stored
+            a version meanwhile, and if the database fails.
         """
         now = float(self._database.clock())
         event = new_event(change.kind, change.text, now, change.data, change.author)
@@ -97,7 +97,7 @@ class CorrectionTable(CellTable):
         return {id_: labels[stored[id_].corrected] for id_ in ids}
 
     def after(self, after: int = 0) -> list[Correction]:
-        """Return corrections of labels, oldest first, also those that a later one replaced.
+        """Return corrections of labels, oldest first; a label that was corrected twice has two.
 
         Parameters
         ----------
@@ -154,9 +154,10 @@ class CorrectionTable(CellTable):
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
         """Return, by id, a row for each of the given decisions that the cell has stored.
 
-        A row has content_hash, quarantined and time of the decision, and of its label success,
-        source, seq and `corrected`: the label after corrections, 0, 1 or FORGOTTEN. These four are
-        None without a label. Ids that are not stored are left out.
+        A row has content_hash, quarantined (whether its trace is kept out of training) and time of
+        the decision, and success, source, seq and `corrected` of its label. `corrected` is the
+        label after corrections: 0, 1 or FORGOTTEN. These four are None without a label. Ids that
+        are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
         return self._database.rows_by_id(

@@ -84,9 +84,10 @@ class DecisionTable(CellTable):
     def select(
         self, where: HistoryFilter, limit: int, start_after: str | None = None, newest: bool = True
     ) -> list[StoredDecision]:
-        """Return the newest `limit` decisions of a selection, or the oldest; always oldest first.
+        """Return the newest `limit` decisions of a selection, or its oldest `limit`.
 
-        They are in the order in which they were made, whatever the clock said.
+        The list is oldest first in both cases: by the order in which the decisions were made,
+        whatever the clock said.
 
         Parameters
         ----------
@@ -140,7 +141,7 @@ class DecisionTable(CellTable):
         Returns
         -------
         list of str
-            Those of quarantined traces are left out.
+            Decisions on quarantined traces (stored, but never used in training) are left out.
         """
         return [
             row.id
@@ -160,7 +161,8 @@ class DecisionTable(CellTable):
         Returns
         -------
         list of StoredDecision
-            Without their traces; those of quarantined traces are left out.
+            Without their traces. Decisions on quarantined traces (stored, but never used in
+            training) are left out.
         """
         return [
             read_decision(row)
@@ -172,7 +174,7 @@ class DecisionTable(CellTable):
     ) -> sa.Select[Any]:
         """Return the query for the cell's decisions of an action that have no label, oldest first.
 
-        Those of quarantined traces, and those by a version before `since_version`, are left out.
+        Decisions on quarantined traces, and by a version before `since_version`, are left out.
         """
         return (
             sa.select(*columns)
@@ -188,19 +190,20 @@ class DecisionTable(CellTable):
         )
 
     def overdue_to(self, within: int, since_version: int = 0) -> int:
-        """Return the number of the newest decision that is old enough for its check to be overdue.
+        """Return the number up to which decisions are old enough for their checks to be overdue.
 
-        A decision with this or a lower number that asked for a check and has no label is overdue.
-        The number is that of the newest decision minus `within`, or the one that a label recorded,
-        if that is larger; 0 if nothing can be overdue yet.
+        A check is overdue if its decision has this or a lower number, asked for the check, and has
+        no label. The number returned is the larger of two: the number of the newest decision minus
+        `within`, and the largest `NewLabel.overdue_to` among the stored labels. It is 0 if nothing
+        can be overdue yet.
 
         Parameters
         ----------
         within : int
             Number of later decisions after which a check is overdue.
         since_version : int, default 0
-            The first version since `within` is in force; if the newest decision is by an earlier
-            one, only what the labels recorded counts.
+            The version with which `within` came into force. If the newest decision is by an earlier
+            version, only the numbers of the labels count.
 
         Returns
         -------
@@ -271,16 +274,15 @@ class DecisionTable(CellTable):
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
         """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
 
-        The newest may be shorter.
+        The newest stretch may be shorter.
 
         Parameters
         ----------
         n : int
             Without effect on stretches of time and on batches.
         **by
-            For periods of time `seconds`, their length, and `start`, when one begins; for batches
-            `batch`, the length or the separators of a batch's name in the parts' numbers. As in
-            `stretches_query`.
+            `seconds` and `start` for periods of time, or `batch` for batches of parts; the
+            arguments of `stretches_query`.
 
         Returns
         -------
@@ -301,9 +303,10 @@ class DecisionTable(CellTable):
         Returns
         -------
         dict
-            decisions, quarantined, labels: numbers; corrected, forgotten: numbers of decisions
-            whose label was corrected or forgotten; actions, reasons, sources: dicts of numbers by
-            value, 0 included. Forgotten labels are not among labels and sources.
+            decisions, labels: numbers; quarantined: number of decisions whose trace is kept out of
+            training; corrected, forgotten: numbers of decisions whose label was corrected or
+            forgotten; actions, reasons, sources: dicts of numbers by value, 0 included. Forgotten
+            labels are not among labels and sources.
         """
         tally = tally or self.tally()
         actions = tally.by("action")

@@ -53,7 +53,8 @@ class EventTable(CellTable):
     def record_damage(self, text: str) -> None:
         """Commit an event of kind "damaged", unless the cell has one with this text.
 
-        If the store cannot be written, the text is logged instead, and nothing raised.
+        If the store cannot be written, the text is logged instead, and nothing is raised. Raise
+        StoreError if it cannot be read.
         """
         query = sa.select(EVENT.c.number).where(
             self._own(EVENT), EVENT.c.kind == "damaged", EVENT.c.text == as_text(text)
@@ -101,6 +102,8 @@ class EventTable(CellTable):
     def policy_change_after(self, decision_id: str) -> Event | None:
         """Return the event of the first change of the policy or the shadow mode after a decision.
 
+        The order is that of the ledger's entries, whatever the clock said.
+
         Parameters
         ----------
         decision_id : str
@@ -108,8 +111,7 @@ class EventTable(CellTable):
         Returns
         -------
         Event or None
-            None if there was no change, or there is no such decision. The order is the ledger's,
-            whatever the clock said.
+            None if there was no such change, or there is no decision with this id.
         """
         is_decision = self._own(DECISION) & (DECISION.c.id == decision_id)
         decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()

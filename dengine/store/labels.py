@@ -71,20 +71,20 @@ class LabelTable(CellTable):
     ) -> LabelledTraces:
         """Return labelled traces for training, with corrected labels, oldest first.
 
-        Labels that a person had forgotten, and those of quarantined traces, are left out. So is a
-        trace that is not as it was stored, and an event with its decision's id is written to the
-        store.
+        Labels that a person had forgotten are left out, and so are labels of quarantined traces,
+        which are stored but never used in training. A trace that is not as it was stored is left
+        out, too, and an event with the id of its decision is written to the store.
 
         Parameters
         ----------
         limit : int or None
-            Number of newest labels, damaged ones included; None: all.
+            Number of newest labels that are read; those whose trace is damaged count. None: all.
         first, last : int, optional
             Numbers of the first and the last label, both included.
         corrected_to : int or None
             Number of the last correction that is applied, for labels as they stood then; None: all.
         cell_only : bool, default False
-            Leave out those of the product's other cells.
+            Leave out the labels of the product's other cells.
 
         Returns
         -------
@@ -111,9 +111,10 @@ class LabelTable(CellTable):
     ) -> Sequence[Any]:
         """Run a query for the newest `limit` labels up to number `last`; return rows, newest first.
 
-        The query itself has this limit, order and condition. Of a product only labels with high
-        numbers are read at first, or all would be sorted; if these are too few, the query runs over
-        all.
+        `query` must have this limit (None: no limit), order and condition already. In a product it
+        is first run on the labels with the 2 * `limit` highest numbers up to `last`, because the
+        database would sort all labels of the product otherwise. If these give fewer than `limit`
+        rows, it is run on all labels.
         """
         if self._scope.product is not None and limit is not None:
             newest = self._scope.newest(connection, LABEL.c.seq)
@@ -124,11 +125,12 @@ class LabelTable(CellTable):
         return connection.execute(query).all()  # here more than half are quarantined or forgotten
 
     def news_since(self, seq: int, limit: int) -> ProductNews:
-        """Return what the cells of the product, this one included, stored after label number `seq`.
+        """Return the labels after number `seq` of all cells of the product, this one included.
 
-        Only labels that train are returned, none that was forgotten or of a quarantined trace, with
-        the numbers of the newest version and correction. A trace that is not as it was stored is
-        left out, and an event is written to the store.
+        They come with their traces, and with the numbers of the product's newest version and newest
+        correction. Labels that were forgotten, and those of quarantined traces (stored, but never
+        used in training), are left out. So is a trace that is not as it was stored, and an event
+        about it is written to the store.
 
         Parameters
         ----------
@@ -166,9 +168,9 @@ class LabelTable(CellTable):
     ) -> tuple[LabelledTraces, list[str]]:
         """Read the traces of label rows, which are sorted by number, oldest first.
 
-        Return the labelled traces in this order, and the ids of decisions whose traces are missing
-        or not as they were stored; these are left out. Raise StoreError if traces have different
-        shapes, or a label is not 0 or 1.
+        `scope` says of which cells the rows are. Return the labelled traces in this order, and the
+        ids of decisions whose traces are missing or not as they were stored; these are left out.
+        Raise StoreError if traces have different shapes, or a label is not 0 or 1.
         """
         labels = {row.seq: row for row in rows}  # the forgotten are not among them
         traces: dict[int, TraceArray] = {}
@@ -208,8 +210,9 @@ class LabelTable(CellTable):
     def past(self, after: int, upto: int | None = None) -> list[PastLabel]:
         """Return this cell's labels as they were recorded, oldest first.
 
-        Labels of quarantined traces are included. A label that is not as it was stored is left out,
-        and an event with its decision's id is written to the store.
+        Labels of quarantined traces, which no version is trained on, are included. A label that is
+        not as it was stored is left out, and an event with the id of its decision is written to the
+        store.
 
         Parameters
         ----------
@@ -238,12 +241,13 @@ class LabelTable(CellTable):
     def outcomes_since(
         self, seq: int, since_version: int = 0, overdue_to: int = 0
     ) -> list[OutcomeRecord]:
-        """Return the outcomes with which a rule is updated, as corrected, in the labels' order.
+        """Return the outcomes with which a rule is updated, with corrected labels, oldest first.
 
-        Left out are labels of rejected parts, since which of them come back is somebody's choice
-        (`Source.INSPECTION`), forgotten labels, and those of quarantined traces. Only this cell's
-        labels count, since those of other cells are no evidence for this one, and a detector of
-        drift that counts them would notice too late that this cell has changed.
+        Left out are forgotten labels, labels of quarantined traces (stored, but never used in
+        training), and labels of rejected parts (`Source.INSPECTION`), because somebody chooses
+        which of these parts come back. Only this cell's labels count: labels of other cells are no
+        evidence for this one, and a drift detector that counts them would notice too late that this
+        cell has changed.
 
         Parameters
         ----------
@@ -253,9 +257,11 @@ class LabelTable(CellTable):
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
             Up to this decision number a check without a label is overdue, which counts as an error
-            until its label comes; 0: none is. An overdue check adds none, one or two outcomes
-            (`overdue_outcomes`), whatever `seq` is. They are inserted where the running engine
-            updated the rule with them; every later label stores that position.
+            until its label comes; 0: none is. All overdue checks are included, whatever `seq` is:
+            each adds an outcome for each side, success and failure, for which its part had evidence
+            (`overdue_outcomes`). These outcomes stand where the running engine updated the rule
+            with them: before the first label whose stored `overdue_to` is not below the decision's
+            number, else at the end.
 
         Returns
         -------
@@ -300,18 +306,20 @@ class LabelTable(CellTable):
         return outcomes
 
     def unreported_total(self, since_version: int = 0) -> int:
-        """Return how many accepted parts before the newest label went on without a report.
+        """Return how many accepted parts before the cell's newest label had no report.
+
+        Each label stores, as `silent`, the number of such parts since the label before it. The sum
+        over the cell's labels is returned; labels of quarantined traces (stored, but never used in
+        training) are left out.
 
         Parameters
         ----------
         since_version : int, default 0
-            Only labels that came under this version or a later one.
+            Only labels that came while this version or a later one was in force.
 
         Returns
         -------
         int
-            The sum of `silent`, the number of such parts that each of the cell's labels keeps since
-            the label before it; labels of quarantined traces are left out.
         """
         return int(
             self._read(

@@ -146,8 +146,9 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
     Raises
     ------
     StoreError
-        If the ledger was begun with another key, or with a key and b"" is given, or the reverse.
-        Without `begin` a cell that has neither an entry nor a key counts as begun without a key.
+        If the ledger was begun with another key than `key`, with a key although `key` is b"", or
+        without one although `key` is not b"". Without `begin` a cell that has neither an entry nor
+        a key counts as begun without a key.
     """
     tag = hmac.new(key, b"dengine ledger", "sha256").hexdigest() if key else None
     is_tag = (SETTING.c.cell_id == cell_id) & (SETTING.c.key == LEDGER_KEY)
@@ -170,9 +171,10 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 
 
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
-    """Return a row (number, digest, chains) of a cell's newest ledger entry.
+    """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
 
-    The digest is 32 bytes, the chains are JSON. None if the cell has no entry.
+    `digest` is 32 bytes. `chains` is JSON: for each table that an engine reads at its start, a
+    digest over all its rows so far.
     """
     return connection.execute(
         sa.select(*LEDGER.c["number", "digest", "chains"])
@@ -267,7 +269,7 @@ class LedgerEntry:
         self.settings = False
 
     def add_rows(self, table: str, rows: Sequence[Row]) -> list[Row]:
-        """Add the sums of rows that are about to be inserted into a table.
+        """Add the sums of rows, which are about to be inserted into a table, to this entry.
 
         Return copies of the rows with two more columns: `entry`, the number of this entry, and
         `sum`.
@@ -330,7 +332,8 @@ def read_settings(connection: sa.Connection, cell_id: str) -> dict[str, str]:
 def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, str]:
     """Compare a cell's settings with the newest copy of them in the ledger.
 
-    Return, by key, "is not chained", "is missing" or "was changed"; {} if they are equal.
+    Return a text for each key that differs: "is not chained" if only the store has it, "is missing"
+    if only the ledger has it, else "was changed". {} if all are equal.
     """
     stored = read_settings(connection, cell_id)
     chained: dict[str, str] = {}
@@ -350,10 +353,10 @@ def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, s
 
 
 def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, first: int) -> str:
-    """Compare what an engine reads of a cell with the cell's ledger.
+    """Compare the rows of a cell that an engine reads with the cell's ledger.
 
-    These are the settings, corrections, versions and newest labels. Of the ledger only the newest
-    entry is checked.
+    These are the settings, corrections, versions and newest labels. Of the ledger itself only the
+    newest entry is checked.
 
     Parameters
     ----------
@@ -402,11 +405,12 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
 def _find_table_error(
     connection: sa.Connection, cell_id: str, name: str, first: int, last_entry: int, chained: str
 ) -> str:
-    """Compare a table's rows with the chain over them; return the first difference in words, or "".
+    """Compare a table's rows with the ledger; return the first difference in words, or "".
 
-    A difference is a row that its sum does not fit, or rows that were removed, added or replaced.
-    Rows from number `first` on are read, or from the first of its entry, up to those of the entry
-    `last_entry`: others may write meanwhile. `chained` is the chain that `last_entry` has.
+    A difference is a row whose values do not fit its stored sum, or rows that were removed, added
+    or replaced. `chained` is the digest over all rows of the table that ledger entry `last_entry`
+    has. Rows of later entries are not read, since another connection may write meanwhile. Reading
+    begins at number `first`, or at an earlier row that belongs to the same ledger entry.
     """
     number = IN_FORCE[name]
     table = number.table
@@ -455,11 +459,12 @@ def _chain_statement(
 ) -> tuple[Any, Any, Any]:
     """Add rows that are about to be inserted to the transaction's ledger entry.
 
-    SQLAlchemy calls it before it executes a statement, with its rows as `many` or as a `single`
-    one. It returns the statement and its parameters. Rows inserted into a chained table then have
-    the entry's number and a sum; other statements, and those outside a write transaction of
-    `Database`, pass unchanged. If settings are written, that is noted in the entry. Raise
-    StoreError for an insert into a chained table whose rows are not beside the statement.
+    SQLAlchemy calls this before it executes a statement. The parameters are in `many`, a list of
+    rows, or in `single`, one row. Return the statement with its parameters. Rows for a table of
+    CHAINED get the number of the entry and their sum. All other statements, and all those outside a
+    write transaction of `Database`, are returned unchanged; if settings are written, the entry
+    notes it. Raise StoreError for an insert into a table of CHAINED whose rows are inside the
+    statement instead of its parameters.
     """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):

@@ -31,7 +31,8 @@ class CellSummary:
     decisions, labels : int
         Their numbers.
     version : int or None
-        Number of the newest accepted version, its product's or its own; None before the first.
+        Number of the newest version that was put in force, its product's or its own; None before
+        the first.
     last_seen : float or None
         Time of its newest decision or label, in seconds since 1970; None before the first decision.
     """
@@ -49,10 +50,11 @@ def check_peer_settings(
 ) -> None:
     """Check that two cells of a product would embed a trace in the same way.
 
-    Compared are the reducer with its parameters, folds, training window, novelty, seed, trace spec,
-    model, and the description of an object that was handed in. A policy, a radius, a schedule or a
-    budget may differ: a version's arrays do not depend on them. A cell without a recipe yet, and a
-    trace spec that one of them has not set yet, fit everything.
+    Compared are the settings on which the arrays of a version depend: the reducer with its
+    parameters, folds, training window, novelty, seed, `TraceSpec`, and the name and description of
+    an object that a user passed as reducer or model. The policy and the rest of the `Recipe`, like
+    the radius and the time budget of a retrain, may differ. Nothing is compared if one of the cells
+    has no recipe yet. The `TraceSpec` is compared only if both cells have one.
 
     Parameters
     ----------

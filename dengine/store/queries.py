@@ -56,9 +56,10 @@ class Scope:
     def first_label(self, connection: sa.Connection, window: int) -> int:
         """Return a label number such that the newest `window` training labels are at or after it.
 
-        Training labels are those of traces that are not quarantined. 1 if there are fewer. For a
-        product that is an estimate, 2 * window below the newest, and may be below 1: the labels are
-        not read.
+        Training labels are those of traces that are not quarantined. 1 if there are fewer than
+        `window`. For a product the labels are not read, and the number is an estimate, 2 * `window`
+        below the newest: it may be below 1, and is too high if more than half of the newest labels
+        are no training labels.
         """
         if self.product is not None:  # by their numbers, or all would be read to be sorted
             return self.newest(connection, LABEL.c.seq) + 1 - 2 * window
@@ -72,10 +73,11 @@ class Scope:
         return connection.execute(query).scalar() or 1
 
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
-        """Return the number of the next row of a table; it stays free until the transaction ends.
+        """Return the number of the next row of a table; nobody else gets it before the commit.
 
-        `column` is the table's column of numbers. Decisions and events are numbered by cell, which
-        the caller has locked; everything else by product, if there is one, which is locked here.
+        `column` is the table's column of numbers. Decisions and events are numbered by cell, and
+        the caller has locked the cell. All other rows are numbered by product, if the cell has a
+        product, and this call locks the product.
         """
         if self.product is None or column.table in (DECISION, EVENT):
             return Scope(self.cell_id).newest(connection, column) + 1
@@ -96,7 +98,7 @@ class Scope:
         return connection.execute(query).scalar() or 0
 
     def newest_version(self, connection: sa.Connection) -> int:
-        """Return the number of the newest accepted version; 0 before the first."""
+        """Return the number of the newest version that was put in force; 0 before the first."""
         return self.newest(connection, VERSION.c.version, VERSION.c.accepted == sa.true())
 
 
@@ -114,8 +116,8 @@ def newest_of(
 ) -> sa.Select[Any]:
     """Return the query for the largest number in a column over a product's cells; it is not run.
 
-    With `conditions`, over the rows that fulfil them. It yields NULL if there is none. It takes one
-    step down the index for each cell, however many rows there are.
+    With `conditions`, only over the rows that fulfil them all. The result is NULL if there is none.
+    The query is fast: the database reads one row of the index for each cell.
     """
     table = column.table
     peer = cells_of(product).subquery()
@@ -142,8 +144,8 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
     Raises
     ------
     StoreError
-        For a cell of another product, for a name that is empty or not printable, and for a cell
-        that has worked without a product: its labels are numbered by themselves.
+        If the cell has another product, if the name is empty or not printable, and if the cell has
+        settings or labels already without a product: its labels have numbers of its own.
     """
     is_own = SETTING.c.cell_id == cell_id
     query = sa.select(SETTING.c.value).where(is_own, SETTING.c.key == PRODUCT_KEY)
@@ -211,8 +213,8 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
 def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     """Return two SQL columns of a decision: `predicted` and `inclusion_probability`.
 
-    `predicted`, what the model alone would have done, is an `ActionCode`. The probability
-    is the decision's propensity if its action is VERIFY, else 0.
+    `predicted` is what the model alone would have done, as an `ActionCode` (an integer).
+    `inclusion_probability` is `Decision.propensity` if the action is VERIFY, else 0.
     """
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     probability = sa.case(
@@ -256,9 +258,9 @@ def past_query(cell_id: str) -> sa.Select[Any]:
 def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[Any]:
     """Return the query for the labels that train: seq, success, content_hash, decision_id.
 
-    Labels that were forgotten and those of quarantined traces are left out. Corrections up to
-    number `corrected_to` are applied; None: all. Labels of all cells of the scope's product are
-    included. The rows are in no order.
+    Labels that were forgotten are left out, and so are labels of quarantined traces, which are
+    stored but never used in training. Corrections up to number `corrected_to` are applied; None:
+    all. Labels of all cells of the scope's product are included. The rows are in no order.
     """
     label = corrected_label(corrected_to)
     return sa.select(
@@ -291,9 +293,10 @@ def stretches_query(
     start : float, default 0.0
         A time, in seconds since 1970, at which a stretch of `seconds` begins.
     batch : str, default ""
-        Group decisions by the beginnings of their parts' numbers instead: a number n in digits
-        takes the first n characters, separators such as "-/" take all up to the last of them.
-        Decisions without a part's number are one group.
+        If not "", a stretch is a batch: the decisions whose parts' numbers begin alike. If `batch`
+        is a number n in digits, the first n characters are compared. Otherwise its characters are
+        separators, such as "-/", and everything up to the last separator is compared. Decisions
+        without a part's number are one group.
 
     Returns
     -------

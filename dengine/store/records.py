@@ -140,8 +140,8 @@ def as_text(text: str) -> str:
 def check_state(report: RetrainReport, state: Arrays | None) -> State | None:
     """Check a version's arrays and return copies of them, by name; None if there are none.
 
-    Raise StoreError for an accepted version without arrays, and for an array of Python objects,
-    which would need a pickle.
+    Raise StoreError if `report.accepted` is True and there are no arrays, and for an array of
+    Python objects, which would need a pickle.
     """
     if state is None and report.accepted:
         raise StoreError(
@@ -164,7 +164,7 @@ class NewLabel:
     success : bool
     source : Source
     model_version : int
-        The version that answered when the label came.
+        The version in force when the label came.
     point : array of float32, shape (d,), or None
         Where the trace was added to that version's references; None if it was not added.
     silent : int
@@ -280,7 +280,7 @@ class ProductNews:
     labelled : LabelledTraces
         New labels of all cells, this one included, oldest first, as corrected.
     version : int
-        Number of the newest accepted version; 0 before the first.
+        Number of the newest version that was put in force; 0 before the first.
     correction : int
         Number of the newest correction; 0 before the first.
     """
@@ -324,13 +324,12 @@ class OutcomeRecord(NamedTuple):
 def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
     """Return the outcomes that a rule counts for a check that is overdue.
 
-    A check is overdue if its label has not come within the number of decisions that the policy
-    sets.
-
-    Whatever the decision was, it counts as wrong: as a failure for the accept side if the part had
-    evidence for success (lower > 0), then as a success for the reject side if it had evidence for
-    failure (upper < 1). So there are none, one or two. Their `seq` is 0, the other side's bound is
-    1 or 0, and `predicted` is VERIFY unless the model alone would have acted on that side.
+    A check is overdue if no report has come within `Policy.label_within` decisions. Until it comes
+    the rule counts what is worst. If the part had evidence for success (lower > 0), there is an
+    outcome "failure", with upper bound 1; its `predicted` is ACCEPT if the model alone would have
+    accepted the part. If the part had evidence for failure (upper < 1), there is then an outcome
+    "success", with lower bound 0; its `predicted` is REJECT if the model alone would have rejected
+    the part. Otherwise `predicted` is VERIFY. So there are none, one or two, all with `seq` 0.
     """
     accepts = int(decision.predicted is Action.ACCEPT)
     rejects = 2 * int(decision.predicted is Action.REJECT)
@@ -385,9 +384,9 @@ def new_event(
 
 
 def open_losses(events: Iterable[Any]) -> list[Any]:
-    """Return those of a cell's events, oldest first, that say that data was lost.
+    """Return the events of kind DATA_LOST after which no event ACKNOWLEDGED came.
 
-    Those before the newest acknowledgement are left out. Rows of the table may be given as well.
+    `events` are events of a cell, or their rows, oldest first; so is the result.
     """
     losses: list[Any] = []
     for event in events:
@@ -463,7 +462,7 @@ class Correction:
 
 @dataclass(frozen=True, slots=True)
 class ModelVersion:
-    """An accepted version of the model with its arrays.
+    """A version of the model that was put in force, with its arrays.
 
     Attributes
     ----------
@@ -511,7 +510,7 @@ class CellAddress(str):
 def address(store: FilePath, cell_id: str | None = None, product: str | None = None) -> str:
     """Return a store's file or URL as text; a `CellAddress` if a cell or product is given.
 
-    A product without a cell is that of the cell "cell".
+    If only a product is given, the cell is named "cell".
     """
     url = os.fspath(store)
     return (
@@ -573,8 +572,8 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
     Raises
     ------
     StoreError
-        For a row that lacks a field, or has a value that cannot be converted. Texts and numbers are
-        taken as they are, unchecked.
+        If the row lacks a field, or a value cannot be converted to the type of its field. Fields of
+        type str, int and float take any value, unchecked.
     """
     wanted = {
         name: type_
@@ -594,7 +593,10 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
 
 
 def _to_column(value: Any, type_: type) -> Any:
-    """Return a field's value for its column: plain, JSON text or packed float32; None as None."""
+    """Return the value of a field for its column: a text, number, JSON text or packed float32.
+
+    None stays None. `type_` is the type of the field.
+    """
     if value is None:
         return None
     if issubclass(type_, StrEnum):
@@ -605,9 +607,10 @@ def _to_column(value: Any, type_: type) -> Any:
 
 
 def _from_column(value: Any, type_: type) -> Any:
-    """Return the field's value that `_to_column` wrote to a column; `type_` is the field's.
+    """Return the value of a field from its column, as `_to_column` wrote it.
 
-    A tuple becomes a tuple of tuples, an array is flat.
+    `type_` is the type of the field. A tuple must hold rows, and becomes a tuple of tuples. An
+    array becomes a flat one.
     """
     if value is None or type_ in (str, int, float):
         return value
@@ -662,8 +665,8 @@ def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
 def to_npz(state: Arrays) -> bytes:
     """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
-    Integers are compressed, of which a state repeats many; weights hardly get smaller. Raise
-    ValueError for an array of Python objects.
+    Arrays of integers are compressed, because they repeat many values. Others, like weights, are
+    not, because they would hardly get smaller. Raise ValueError for an array of Python objects.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -696,7 +699,7 @@ class VersionError(StoreError):
 
 @dataclass(frozen=True, slots=True)
 class StoredVersion:
-    """A retrain as a store lists it, dropped candidates included.
+    """A retrain as a store lists it, also if its version was dropped (not put in force).
 
     Attributes
     ----------
@@ -726,9 +729,10 @@ class StoredVersion:
 def keeps_state(version: int, newest: int, keep: int | None) -> bool:
     """Return whether a version keeps its state when `newest` is the newest version.
 
-    The first version and the `keep` newest do (None: all do), and of older ones ever fewer: of the
-    newest hundred every tenth, of the newest thousand every hundredth, and so on. So the number of
-    states grows with the logarithm of the number of versions.
+    The first version and the `keep` newest keep it (None: all do). Of older versions ever fewer do:
+    of the newest hundred those whose number is divisible by 10, of the newest thousand those whose
+    number is divisible by 100, and so on. So the number of states grows with the logarithm of the
+    number of versions.
     """
     age = newest - version
     if keep is None or version == 1 or age < keep:

@@ -56,7 +56,8 @@ def read_rule_progress(
     within : int
         Number of later decisions after which a check without a label is overdue.
     policy_since : int
-        The first version under the present policy, which sets `within`.
+        The version with which the present policy came into force. If the newest decision is by an
+        earlier version, no further check becomes overdue by `within`.
 
     Returns
     -------

@@ -185,7 +185,7 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
 
 
 def _add_columns(connection: sa.Connection) -> None:
-    """Add the columns of ADDED to the tables of a store that an earlier dengine made.
+    """Add the columns that an earlier dengine did not have (ADDED) to the tables of its store.
 
     They are NULL in its rows. A table that has them, or is no table of a store, is not changed.
     """
@@ -203,7 +203,8 @@ def _add_columns(connection: sa.Connection) -> None:
 def check_schema(connection: sa.Connection, name: str) -> None:
     """Raise a StoreError unless a database holds a store of this schema with all columns.
 
-    `name` is the database's, for the error. Columns of ADDED may be missing.
+    Columns that a later dengine added to the schema (ADDED) may be missing. `name` is the name of
+    the database, for the error.
     """
     inspector = sa.inspect(connection)
     tables = {

@@ -33,11 +33,11 @@ class SettingTable(CellTable):
         self._database.write(lambda connection: self.replace(connection, settings))
 
     def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
-        """Replace the engine's settings of the cell in a write transaction; the store's own stay.
+        """Replace the engine's settings of the cell in a write transaction; nothing is committed.
 
-        Raise StoreError for a setting that is the store's own (`RESERVED`), and SettingError if
-        another cell of the product would embed traces differently. The product stays locked until
-        the commit.
+        The settings that the store itself keeps (`RESERVED`) stay; raise StoreError if `settings`
+        has one of them. Raise SettingError if another cell of the product would embed traces
+        differently. The product stays locked until the transaction ends.
         """
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(

@@ -142,9 +142,9 @@ def verify_history(
     """Check every row of a store's history; nothing is written, and engines may run meanwhile.
 
     What is wrong is returned as faults, not raised: a row that was changed, added or removed, a
-    damaged SQLite file, a ledger entry that a cell's journal names and the store lacks, lost data
-    that nobody has acknowledged, and an `expect` that no entry has. Takes about 80 bytes of memory
-    per row.
+    damaged SQLite file or journal, a ledger entry that a cell's journal names and the store lacks,
+    lost data that nobody has acknowledged, and an `expect` that no entry has. Takes about 80 bytes
+    of memory per row.
 
     Parameters
     ----------
@@ -212,9 +212,11 @@ def verify_history(
 
 
 def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
-    """Return what a journal knows: ledger entries, number of records for its store, what it lost.
+    """Read a journal; nothing is raised if it is missing or damaged.
 
-    If there is no journal, or it cannot be read, the entry is that of its head, the number None.
+    Return the ledger entries that it names, the number of records that its store has not taken, and
+    in words what it lost. If there is no journal, or it cannot be read, the head beside it gives
+    the ledger entry, the number is None and the text "".
     """
     with suppress(StoreError):  # it is missing, damaged, or another user's
         records, journal = read_undrained(path)
@@ -302,7 +304,7 @@ class CellCheck:
     def _catch_database_errors(
         self, table: str, faults: Iterator[HistoryFault]
     ) -> Iterator[HistoryFault]:
-        """Yield the faults of a check; a database error ends it as one more fault, not raised.
+        """Yield the faults of a check; a database error ends the check and is yielded as a fault.
 
         After such an error `run` does not look for missing rows.
         """
@@ -329,11 +331,15 @@ class CellCheck:
             yield dict(row._mapping)
 
     def _check_rows(self, table: str) -> Iterator[HistoryFault]:
-        """Yield a fault for each row of a table, or version state, that was changed or not chained.
+        """Yield a fault for each row of a table that was changed or is not in the ledger.
 
-        A row is not chained if it has no ledger entry. Keep the sums of all others for
-        `_check_ledger`, count `rows`, and call `on_rows` after each CHUNK rows; `run` calls it for
-        the rest.
+        A row with neither a ledger entry nor a sum is not in the ledger: something beside dengine
+        wrote it. A row was changed if its values do not fit its stored sum. The state of a version
+        has a sum of its own, and a fault of its own.
+
+        The sums of every row with an entry, also of a changed one, are kept for `_check_ledger`.
+        Each row adds 1 to `rows`. After each CHUNK rows `on_rows` is called; `run` calls it once
+        more for the rows after the last CHUNK.
         """
         for row in self._read_raw(table):
             self.rows += 1
@@ -358,10 +364,10 @@ class CellCheck:
                 self._sums[table] += ROW_SUMS.pack(entry, _bytes(stored), now)
 
     def _check_ledger(self) -> Iterator[HistoryFault]:
-        """Yield a fault for each ledger entry that is missing or does not fit.
+        """Yield a fault for each ledger entry that was changed or is missing; fill `digests`.
 
-        Each must fit the entry before and the rows that `_check_rows` has read. At most SHOWN
-        missing entries are named. Fills `digests`.
+        An entry must fit the digest of the entry before, and the sums of its rows, which
+        `_check_rows` has read. Only the first 20 missing entries are yielded.
         """
         sums = {table: np.frombuffer(packed, SUMS) for table, packed in self._sums.items()}
         sums = {
@@ -421,7 +427,10 @@ class CellCheck:
             yield self._fault(EVENT.name, event.number, f"says: {event.text} {LOSS_REMEDY}")
 
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
-        """Yield a fault for each row of a table whose row of the required table is missing."""
+        """Yield a fault for each row of `table` that needs a row in `required` and has none.
+
+        The table of the fault is `required`.
+        """
         key = table.c[KEY[table.name]]
         required_key = required.c[KEY[required.name]]
         is_pair = (required.c.cell_id == table.c.cell_id) & (required_key == key)

@@ -69,14 +69,14 @@ class VersionTable(CellTable):
         Returns
         -------
         int
-            The version's number. It is the report's, unless this one is accepted and another cell
-            of the product stored a version meanwhile: then the next.
+            The version's number. It is the number in the report, unless `report.accepted` is True
+            and another cell of the product stored a version meanwhile: then it is the next number.
 
         Raises
         ------
         StoreError
-            For an accepted version without arrays, for an array of Python objects, and if the
-            database fails.
+            If `report.accepted` is True and there are no arrays, for an array of Python objects,
+            and if the database fails.
         """
         row = self.row(report, last_seq, state, self._database.clock() if time is None else time)
         return self._database.write(lambda connection: self.insert(connection, row))
@@ -90,8 +90,8 @@ class VersionTable(CellTable):
     ) -> Row:
         """Return the row of a retrain for the table `model_version`, its arrays packed as npz.
 
-        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError for
-        an accepted version without arrays, and for an array of Python objects.
+        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError if
+        `report.accepted` is True and `state` is None, and for an array of Python objects.
         """
         arrays = check_state(report, state)
         blob = None if arrays is None else to_npz(arrays)
@@ -103,10 +103,12 @@ class VersionTable(CellTable):
         } | to_row(report)
 
     def insert(self, connection: sa.Connection, row: Row) -> int:
-        """Insert the row of a retrain without a commit; return its version's number.
+        """Insert the row of a retrain; return the number of its version. Nothing is committed.
 
-        For an accepted version this is the next number if another cell of the product has taken the
-        given one; and the states that `keeps_state` does not keep are deleted.
+        If the version is not put in force (`accepted` of the row is False), it keeps its number and
+        nothing else is done. Otherwise it gets the next number if another cell of the product has
+        taken its number, and the states of older versions that `keeps_state` does not keep are
+        deleted.
         """
         number: int = row["version"]
         if (
@@ -131,15 +133,16 @@ class VersionTable(CellTable):
         return number
 
     def newest(self) -> ModelVersion | None:
-        """Return the newest accepted version of the cell or its product, with its arrays.
+        """Return the newest version that was put in force in the cell or its product.
 
-        For a damaged one an event is written to the store, and the one before it is returned.
+        It comes with its arrays. If they are damaged, an event is written to the store, and the
+        next older version that still has its arrays is returned.
 
         Returns
         -------
         ModelVersion or None
-            None before the first, and if all that are kept are damaged. The version of another cell
-            is returned without the state of its rule.
+            None if there is no version yet, and if all arrays that are kept are damaged. The
+            version of another cell is returned without the state of its rule.
         """
         for i, row in enumerate(self._read(self._accepted_query())):
             if not row.kept and i > 0:
@@ -151,7 +154,7 @@ class VersionTable(CellTable):
         return None
 
     def load(self, version: int) -> ModelVersion:
-        """Return an accepted version of the cell or its product, with its arrays.
+        """Return a version that was put in force in the cell or its product, with its arrays.
 
         Parameters
         ----------
@@ -165,8 +168,8 @@ class VersionTable(CellTable):
         Raises
         ------
         VersionError
-            If there is no such accepted version, if its state is not kept (the error names the
-            versions whose states are), or if it is damaged.
+            If no such version was put in force, if its state is not kept (the error names the
+            versions whose states are kept), or if its state is damaged.
         """
         retrains = {
             row.version: row.retrain
@@ -182,10 +185,10 @@ class VersionTable(CellTable):
         return self._load_retrain(retrains[version])
 
     def _load_retrain(self, retrain: int) -> ModelVersion:
-        """Return the version of a retrain with its arrays.
+        """Return the version that the retrain with this number made, with its arrays.
 
-        The version of another cell is returned without the state of its rule, and with a
-        `rule_last_seq` of 0. Raise VersionError if the state is missing or damaged.
+        A version of another cell is returned without the state of its rule, and its `rule_last_seq`
+        is 0: the rule includes no label. Raise VersionError if the state is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
@@ -204,14 +207,14 @@ class VersionTable(CellTable):
         return ModelVersion(row.version, row.last_seq, state)
 
     def all(self, cell_only: bool = False) -> list[StoredVersion]:
-        """Return every retrain of the cell or its product, dropped ones included, oldest first.
+        """Return every retrain of the cell or its product, oldest first.
 
-        Their arrays are not read.
+        Retrains whose version was dropped (not put in force) are included. No arrays are read.
 
         Parameters
         ----------
         cell_only : bool, default False
-            Leave out those of the product's other cells.
+            Leave out the retrains of the product's other cells.
 
         Returns
         -------
@@ -233,9 +236,10 @@ class VersionTable(CellTable):
         return [version.report for version in self.all()]
 
     def _accepted_query(self) -> sa.Select[Any]:
-        """Return the query for the accepted versions of the cell or its product, newest first.
+        """Return the query for the versions of the cell or its product that were put in force.
 
-        Its columns are retrain, version, and `kept`, whether the state is kept.
+        The rows are newest first. The columns are `retrain`, `version`, and `kept`: whether the
+        state is kept.
         """
         return (
             sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))

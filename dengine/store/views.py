@@ -132,9 +132,9 @@ class DecisionGroup:
     def label(self) -> str:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
-        "overdue": a check was asked for, has brought no label, and so many decisions followed that
-        it is too late. "none": there is no label and that is not overdue, as it never is for a
-        quarantined trace.
+        "overdue": a check was asked for, there is no label, and so many decisions followed that the
+        check is overdue. "none": there is no label and the check is not overdue, or none was asked
+        for. A check of a quarantined trace (stored, but never used in training) is never overdue.
         """
         if self.source is not None:
             if self.success is None:
@@ -170,7 +170,7 @@ class Tally:
         return sum(group.n for group in self.groups if is_counted(group))
 
     def by(self, field: str) -> Counter[Any]:
-        """Return the number of decisions by value of a `DecisionGroup`'s field or property."""
+        """Return the number of decisions per value of a field or property of `DecisionGroup`."""
         counts: Counter[Any] = Counter()
         for group in self.groups:
             counts[getattr(group, field)] += group.n
@@ -180,8 +180,8 @@ class Tally:
     def outcomes(self) -> Outcomes:
         """Counts of accepted, rejected and audited parts by label, for the certificate.
 
-        Audited parts count by what the model alone would have done. Parts that an operator's limits
-        rejected (`Reason.OUTSIDE`) are not counted as rejected.
+        An audited part counts as accepted or rejected by what the model alone would have done.
+        Parts that an operator's limits rejected (`Reason.OUTSIDE`) are not counted as rejected.
         """
         by_action = Counter[tuple[Action, str]]()
         audited = Counter[tuple[Action, str]]()  # by what the model alone would have done
