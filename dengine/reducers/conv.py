@@ -202,11 +202,11 @@ class ConvReducer(TorchReducer):
         done. No label is read.
         """
         if len(X) >= self.min_traces:
-            traces = self._check_and_start(X)
+            traces = self._check_and_initialize(X)
             self.rocket_.precompute(traces, numbers)
 
-    def _start(self, traces: Floats) -> None:
-        super()._start(traces)
+    def _initialize(self, traces: Floats) -> None:
+        super()._initialize(traces)
         self.rocket_.init_encoder(traces)
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:

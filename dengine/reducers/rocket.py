@@ -335,7 +335,7 @@ class RocketReducer(Reducer):
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
         folds = folds_of(traces, self.folds, folds)
-        self._start(traces)
+        self._initialize(traces)
         check_classes(labels, self.training_masks(folds))
         self._fit_heads(self.raw_features(traces), labels, folds)
         return self
@@ -360,7 +360,7 @@ class RocketReducer(Reducer):
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
-        traces = self._check_and_start(X)
+        traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
         check_classes(labels, self.training_masks(folds))
         return self.train_heads(traces, labels, folds, stop, numbers)
@@ -395,9 +395,9 @@ class RocketReducer(Reducer):
         stays as it is, since the first training will draw the kernels from more traces. Raises
         SettingError for a parameter out of its range or fewer than 2 samples.
         """
-        is_started = "net_" in vars(self)
-        reducer: Self = self if len(X) >= MIN_TRACES or is_started else clone(self)
-        reducer._check_and_start(X)
+        is_initialized = "net_" in vars(self)
+        reducer: Self = self if len(X) >= MIN_TRACES or is_initialized else clone(self)
+        reducer._check_and_initialize(X)
         return reducer.net_
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
@@ -408,18 +408,18 @@ class RocketReducer(Reducer):
         `MIN_TRACES` traces.
         """
         if len(X) >= MIN_TRACES:
-            self.raw_features(self._check_and_start(X), numbers)
+            self.raw_features(self._check_and_initialize(X), numbers)
 
-    def _check_and_start(self, X: Floats) -> Floats:
+    def _check_and_initialize(self, X: Floats) -> Floats:
         """Check traces and return them as (n, C, T).
 
         The first ones set the shape, the scales and the kernels.
         """
         if "net_" not in vars(self):
-            self._start(self.check_traces(X, reset=True))
+            self._initialize(self.check_traces(X, reset=True))
         return self.check_traces(X)
 
-    def _start(self, traces: Floats) -> None:
+    def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
         No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its

@@ -227,7 +227,7 @@ class TorchReducer(Reducer):
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
         folds = folds_of(traces, self.folds, folds)
-        self._start(traces)
+        self._initialize(traces)
         self._train(traces, labels, folds, StopRule(), steps=self.fit_steps)
         return self
 
@@ -246,7 +246,7 @@ class TorchReducer(Reducer):
         float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20 traces in
         the first training, and for fewer than two outside a fold.
         """
-        traces = self._check_and_start(X)
+        traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
         steps = self.n_steps_due(len(traces))
         return self._train(traces, labels, folds, stop or StopRule(), steps, numbers)
@@ -268,18 +268,18 @@ class TorchReducer(Reducer):
         """
         return int(min(self.fit_steps, INITIAL_STEPS + STEPS_PER_LABEL * n_labels))
 
-    def _check_and_start(self, X: Floats) -> Floats:
+    def _check_and_initialize(self, X: Floats) -> Floats:
         """Check traces and return them as (n, C, T); the first call starts the reducer.
 
         Raises SettingError if the first call has fewer than 20 traces.
         """
-        if not vars(self).get("is_started_"):
+        if not vars(self).get("is_initialized_"):
             do = "verify more parts first"
             expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
-            self._start(self.check_traces(X, reset=True))
+            self._initialize(self.check_traces(X, reset=True))
         return self.check_traces(X)
 
-    def _start(self, traces: Floats) -> None:
+    def _initialize(self, traces: Floats) -> None:
         """Build preprocessor and members anew for traces (n, C, T); no label is read.
 
         The channels' scales are read from the traces, the weights from the checkpoint, if any.
@@ -294,7 +294,7 @@ class TorchReducer(Reducer):
             load_checkpoint(self.members_, self.checkpoint)
             self.averaged_members_.load_state_dict(self.members_.state_dict())
         self.encoder_ = self._new_encoder()
-        self.is_started_ = True
+        self.is_initialized_ = True
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         """Set initial weights and an empty state for traces of this shape; no trace is read.
@@ -317,7 +317,7 @@ class TorchReducer(Reducer):
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
         self.can_compile_: bool | None = None  # until it was tried
-        self.is_started_ = False  # until scales and checkpoint are read
+        self.is_initialized_ = False  # until scales and checkpoint are read
         self.n_steps_ = 0
         self.n_steps_left_ = 0
         self.n_new_steps_ = 0
@@ -589,7 +589,7 @@ class TorchReducer(Reducer):
             i, key = name.split(".")
             moments = self.optimizer_state_.setdefault(int(i), {})
             moments[key] = torch.from_numpy(np.array(value))
-        self.is_started_ = True
+        self.is_initialized_ = True
         self.encoder_ = self._new_encoder()
         points = state.get("points")
         if points is not None and not np.allclose(points, self._embed_ramp(), atol=SAME_POINTS):

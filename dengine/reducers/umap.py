@@ -250,7 +250,7 @@ class UmapReducer(Reducer):
         """
         traces = self.check_traces(X, reset=True)
         self.check(len(traces))
-        self._start(traces)
+        self._initialize(traces)
         self._train(traces, None, StopRule(), self._n_first_epochs)
         return self
 
@@ -274,7 +274,7 @@ class UmapReducer(Reducer):
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
         if numbers is None or not self._has_searched_any(numbers):
-            self._start(traces)
+            self._initialize(traces)
         self._train(traces, numbers, stop or StopRule())
         return as_points(self.embedding_.numpy())
 
@@ -303,7 +303,7 @@ class UmapReducer(Reducer):
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
         if not self._is_fitted:
-            self._start(traces)
+            self._initialize(traces)
         neighbors = self.neighbors_.update(traces, numbers, self.make_frames_)
         self.precomputed_neighbors_: Neighbors | None = neighbors
 
@@ -322,7 +322,7 @@ class UmapReducer(Reducer):
         neighbors = self.precomputed_neighbors_ or self.neighbors_
         return bool(np.isin(numbers, neighbors.numbers).any())
 
-    def _start(self, traces: Floats) -> None:
+    def _initialize(self, traces: Floats) -> None:
         """Forget all trainings, draw the seed, and fit the frames to traces (n, C, T).
 
         Of many traces 256 at most, evenly spaced, are read. An earlier `encoder_` stays until the
