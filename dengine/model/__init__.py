@@ -1,4 +1,4 @@
-"""Models that decide on a trace: their contracts, dengine's own, the adapter of baselines. `Model`
+"""Models that decide on a trace: their interfaces, dengine's own, the adapter of baselines. `Model`
 is what a user's baseline implements, `EngineModel` what the engine drives, and `ModelPrediction` is
 dengine's own.
 """

@@ -1,7 +1,7 @@
-"""The two contracts of a model: `Model` for baselines, `EngineModel` for the engine. The file also
+"""The two interfaces of a model: `Model` for baselines, `EngineModel` for the engine. The file also
 holds `Prediction`, what a model answers; `BaselineAdapter`, by which `as_engine_model` makes an
 `EngineModel` of a baseline; and `Exportable`, what a model hands to an exporter. dengine's own
-`neighbours.ModelPrediction` implements both contracts.
+`neighbours.ModelPrediction` implements both interfaces.
 
 Calls that must not raise into the cell go through `engine.guard.guarded`.
 """
@@ -35,7 +35,7 @@ NO_TRACES: Floats = np.zeros((0, 1, 1), np.float32)
 
 
 class Prediction(NamedTuple):
-    """A model's prediction for one trace; fields as of `Decision`."""
+    """A model's prediction for one trace; its fields mean the same as those of `Decision`."""
 
     action: Action
     lower: float
@@ -113,9 +113,9 @@ class EngineModel(ABC):
     _conditions: DecisionConditions | None = None
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of those without effect.
+        """Return the recipe with this model's own settings in place of those that have no effect.
 
-        The default returns it unchanged.
+        The default returns the recipe unchanged.
         """
         return recipe
 
@@ -136,7 +136,7 @@ class EngineModel(ABC):
         y : array of int, shape (n,)
             1 is success, 0 is failure.
         hashes : array of int64, shape (n,)
-            Hash of each trace's part, or of its content; it deals the fold.
+            Hash of each trace's part, or of its content; the fold follows from it.
         stop : StopRule, optional
             Ends the training by steps or by the clock; None: the reducer's own number of steps.
         numbers : array of int64, shape (n,), optional
@@ -169,7 +169,7 @@ class EngineModel(ABC):
         """
 
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one trace: check faults and limits, ask `predict_one`, and draw audits.
+        """Decide on one trace: check faults and force limits, ask `predict_one`, and draw audits.
 
         `predict_one` is asked only if the trace has no fault and is within the limits; what it
         raises is raised here. An audit verifies a part that the model was certain of; whether it is
@@ -182,8 +182,8 @@ class EngineModel(ABC):
         part_hash : int
             Hash of its part's number; 0 for an unknown part, for which the content hash stands.
         conditions : DecisionConditions
-            Force limits, sensor limit and audits. The decider for them is kept and used again while
-            they stay equal.
+            Force limits, range of the sensor and audits. The decider for them is kept, and used
+            again while they stay equal.
 
         Returns
         -------
@@ -196,10 +196,11 @@ class EngineModel(ABC):
         return verdict
 
     def decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Return the decider for these conditions, and keep it.
+        """Return the decider for these conditions, and keep it for the next call.
 
         It is built anew if none is kept, or if the kept one is for other conditions. None stands
-        for no force limits, no sensor limit and no audits. Raises ValueError if nothing was fitted.
+        for no force limits, a sensor without a known range, and no audits. Raises ValueError if
+        nothing was fitted.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
@@ -208,7 +209,7 @@ class EngineModel(ABC):
         return self._decider
 
     def build_decider(self, conditions: Any) -> Decider:
-        """Build a decider of this model for these conditions, which asks `predict_one`.
+        """Build a decider for these conditions, which asks this model's `predict_one`.
 
         It is returned, not kept; `decider` keeps one.
         """
@@ -257,10 +258,11 @@ class EngineModel(ABC):
         """
 
     def change_reference(self, number: int, hash_: int, y: int | None) -> bool:
-        """Relabel the reference of this number, or remove it where `y` is None.
+        """Relabel the reference with this label number, or remove it if `y` is None.
 
-        Returns True, also where there is no such reference; False, with nothing changed, where it
-        has another hash, or the model cannot change one, as by default.
+        Returns True, also if there is no such reference. Returns False, with nothing changed, if
+        the reference has another hash than `hash_`, or if the model cannot change references; this
+        is the default.
         """
         return False
 
@@ -308,15 +310,13 @@ class EngineModel(ABC):
 
     @abstractmethod
     def successor(self) -> EngineModel:
-        """Return a model to train next, starting from this one, which is not changed by that."""
+        """Return a model to train next, which starts from this one and does not change it."""
 
     def prepare(self, previous: EngineModel) -> None:  # noqa: B027  # a default: nothing to prepare
         """Take over the previous model's rule, and be ready to predict at once.
 
         A rule that is stale, because an update of it failed, is taken over as well, and this model
         is stale then. The default does nothing.
-
-        The default does nothing.
         """
 
     @property
@@ -325,17 +325,18 @@ class EngineModel(ABC):
         return ""
 
     def defect(self) -> str:
-        """Return why the trained model must not be used; "" if it may. It must read no label.
+        """Return why the trained model must not be used; "" if it may be used.
 
-        It is called right after the training, where the model was trained.
+        It is called right after the training, in the same process. An implementation must not read
+        labels. The default returns "".
         """
         return ""
 
     def check_answers(self) -> Iterator[str]:
         """Decide on some training traces, one with each step of the iterator.
 
-        Yield for each why the model must not be used, "" if it may. It is called in the process
-        that will decide, after `prepare`. The default yields nothing.
+        For each trace it yields why the model must not be used, or "" if it may be used. It is
+        called in the process that will decide, after `prepare`. The default yields nothing.
         """
         return iter(())
 
@@ -356,15 +357,15 @@ class EngineModel(ABC):
         return self
 
     def needs_refit(self, state: Arrays) -> bool:
-        """Return whether `set_state` needs a model that was trained on the state's own traces.
+        """Return whether a model must be trained again before `set_state` can restore the state.
 
-        True by default.
+        It is then trained on the traces of the version that gave the state. True by default.
         """
         return True
 
 
 class PythonPredictor(nn.Module):
-    """Lets a `Decider` ask a model that has no compiled module.
+    """Lets a `Decider` ask a model that runs in Python.
 
     Parameters
     ----------
@@ -379,8 +380,9 @@ class PythonPredictor(nn.Module):
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """Predict one trace (C, T) by the model's `predict_one`; `part` is the hash of its part.
 
-        Returns positions of action and reason, lower, upper, n_success, n_failure, and an embedding
-        that is always empty, shape (0, 0).
+        Returns the positions of action and reason in `ACTIONS` and `REASONS`, lower, upper,
+        n_success, n_failure, and an embedding that is always empty, shape (0, 0). Raises what
+        `predict_one` raises.
         """
         prediction = self.model.predict_one(x.numpy(), part)
         action = ACTIONS.index(prediction.action)
@@ -395,7 +397,7 @@ class PythonPredictor(nn.Module):
 
 
 def as_engine_model(model: Model) -> EngineModel:
-    """Return a model as the engine drives it: an `EngineModel` as it is, a baseline adapted.
+    """Return the model itself if it is an `EngineModel`, else a baseline in a `BaselineAdapter`.
 
     The baseline is not copied. Raises SettingError for a class, and for an object that lacks a
     method of `Model`.
@@ -412,12 +414,13 @@ def as_engine_model(model: Model) -> EngineModel:
 class BaselineAdapter(EngineModel):
     """Makes an `EngineModel` of a baseline, which decides by its own rule.
 
-    A deep copy of the baseline is trained, so the present one goes on answering.
+    An engine trains a deep copy of the baseline, see `successor`, so the present one goes on
+    answering.
 
     Parameters
     ----------
     model : Model
-        Its settings are its author's affair: a store compares only the name of its class.
+        A store compares only the name of its class, not its settings.
     """
 
     keeps_references = False
@@ -437,12 +440,12 @@ class BaselineAdapter(EngineModel):
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """Return the baseline's decision on one trace (channels, samples), with bound and counts.
+        """Return the baseline's decision on one trace (channels, samples), with bounds and counts.
 
         The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding. `hash_` has no
         effect, because a baseline knows nothing of parts. Raises ValueError for an unknown action
         and for counts that are not whole numbers from 0 to 2**63 - 1 (OverflowError for an infinite
-        one); bounds are not checked.
+        count). Bounds are not checked.
         """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)
@@ -458,10 +461,10 @@ class BaselineAdapter(EngineModel):
         return Prediction(action, float(lower), float(upper), *counts, None, reason)
 
     def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
-        """Let the baseline take in the labelled trace.
+        """Pass the labelled trace to the baseline's `add`, which changes the baseline in place.
 
-        Returns the trace itself, which serves as its reference point. The baseline is changed in
-        place; number, hash and point have no effect.
+        Returns the trace itself, in place of a reference point. Number, hash, embedding and point
+        have no effect.
         """
         self.model.add(x, y)
         return x
@@ -477,21 +480,21 @@ class Exportable:
     Attributes
     ----------
     model : ModelPrediction
-        Fitted.
+        A fitted model.
     trace : TraceSpec
-        The trace contract.
+        What the traces look like.
     audit_rate : float
         Share of the certain decisions that are verified as audits.
     seed : int
-        Of the coin that draws audits.
+        Seed of the audit draw.
     stops_all : bool
-        Whether silence until the next decision confirms an accepted part.
+        Whether an accepted part is confirmed if nothing is reported until the next decision.
     force_limits : tuple of ForceLimits
-        As they act on traces.
-    model_version, recipe
-        What the file says of the engine; 0 and "" without one.
+        The force limits of the policy.
+    model_version, recipe : int, str
+        Version and recipe that the exported file names; 0 and "" if no engine made the model.
     examples : array of float32, shape (n, C, T)
-        Traces on which the compiled decision is compared with the reducer.
+        Traces on which the embeddings of the exported decider are compared with the reducer's.
     note : callable, optional
         Called with the kind and the text of an event, to record the export.
     """
@@ -508,5 +511,8 @@ class Exportable:
     note: Callable[[str, str], object] | None = None
 
     def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """Return itself, or a copy with this trace contract; exporters call it on any source."""
+        """Return itself if `trace` is None, otherwise a copy with this `TraceSpec`.
+
+        A `ModelPrediction` has this method as well, so an exporter takes either.
+        """
         return self if trace is None else replace(self, trace=trace)

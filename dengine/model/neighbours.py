@@ -94,7 +94,9 @@ OTHERWISE_COMPILED = (
 
 
 class Predictor(nn.Module):
-    """Encoder, novelty gate, references and rule as one module; compiles if the rule does.
+    """Encoder, novelty gate, references and rule in one module.
+
+    TorchScript compiles it if it compiles the encoder and the rule.
 
     Parameters
     ----------
@@ -133,8 +135,9 @@ class Predictor(nn.Module):
         """Predict one trace (C, T) of float32.
 
         `part` is the hash of its part, whose references are not counted; 0 excludes none. Returns
-        positions of action and reason, lower, upper, n_success, n_failure, and the scaled embedding
-        (K, d). A novel trace is verified without counting: the bound is (0, 1), the counts are 0.
+        the positions of action and reason in `ACTIONS` and `REASONS`, lower, upper, n_success,
+        n_failure, and the scaled embedding (K, d). A novel trace is verified without counting: its
+        bounds are 0 and 1, its counts are 0.
         """
         z = self.embed(x)
         if self.novelty(x):
@@ -163,12 +166,13 @@ _COMPILED: dict[Any, Any] = {}
 
 
 def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
-    """Return the compiled decider of this structure, and compile it if there is none yet.
+    """Return the template of a decider: a compiled decider of the same structure (`structure_of`).
 
-    It is the same object for all deciders of one `structure_of`, so do not change it: `compiled`
-    copies it. A new one decides three times on a ramp of `warm_up_shape` (C, T), so that later
-    calls are fast, and is kept in the process; of more than `KINDS` the oldest is dropped.
-    Compiling takes tens of milliseconds; RuntimeError if TorchScript cannot compile it.
+    If the process keeps none of this structure, `eager` is compiled, which takes tens of
+    milliseconds. The new template decides three times on a ramp of `warm_up_shape` (C, T), so that
+    later calls are fast. The process keeps it, and drops the oldest if there were `KINDS` before.
+    All deciders of a structure have the same template, so do not change it: `compiled` copies it.
+    Raises RuntimeError if TorchScript cannot compile the decider.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -184,11 +188,11 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 
 
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
-    """Return everything that a copy of a compiled module has of it, as a hashable key.
+    """Return a hashable key, equal for two modules if one compiled module can serve for both.
 
-    That is classes, attributes and shapes of all submodules, but not the tensors' values, which
-    `compiled` sets. The classes themselves are part of it, not their names: a notebook cell that is
-    run again defines another class.
+    The key holds the class and the attributes of all submodules; of a tensor it holds only the
+    shape, because `compiled` sets the values. The gate of the force limits is left out. The class
+    itself is in the key, not its name: a notebook cell that is run again defines another class.
     """
     parts = [
         (path, type(module), _as_key(attributes_of(module)))
@@ -199,10 +203,11 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 
 
 def _as_key(value: object) -> object:
-    """Return what `structure_of` compares of a module's attribute; None if it makes no difference.
+    """Return the part of `structure_of` for a value; None if the value makes no difference.
 
-    That is a function itself (not its address, which another may get later), or the type of a list,
-    tuple or dict with its items: of a constant its text, of a tensor its shape.
+    A function stands for itself; its address would not do, since another function may get it later.
+    A list, tuple or dict gives its type and its items: a constant as text, a tensor by its shape.
+    Any other value gives None.
     """
     if isinstance(value, FUNCTIONS):
         return value
@@ -222,11 +227,11 @@ def _as_key(value: object) -> object:
 
 
 def _is_code_unchanged(*modules: nn.Module) -> bool:
-    """Return whether no module's code was changed since TorchScript compiled it; else warn.
+    """Return whether no module's code was changed since TorchScript compiled it.
 
-    TorchScript keeps what it compiled first, so a class whose code was changed, as in a notebook,
-    must run in Python. Code that was never compiled counts as unchanged. The warning is logged and
-    names the classes.
+    Otherwise a warning is logged. TorchScript keeps the first code of a class that it
+    compiled, so a class whose code was changed, in a notebook for example, must run in Python. Code
+    that was never compiled counts as unchanged. The warning names the classes.
     """
     changed = [type(module).__name__ for module in modules if is_code_changed(module)]
     if changed:
@@ -241,9 +246,9 @@ def _is_code_unchanged(*modules: nn.Module) -> bool:
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return a compiled decider that shares the tensors of an eager one.
 
-    It is a copy of a template, the compiled decider that the process keeps for all of this
-    structure. Where there is none, one is compiled and warmed up on a trace of `warm_up_shape` (C,
-    T), see `template_of`, which may raise RuntimeError.
+    It is a copy of the template that the process keeps for all deciders of this structure. If the
+    process has no such template, `template_of` compiles it, and calls it on a trace of
+    `warm_up_shape` (C, T). Raises RuntimeError if TorchScript cannot compile it.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
     submodules = dict(module.named_modules(remove_duplicate=False))
@@ -256,7 +261,9 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 
 
 def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]:
-    """Compare the embeddings of a decider with the points of a reducer, a trace with each step.
+    """Compare the embeddings of a decider with the points of a reducer.
+
+    Each step of the iterator decides on one trace.
 
     Parameters
     ----------
@@ -269,7 +276,8 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     Yields
     ------
     str
-        What is wrong; "" if they are the same, and for a trace that has a fault for the decider.
+        What is wrong; "" if the two agree within `SAME_POINTS`, and for a trace in which the
+        decider finds a fault.
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
@@ -279,7 +287,10 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
 
 
 def is_close(points: Floats, expected: Floats, tolerance: float = SAME_POINTS) -> bool:
-    """Return whether points are no NaN and are the expected ones, within a relative tolerance."""
+    """Return whether points are not NaN and equal the expected ones within a tolerance.
+
+    The tolerance is relative for large coordinates and absolute for small ones.
+    """
     return bool(np.allclose(points, expected, rtol=tolerance, atol=tolerance))
 
 
@@ -297,24 +308,26 @@ class ModelPrediction(EngineModel):
         A name in `REDUCERS`, a `Reducer`, or any scikit-learn transformer; it is cloned, never
         fitted itself.
     classifier : WilsonRadiusClassifier, optional
-        Holds radius and policy; it is cloned, never fitted itself. None: with the reducer's radius.
+        Holds the radius, the policy and the largest number of references; it is never fitted. None:
+        one with the reducer's `default_radius`.
     folds : int
         Number of folds K for a transformer that uses labels and does not cross-fit by itself.
     rule : DecisionRule, optional
         Turns counts into an action; None: the rule of the classifier's policy.
     novelty : float
-        How far beyond its references a trace may lie, as in `Recipe`; 0: anywhere.
+        A trace is novel if it lies farther from the references than this allows, see `Recipe`; 0:
+        no trace is novel.
 
     Attributes
     ----------
     spaces : Reducer
-        The fitted reducer, cross-fitted where it uses labels.
+        The fitted reducer, cross-fitted if it uses labels.
     index : RadiusIndex
         The references; set by `fit`.
     scale : array of float32, shape (K,)
         Each space is divided by its scale; set by `fit`.
     gate : NoveltyGate
-        Set by `fit`.
+        Finds novel traces; set by `fit`.
     examples : array of float32, shape (n, C, T)
         Some of the training traces; none in a model that was restored.
     """
@@ -342,11 +355,11 @@ class ModelPrediction(EngineModel):
 
     @classmethod
     def from_recipe(cls, recipe: Recipe, seed: int = 0) -> Self:
-        """Return the untrained model that a recipe describes; `seed` is the reducer's.
+        """Return the untrained model that a `Recipe` describes; `seed` is for the reducer.
 
-        Reducer, radius, folds, novelty, policy and decision rule are the recipe's; its window is
-        the largest number of references. Raises SettingError for a reducer or a rule that cannot be
-        made.
+        Reducer, radius, folds, novelty, policy and decision rule are the recipe's; `recipe.window`
+        is the largest number of references. Raises SettingError if the reducer or the rule cannot
+        be made.
         """
         policy = recipe.policy
         classifier = WilsonRadiusClassifier(
@@ -370,10 +383,11 @@ class ModelPrediction(EngineModel):
         return f"{reducer} under {classifier}, {self.folds} folds, {type(self.rule).__name__}"
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of its.
+        """Return a copy of a recipe with the settings that this model really has.
 
-        These are radius, alpha, lower bound and interval of the classifier, folds (2 at least) and
-        novelty. All else, such as the reducer and the window, stays as the recipe has it.
+        Radius, alpha, lower bound and interval are taken from the model's classifier, folds (at
+        least 2) and novelty from the model. All else, such as the reducer and the window, stays as
+        in the recipe.
         """
         classifier = self.classifier
         policy = replace(
@@ -405,11 +419,11 @@ class ModelPrediction(EngineModel):
         return replace(report, note="; ".join(filter(None, (report.note, self._note))))
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
-        """Train the reducer from scratch, and make the traces the references.
+        """Train the reducer from scratch, and replace the references by the traces.
 
-        Of more traces than the classifier's capacity the last become references. Scales and novelty
-        gate are computed anew as well. The rule stays as it is. If the training raises, the reducer
-        is left untrained: fit again.
+        If there are more traces than the classifier's capacity, only the last become references.
+        The scales and the novelty gate are computed anew as well, the rule stays as it is. If the
+        training raises, the reducer is left untrained: call `fit` again.
 
         Parameters
         ----------
@@ -417,7 +431,8 @@ class ModelPrediction(EngineModel):
         y : array of int, shape (n,)
             1 is success, 0 is failure.
         hashes : array of int64, shape (n,), optional
-            `folds.trace_hash` of each trace, which gives its fold; None: of its content.
+            `folds.trace_hash` of each trace, which gives its fold; the number of hashes is not
+            checked. None: `folds.content_hash`.
 
         Returns
         -------
@@ -426,13 +441,12 @@ class ModelPrediction(EngineModel):
         Raises
         ------
         SettingError
-            Where the reducer cannot be trained, as by too few traces, or some reducers by one
-            class.
+            If the reducer cannot be trained: there are too few traces, or, for some reducers, a
+            single class. If 20 traces or more are all of one part.
         TraceError, DataError
-            For an array of another shape, and for labels other than 1 and 0.
+            If the shape of X is another, and if a label is neither 1 nor 0.
         ValueError
-            For another number of labels than of traces, and for samples that are not finite. The
-            number of hashes is not checked.
+            If there are not as many labels as traces, and if a sample is not finite.
         """
         X = as_traces(X)
         y = as_labels(y)
@@ -448,15 +462,15 @@ class ModelPrediction(EngineModel):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Self:
-        """Train the reducer on traces (n, C, T), from its last training where it can; return self.
+        """Train the reducer on traces (n, C, T), and replace the references by them; return self.
 
-        All traces become references, or the last ones if they exceed the classifier's capacity.
-        `index`, `scale`, `gate` (the novelty gate), `examples` and `trace_shape` are replaced, the
-        decider is dropped, and the rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,),
-        of the parts, give the folds; `numbers` (n,), of the labels, go to the references; `stop`
-        may end the reducer's training early. Extreme samples are clipped first. Raises SettingError
-        if the reducer cannot be trained on these, and for 20 traces or more that are all of one
-        part, since no label would count for another part.
+        A reducer that can go on from its last training does so. If there are more traces than the
+        classifier's capacity, only the last become references. `index`, `scale`, `gate` (the
+        novelty gate), `examples` and `trace_shape` are replaced, the decider is dropped, and the
+        rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds;
+        `numbers` (n,), of the labels, are kept with the references; `stop` may end the reducer's
+        training early. Extreme samples are clipped first. Raises SettingError if the reducer cannot
+        be trained on these traces, and if 20 traces or more are all of one part.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -489,12 +503,12 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        `numbers` are the labels' sequence numbers, by which the reducer finds its results again.
-        Before the first training, if reducer and rule can be compiled, a decider is compiled
-        meanwhile, in the caller's thread, and kept in the process as the template from which later
-        ones are copied: the first retrain has no time for that. The call returns when both are
-        done, and raises what one of them raised. A warning is logged if code was changed after it
-        was compiled.
+        `numbers` are the labels' sequence numbers, by which the reducer finds its results again. It
+        computes in a thread of its own. Before the first training, if reducer and rule can be
+        compiled, the caller's thread compiles a decider meanwhile, because the first retrain has no
+        time for that; the process keeps it as a template (`template_of`). The call returns when
+        both are done, and raises what either raised. A warning is logged if code was changed after
+        it was compiled.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -507,9 +521,9 @@ class ModelPrediction(EngineModel):
             computing.result()
 
     def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
-        """Compile a decider for traces of this shape (C, T), with empty references, and drop it.
+        """Compile a decider for traces of this shape (C, T), with empty references.
 
-        Its template, from which `compiled` copies later deciders, stays in the process. Nothing in
+        The process keeps it as a template, from which `compiled` copies later deciders. Nothing in
         the model changes.
         """
         channels, samples = trace_shape
@@ -525,11 +539,11 @@ class ModelPrediction(EngineModel):
     def prepare(self, previous: EngineModel) -> None:
         """Share the rule object of the previous model, and build the decider.
 
-        If either model is stale, because an update of its rule failed, this one is stale then. The
-        decider is built for the conditions (force limits, sensor limit, audits) under which the
-        previous model decided, or if it never did, for this one's. If this model has a decider with
-        that rule for those conditions, it is kept. Nothing happens if the previous model is no
-        `ModelPrediction`. Raises ValueError if nothing was fitted.
+        If the rule of either model is stale, because an update of it failed, this model is stale
+        afterwards. The decider is built for the `DecisionConditions` under which the previous model
+        decided, or, if that never decided, for those of this model. A decider that this model has
+        already, with the same rule and for the same conditions, is kept. Nothing happens if the
+        previous model is no `ModelPrediction`. Raises ValueError if nothing was fitted.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -550,14 +564,14 @@ class ModelPrediction(EngineModel):
         Parameters
         ----------
         conditions : DecisionConditions or None
-            None stands for no force limits, no sensor limit and no audits.
+            None stands for no force limits, a sensor without a known range, and no audits.
 
         Returns
         -------
         Decider
-            Compiled if encoder and rule can be compiled. Otherwise it runs in Python, and those of
-            its parts that can be compiled are. A warning is logged if the code of a part was
-            changed after it was compiled.
+            Compiled if encoder and rule can be compiled. Otherwise it runs in Python, and only some
+            of its submodules are compiled. This is also so if the code of the rule or the encoder
+            was changed after it was compiled; a warning is then logged.
 
         Raises
         ------
@@ -587,7 +601,7 @@ class ModelPrediction(EngineModel):
 
     @property
     def trace_spec(self) -> TraceSpec:
-        """Shape of the traces that it was trained on; ValueError if nothing was fitted."""
+        """`TraceSpec` with the shape of the training traces; ValueError if nothing was fitted."""
         if "index" not in vars(self):
             raise ValueError("Expected a fitted model; call fit(X, y) first.")
         channels, samples = self.trace_shape
@@ -605,10 +619,11 @@ class ModelPrediction(EngineModel):
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
         """Make one labelled trace, shape (samples,) or (channels, samples), a reference.
 
-        `y` is 1 for success, 0 for failure. The content of the trace gives its fold and stands for
-        its part. The reducer is not trained, and a full index drops its oldest reference. Returns
-        self; raises ValueError if nothing was fitted, TraceError for a trace of another shape, and
-        ReportError for another label. Samples are not checked: a NaN makes a reference of NaN.
+        `y` is 1 for success, 0 for failure. The hash of the trace's content gives the fold and
+        stands for the part. The reducer is not trained, and a full index drops its oldest
+        reference. Samples are not checked: a NaN makes a reference of NaN. Returns self. Raises
+        ValueError if nothing was fitted, TraceError for a trace of another shape, and ReportError
+        for another label.
         """
         X = as_traces(np.asarray(x)[None], self.trace_spec)
         hash_ = int(content_hash(X)[0])
@@ -627,9 +642,11 @@ class ModelPrediction(EngineModel):
     ) -> Floats:
         """Add one labelled trace (channels, samples) to the index, in the space of its fold.
 
-        The hash of its part, `hash_`, gives the fold. The reference is `point` as it is, else the
-        row of `embedding` for that space, else computed. A full index drops its oldest reference.
-        `number` is the label's sequence number. Returns the point, float32 (d,), scaled.
+        The hash of its part, `hash_`, gives the fold. The reference is `point` if given, otherwise
+        the row of `embedding` for that space; without both it is computed from the trace. A full
+        index drops its oldest reference. `number` is the label's sequence number. Returns the
+        reference point, float32 (d,), scaled. Raises ValueError if it must be computed and nothing
+        was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
@@ -659,10 +676,10 @@ class ModelPrediction(EngineModel):
     ) -> None:
         """Update the rule in place with the outcome of one part and the novelty of its trace.
 
-        The rule's `observe` gets `n_unreported`, the accepted parts without a known outcome since
-        the last update, and `novel`; then its `update` gets the other arguments. The compiled
-        decider decides by the new state at once. If either raises, `rule_is_stale` is set and the
-        exception goes on to the caller.
+        The rule's `observe` gets `n_unreported`, the number of accepted parts without a known
+        outcome since the last update, and `novel`; then its `update` gets the other arguments, see
+        `EngineModel.update_rule`. The decider decides by the new state at once. If one of the two
+        raises, `rule_is_stale` is set and the exception is passed on.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
@@ -692,11 +709,11 @@ class ModelPrediction(EngineModel):
         return self.rule.learns()
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model under another policy, to be compiled anew around the same references.
+        """Return a model under another policy that shares the references and the reducer.
 
-        Its rule has learned nothing, and so has missed no outcome (`rule_is_stale` is False). This
-        model does not change, but both share the references and the reducer. Raises SettingError
-        for a rule that cannot be made.
+        Its rule is new, has learned nothing and is not stale; its decider is not built yet. This
+        model does not change, except that a reference that is added to either is in both. Raises
+        SettingError if the rule cannot be made.
         """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
@@ -711,7 +728,7 @@ class ModelPrediction(EngineModel):
         return SAFE_MODES[self.rule.safe_mode()]
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """Predict one trace (channels, samples) without force limits, fault checks and audits.
+        """Predict one trace (channels, samples) without fault checks, force limits and audits.
 
         References of the part with this hash are not counted; 0 excludes none. The trace's shape is
         not checked. Raises RuntimeError if the rule is stale, because an update of it failed, and
@@ -727,13 +744,14 @@ class ModelPrediction(EngineModel):
         )
 
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one raw trace x (C, T) by `decider(conditions)`, which may have to be built.
+        """Decide on one raw trace x (C, T), by the decider for these conditions.
 
-        References of the part with this hash are not counted; for an unknown part, 0, the content
-        hash stands. Returns a `Verdict`, the tuple that `Decider.forward` returns, with the scaled
-        embedding (K, d), a point in each of the K spaces. Raises ValueError if nothing was fitted,
-        and RuntimeError if the rule is stale, because an update of it failed; but a trace with a
-        fault is verified all the same.
+        The decider is built first if the one that the model keeps is for other conditions.
+        References of the part with this hash are not counted. 0 stands for an unknown part: then
+        references with the same content hash as the trace are not counted. Returns a `Verdict`, the
+        tuple that `Decider.forward` returns, with the scaled embedding (K, d), a point in each of
+        the K spaces. Raises ValueError if nothing was fitted, and RuntimeError if the rule is
+        stale, because an update of it failed; but a trace with a fault is verified all the same.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -744,7 +762,7 @@ class ModelPrediction(EngineModel):
         return verdict
 
     def _check_rule(self) -> None:
-        """Raise RuntimeError if the rule has missed an outcome."""
+        """Raise RuntimeError if the rule is stale: an update of it failed."""
         if self.rule_is_stale:
             raise RuntimeError("the rule has missed what became of a part, so it cannot be asked")
 
@@ -787,9 +805,8 @@ class ModelPrediction(EngineModel):
     def successor(self) -> "ModelPrediction":
         """Return a model to train next, with a copy of this one's reducer to start from.
 
-        Rule, references, scale and novelty gate are this model's own objects. Training replaces the
-        last three in the successor only, so this model goes on deciding; `prepare` takes over the
-        rule.
+        The successor shares rule, references, scale and novelty gate with this model. Training
+        replaces the last three in the successor only, so this model goes on deciding.
         """
         model = copy.copy(self)
         model.spaces = copy.deepcopy(self.spaces)
@@ -800,9 +817,10 @@ class ModelPrediction(EngineModel):
     def defect(self) -> str:
         """Return why an engine could not open a store with this version; "" if it could.
 
-        The references, and the points of some training traces, must be finite, and a reducer that
-        is restored from this one's state must give these points, twice. A reducer without a state
-        must give them again itself. The points are kept for `check_answers`.
+        The references must be finite, and so must the points to which the reducer maps `examples`,
+        some training traces. A reducer that is restored from the state of this one must map
+        `examples` to the same points, each of two times; if a reducer gives no state, it must do
+        so itself. The scaled points are kept for `check_answers`.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -819,21 +837,26 @@ class ModelPrediction(EngineModel):
         return "" if all(is_close(z, points, SAME_BATCH) for z in answers) else NOT_RESTORED
 
     def scaled_points(self, X: Floats) -> Floats:
-        """Return the scaled embeddings (n, K, d) of traces (n, C, T), by the reducer itself."""
+        """Return the scaled embeddings (n, K, d) of traces (n, C, T), without the decider."""
         return self.spaces.embed(X) / self.scale[:, None]
 
     def check_answers(self) -> Iterator[str]:
-        """As `EngineModel.check_answers`, on the examples whose points `defect` has kept."""
+        """Compare the decider's embeddings of `examples` with the points that `defect` kept.
+
+        Yields for each example why the model must not be used, "" if it may be used. Call `defect`
+        before.
+        """
         decider = self.decider(self._conditions)
         return compare_points(decider, self.examples, self._example_points)
 
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
 
-        Trace shape, references and scale are always there; "reducer.", "rule." and "novelty." begin
-        the names of what these parts have. An enabled novelty gate is there, a disabled one not. A
-        stale rule is not there, but "rule_is_stale" is. Scale and reducer may be views. Raises
-        AttributeError before the first training.
+        Trace shape, references and scale are always in it. The names of the arrays of the reducer,
+        the rule and the novelty gate begin with "reducer.", "rule." and "novelty.". A reducer
+        without a state and a disabled gate have no arrays. In place of a stale rule there is
+        "rule_is_stale". Arrays of the scale and the reducer may be views. Raises AttributeError
+        before the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -849,11 +872,12 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale, rule and gate are restored, and the reducer if its state is there; else
-        (`needs_refit`) train this model on the same traces before the call. The decider is dropped.
-        A state of a stale rule leaves the rule as it is; `rule_is_stale` always stays as it is.
-        Raises StoreError if the fitted reducer keeps a state but this one lacks it, and for a rule
-        or gate of other sizes; KeyError or ValueError for the state of another reducer.
+        References, scale, rule and novelty gate are restored, and the reducer if the state holds
+        it. If it does not (`needs_refit`), train this model on the same traces before this call.
+        The decider is dropped. If the rule was stale, the state does not hold it, and this model's
+        rule stays as it is; `rule_is_stale` always stays as it is. Raises StoreError if the state
+        holds no reducer although this fitted reducer gives a state, and for a rule or gate of other
+        sizes; KeyError or ValueError for the state of another reducer.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
@@ -872,13 +896,13 @@ class ModelPrediction(EngineModel):
         return self
 
     def needs_refit(self, state: Arrays) -> bool:
-        """Return whether the reducer has no state there, so that it must be fitted again."""
+        """Return whether a state does not hold the reducer, which must then be trained again."""
         return not arrays_with_prefix(state, "reducer.")
 
     def exported(self, trace: TraceSpec | None) -> Exportable:
-        """Return what an exporter starts from: this model and a trace contract.
+        """Return an `Exportable` of this model, from which an exporter starts.
 
-        That is `trace`, or where it is None the shape of the traces it was trained on. Raises
+        Its `TraceSpec` is `trace`, or if that is None, the shape of the training traces. Raises
         ExportError before the first training.
         """
         if "trace_shape" not in vars(self):
@@ -893,11 +917,12 @@ class ModelPrediction(EngineModel):
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     """Count those of the newest `NEWEST` traces that nearly repeat one of another part among them.
 
-    Labels are counted as independent trials, so a part that is inserted again must be known as such
-    (`part=`). This notices the plain cases where it is not; it changes no decision. Only traces of
-    other parts are compared with a trace. It counts if the nearest of them is nearer than `NEAR`
-    times the distance of the one that comes after the `NEIGHBOURS` nearest; so more near repeats
-    than that hide one another. If there are only 1 to `NEIGHBOURS` of them, the trace counts.
+    Labels are counted as independent trials, so the number of a part that is inserted again must be
+    given (`part=`). This function notices plain cases in which it was not; no decision depends on
+    it. A trace is compared with the traces of other parts only. It nearly repeats one if the
+    nearest of them is nearer than `NEAR` times the distance to the next after the `NEIGHBOURS`
+    nearest. So a trace with more than `NEIGHBOURS` near repeats does not count, and a trace that
+    has only 1 to `NEIGHBOURS` traces of other parts to compare with counts.
 
     Parameters
     ----------
@@ -932,10 +957,9 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 
 
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
-    """Return a note for the retrain's report if many traces nearly repeat another part's, else "".
+    """Return a note for the report of a retrain if `near_repeats` counts many traces, else "".
 
-    `near_repeats`, whose arguments it takes, counts them among the newest `NEWEST` traces; more
-    than `MANY_REPEATS` are many.
+    It takes the arguments of `near_repeats`. More than `MANY_REPEATS` traces are many.
     """
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:

@@ -84,8 +84,8 @@ def make_reducer(name: str, **params: Any) -> Any:
     name : str
         A name in `REDUCERS`, or `module:Class`.
     **params
-        Parameters of its class. Only for names in `REDUCERS` are types checked here, and that
-        integers have at most 32 bits; narrower ranges are checked when it is fitted.
+        Parameters of its class. For names in `REDUCERS` their types are checked here, and that
+        integers have at most 32 bits; `fit` checks narrower ranges.
 
     Returns
     -------
@@ -111,9 +111,10 @@ def make_reducer(name: str, **params: Any) -> Any:
 def _check_parameter(default: Any, key: str, value: Any) -> None:
     """Raise SettingError unless a reducer's parameter `key` may have this value.
 
-    A value must have the type of the default, or be any number but NaN where that is a float.
-    `folds` lies between 2 and 1000, another integer within 32 bits. Any value will do if the
-    default is neither bool, str, int nor float, such as None. Otherwise every retrain would fail.
+    The value must have the type of `default`; if that is a float, any number but NaN will do.
+    `folds` must lie between 2 and 1000, any other integer within 32 bits. If the default is
+    neither bool, str, int nor float, as None is, the value is not checked. Without the check, a
+    wrong value would make every retrain fail.
     """
     integers = (2, 1000) if key == "folds" else (-MAX_INTEGER, MAX_INTEGER)
     checks = {

@@ -65,7 +65,7 @@ class StopRule:
     late : bool
         Whether the deadline, and not the number of steps, ended the fit.
     last_step : float or None
-        When the last step began, of a fit with a deadline; None before the first.
+        When the last step of a fit with a deadline began; None before the first step.
     """
 
     deadline: float | None = None
@@ -78,9 +78,9 @@ class StopRule:
         """Return whether step number `step`, counted from 0, may not begin any more.
 
         That is so once `max_steps` steps were taken, or once the deadline has passed and at least
-        `min_steps` steps were taken. It sets `late` to whether the deadline is the reason; if
-        `max_steps` is, `late` stays as it is. With a deadline it also sets `last_step`, to the
-        present time, if the step may begin.
+        `min_steps` steps were taken. With a deadline, `late` becomes True if the deadline is the
+        reason; if the step may begin, `late` becomes False and `last_step` the present time. If
+        `max_steps` is the reason, neither is changed.
         """
         if self.max_steps is not None and step >= self.max_steps:
             return True
@@ -104,8 +104,8 @@ class FitReport:
     note : str
         One line for the operator.
     n_steps_left : int
-        Steps that are missing until training is complete. While there are some, the engine
-        retrains after every cycle.
+        Steps that are missing until training is complete. If there are some, an engine without a
+        product retrains again without waiting for new labels.
     """
 
     n_steps: int = 0
@@ -128,10 +128,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     min_traces : int
         Number of labelled traces that an engine collects before the first training.
     default_radius : float
-        Radius of the neighbourhood whose labels count, where a recipe names none. Unless
-        `own_unit`, the embedding is first scaled to a root mean square radius of 1.
+        Radius of the neighbourhood whose labels count, if a recipe names none. Unless `own_unit`
+        is True, the embedding is first scaled to a root mean square radius of 1.
     default_retrain_every : int
-        New labels between two retrains, where a recipe names none.
+        New labels between two retrains, if a recipe names none.
     """
 
     uses_labels = False
@@ -154,10 +154,11 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
 
     def transform(self, X: ArrayLike) -> Floats:
-        """Embed traces for pictures: the mean of all spaces. Decide by `embed` instead.
+        """Embed each trace as one point, the mean over all spaces, for pictures.
 
-        A subclass defines this method or `embed`. Traces are embedded one by one, as a cell does,
-        since in a batch the last bits of a result depend on the other traces.
+        Decisions use `embed`, which gives a point in each space. A subclass defines this method or
+        `embed`. Traces are embedded one by one, as in a cell, since in a batch the last bits of a
+        result depend on the other traces.
 
         Parameters
         ----------
@@ -172,7 +173,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         NotFittedError
             Before a fit.
         ValueError
-            For values that are not finite, and traces of another shape than in `fit`.
+            If a value is not finite, or the traces have another shape than in `fit`.
         """
         traces = self.check_traces(X)
         return np.concatenate(
@@ -194,8 +195,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     ) -> Floats:
         """Train for an engine, and return the embedding of the traces as references.
 
-        The default fits anew, and neither `stop` nor `numbers` has an effect. A reducer that can
-        goes on from the last training.
+        The default fits anew, and neither `stop` nor `numbers` has an effect. A subclass may go on
+        from its last training instead.
 
         Parameters
         ----------
@@ -222,9 +223,9 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def untrained_module(self, X: Floats) -> Any:
         """Return a module like the one that `module` returns after training on X (n, C, T).
 
-        Its attribute `dim` is the number of coordinates. None, as by default: it is not known
-        before training. The engine compiles this module ahead of the first training, which then has
-        less to do. Kernels or weights may be drawn here.
+        Its attribute `dim` is the number of coordinates. None, the default, if the module is not
+        known before training. The engine compiles this module ahead of the first training, which
+        then has less to do. Random kernels or weights may be drawn here.
         """
 
     def warm_up(self) -> None:  # a default: nothing to load
@@ -234,10 +235,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute now, and keep, what the next `train` needs from traces X (n, C, T), labels aside.
+        """Compute now, and keep, what the next `train` needs of traces X (n, C, T) without labels.
 
-        `numbers` are those of the labels, as in `train`, by which `train` finds the results again.
-        The default does nothing.
+        `numbers` are the numbers of the labels, by which `train` finds the results again. The
+        default does nothing.
         """
 
     def embed(self, X: Floats) -> Floats:
@@ -258,15 +259,14 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def module(self) -> "nn.Module | None":
         """Return the embedding as a module that TorchScript can compile, (B, C, T) -> (B, K, d).
 
-        None, as by default: the reducer has no module, so it embeds in Python and cannot be
-        exported.
+        None, the default, if the reducer has no module: it embeds in Python and cannot be exported.
         """
         return None
 
     def get_state(self) -> State | None:
         """Return arrays from which `set_state` restores the reducer bit for bit.
 
-        None, as by default: it can only be restored by fitting it again.
+        None, the default, if the reducer can only be restored by fitting it again.
         """
         return None
 
@@ -307,19 +307,19 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         array of float32, shape (n, C, T)
-            Writeable, and the caller's own memory where X already has that form.
+            Writeable; the memory of X itself if X has this shape and type already.
 
         Raises
         ------
         NotFittedError
             Without `reset`, before a fit.
         ValueError
-            If a value is not finite or not a number, if a table has other columns than in `fit`,
-            and with `reset` if there is no trace.
+            If a value is not finite or not a number. If X is a single trace (T,), or a table or
+            array (n, T) with other columns than in `fit`. With `reset`, if there is no trace.
         TraceError
-            If the shape is none of traces, or another than in `fit`, and with `reset` if no sample
-            reaches 1e-12, whose square float32 hardly holds; a plain ValueError for a
-            single trace (T,) and for another number of columns of X (n, T).
+            If X has another number of dimensions, or no samples. If X (n, C, T) has another shape
+            than in `fit`. With `reset`, if all samples are below 1e-12 but not all are 0, because
+            float32 hardly holds their squares.
         """
         if not reset:
             check_is_fitted(self)
@@ -383,17 +383,20 @@ def as_rows(traces: Floats) -> Floats:
 
 
 def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
-    """Return (n, d) of an embedding (n, K, d): row i in space ``folds[i]`` or the only space."""
+    """Return the points (n, d) of an embedding (n, K, d): point i in space ``folds[i]``.
+
+    If there is a single space, all points are in it.
+    """
     spaces = np.asarray(folds) if Z.shape[1] > 1 else np.zeros(len(Z), dtype=np.int64)
     return np.ascontiguousarray(Z[np.arange(len(Z)), spaces])
 
 
 def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
-    """Return the scale of each space: the root mean square radius of its fold's points.
+    """Return the scale of each space: the root mean square distance of its points from their mean.
 
-    The radius is the distance from their mean. Outliers are left out, since a single one would draw
-    all other points together. These are points more than 50 times as far from the median as the
-    median point, unless they are more than 5 % of a fold's points and more than one.
+    Space k has the points of fold k. Outliers are left out, since a single one would draw all other
+    points together. Outliers are the points more than 50 times as far from the median as the median
+    distance. If these are several, and more than 5 % of the fold's points, none is left out.
 
     Parameters
     ----------
@@ -406,7 +409,7 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     Returns
     -------
     array of float32, shape (K,)
-        1 where a fold has no points, or points without a finite spread above rounding.
+        1 for a fold without points, or if their spread is not finite or not above rounding errors.
     """
     scale = np.ones(n_spaces, dtype=np.float32)
     for k in range(n_spaces):
@@ -428,8 +431,8 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
 def binary_labels(y: Any, n: int, name: str) -> Ints:
     """Return labels of two classes as int64 (n,): 1 for the larger class, 0 for the other.
 
-    Labels of 0 and 1 stay as they are, also if only one of them occurs. Another lone class becomes
-    1. A column (n, 1) is taken, with a warning.
+    Labels of 0 and 1 stay as they are, also if only one of them occurs. A single class that is
+    neither 0 nor 1 becomes 1. A column (n, 1) is accepted with a warning.
 
     Parameters
     ----------
@@ -437,7 +440,7 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     n : int
         Number of traces.
     name : str
-        Of the reducer, for the message of an error.
+        Name of the reducer, for the message of an error.
 
     Returns
     -------
@@ -446,8 +449,8 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
     Raises
     ------
     SettingError
-        If there are no labels, more than two classes, continuous or not finite ones, or another
-        number than n.
+        If `y` is None, or its labels are of more than two classes, continuous, not finite, or not
+        n in number.
     """
     if y is None:
         raise SettingError(
@@ -475,8 +478,8 @@ def binary_labels(y: Any, n: int, name: str) -> Ints:
 def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     """Return the folds of traces (n, C, T), int64 (n,): those given, or by a hash of each trace.
 
-    Given folds are cast to int64. Raises SettingError if they are not one from 0 to n_folds - 1 for
-    each trace.
+    Given folds are cast to int64. Raises SettingError unless there is one for each trace, and each
+    lies between 0 and n_folds - 1.
     """
     if folds is None:
         return content_fold(traces, n_folds)
@@ -487,10 +490,11 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
 
 
 def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
-    """Raise SettingError unless the labels (n,) outside each fold have both classes.
+    """Raise SettingError unless, for each fold, the labels (n,) outside it have both classes.
 
-    Row k of `masks`, bool (K, n), tells which labels are outside fold k. With none there the
-    message blames the sensor or the unit, as all traces are the same; else it asks for more labels.
+    Row k of `masks`, bool (K, n), tells which labels are outside fold k. The message asks for more
+    labels. If no label is outside a fold, all traces are the same and so in one fold: the message
+    then asks to check the sensor and the unit of measurement.
     """
     for fold, outside in enumerate(masks):
         n_classes = len(np.unique(labels[outside]))
@@ -524,7 +528,7 @@ def seed_of(random_state: Any) -> int | None:
 
 
 def draw_seed(random_state: Any) -> int:
-    """Return the seed of a `random_state` as `seed_of` does, but a random one for None."""
+    """Return the seed of a `random_state`, see `seed_of`; for None, return a random seed."""
     seed = seed_of(random_state)
     return int(np.random.default_rng().integers(2**31)) if seed is None else seed
 
@@ -557,13 +561,14 @@ class _Wrapping(Reducer):
 
     @property
     def own_unit(self) -> bool:  # type: ignore[override]  # elsewhere a constant of the class
-        """Return `own_unit` of a wrapped `Reducer`; False for other transformers."""
+        """Return `own_unit` of the wrapped `Reducer`; False for another transformer."""
         return self.reducer.own_unit if isinstance(self.reducer, Reducer) else False
 
     def as_input(self, X: Floats) -> Any:
         """Return traces (n, C, T) as the wrapped transformer takes them.
 
-        A `Reducer` takes them as they are, others rows (n, C * T), as a copy that they may change.
+        A `Reducer` takes them as they are. Another transformer takes rows (n, C * T), in a copy
+        that it may change.
         """
         return X if isinstance(self.reducer, Reducer) else as_rows(X).copy()
 
@@ -606,7 +611,7 @@ class CrossFitted(_Wrapping):
     reducer : transformer
         It is not fitted itself; `fit` fits K clones of it, `clones_`.
     folds : int, default 2
-        K, at least 2. The fold of a trace is an integer hash of its content; see `folds.py`.
+        K, at least 2. The fold of a trace follows from a hash of its content; see `folds.py`.
     """
 
     uses_labels = True
@@ -628,7 +633,7 @@ class CrossFitted(_Wrapping):
         y : array, shape (n,)
             Labels of two classes, of which the larger is given to the clones as 1, the other as 0.
         folds : array of int64, shape (n,), optional
-            Fold of each trace, 0 to K - 1, not checked. None: by its content.
+            Fold of each trace, 0 to K - 1; it is not checked. None: by a hash of its content.
 
         Returns
         -------
@@ -640,7 +645,7 @@ class CrossFitted(_Wrapping):
             If K is below 2, the labels are missing or not of two classes, or the traces outside a
             fold have a single class.
         TraceError, ValueError
-            For an X of another shape, and for values that are not finite.
+            If X has a shape that is none of traces, or a value is not finite.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

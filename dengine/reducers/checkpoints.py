@@ -1,4 +1,4 @@
-"""Checkpoints of a network: weights of a single member, from which all members of a reducer start.
+"""Checkpoints of a network: weights of one copy of it, from which all copies in a reducer start.
 `save_checkpoint` writes one; `TorchReducer(checkpoint=...)` reads it with `load_checkpoint`. A
 checkpoint holds tensors alone, so that loading it runs no code.
 """
@@ -19,10 +19,10 @@ SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names of parameters in
 
 
 def save_checkpoint(members: Members, path: str | Path) -> None:
-    """Write the weights of a single member to a file, which is replaced if it exists.
+    """Write the weights of a `Members` with one copy of the network to a file.
 
-    The file is written as a whole or not at all. Raises SettingError for more than one member,
-    OutputError if the file cannot be written.
+    An existing file is replaced. The file is written as a whole or not at all. Raises SettingError
+    if there is more than one copy, OutputError if the file cannot be written.
     """
     expect(members.count == 1, "a single member", members.count)
     content = BytesIO()  # torch's own writer aborts the process on a full disk
@@ -31,7 +31,7 @@ def save_checkpoint(members: Members, path: str | Path) -> None:
 
 
 def load_checkpoint(members: Members, path: str | Path) -> None:
-    """Copy the weights of a checkpoint, which holds a single member, into every member, in place.
+    """Copy the weights of a checkpoint into every copy of the network in `members`, in place.
 
     Buffers, such as the statistics of batch normalisation, are copied as well.
 
@@ -39,8 +39,7 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     ------
     SettingError
         If the file cannot be read, has other names, shapes or types than the network, or has values
-        that are not finite or larger than 1e6, or negative variances. In these cases no member is
-        changed.
+        that are not finite or larger than 1e6, or negative variances. `members` is then unchanged.
     """
     weights = read_tensors(path)
     state = members.state_dict()
@@ -87,7 +86,7 @@ def read_tensors(path: str | Path) -> dict[str, Tensor]:
 
 
 def shape_of_member(name: str, value: Tensor, count: int) -> torch.Size:
-    """Return the shape that a tensor of `count` members has in a checkpoint of a single one."""
+    """Return the shape that a tensor of a `Members` of `count` copies has in a checkpoint."""
     if value.dim() == 0 or SEPARATE.match(name):
         return value.shape
     return torch.Size([value.shape[0] // count, *value.shape[1:]])

@@ -12,7 +12,7 @@
 
 With three signals or more there are fewer channels, and on short traces the first stride is 2.
 Batch normalisation and ReLU follow each convolution. `encoder.Members` puts two units and a logit
-behind the network, and `TorchReducer` trains several members of it side by side, each without the
+behind the network, and `TorchReducer` trains several copies of it side by side, each without the
 labels of one fold.
 
 References
@@ -45,21 +45,21 @@ MIN_SAMPLES_OF_STRIDE_4 = 160  # on shorter traces the first convolution has a s
 
 
 class ConvNetwork(nn.Module):
-    """Three convolutions, pooling over regions and a hidden layer, for one or several members.
+    """Three convolutions, pooling over regions and a hidden layer; one or several such networks.
 
     Parameters
     ----------
     channels, samples : int
         2 * C and L of the preprocessed traces: each signal is followed by its differences.
     members : int, default 1
-        Networks that are computed at once. Member k reads the `channels` inputs from
-        ``k * channels`` on and writes the `features` outputs from ``k * features`` on. Grouped
-        convolutions keep the members apart.
+        Number of separate networks that the module computes at once. Network k reads the `channels`
+        inputs from ``k * channels`` on and writes the `features` outputs from ``k * features`` on.
+        Grouped convolutions keep the networks apart.
     width : int, default 8
         Outputs of the first convolution for each signal; the others have twice as many. With many
         signals it is reduced, down to `width` // 3, so that the time of a step hardly grows.
     features : int, default 32
-        Outputs of each member.
+        Outputs of each network.
     """
 
     def __init__(
@@ -89,9 +89,9 @@ class ConvNetwork(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Preprocessed traces (B, members * channels, L) -> features (B, members * features).
 
-        The convolutions' outputs are pooled, as mean and maximum of each region and of the whole
-        trace, and pass the hidden layer with a ReLU. In training mode dropout makes the result
-        random.
+        The outputs of the convolutions are pooled to the mean and maximum of each region and of the
+        whole trace, and then pass the hidden layer and a ReLU. In training mode dropout makes the
+        result random.
         """
         h = self.convolutions(x)  # (B, members * C * 2 * width, P)
         mean = F.avg_pool1d(h, self.window, self.stride)  # (B, ..., regions)
@@ -133,7 +133,7 @@ class ConvEncoder(nn.Module):
     Parameters
     ----------
     network : Encoder
-        Preprocessor and trained members, one for each fold.
+        Preprocessor and trained copies of the network, one for each fold.
     rocket : FeatureEmbedding
         With one coordinate, the probability of success.
     """
@@ -173,7 +173,7 @@ def average_logits(
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class ConvReducer(TorchReducer):
-    """Embed traces by a convolutional network that is trained on the CPU, a bit at each retrain.
+    """Embed traces by a convolutional network that is trained on the CPU, in steps at each retrain.
 
     It is `TorchReducer` with `ConvNetwork`; the parameters are those of `TorchReducer`. The logit
     of success is the mean of two: that of the network, and that of a `RocketReducer`, which is
@@ -197,20 +197,23 @@ class ConvReducer(TorchReducer):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces (n, C, T) for `rocket_`, and cache them for `train`.
 
-        They are found again by `numbers`; without these they are not kept. The first call with
-        `min_traces` traces also builds the network and draws the kernels; with fewer nothing is
-        done. No label is read.
+        `train` finds them again by `numbers`; without numbers they are not kept. The first call
+        also builds the network and draws the kernels. With fewer than `min_traces` traces nothing
+        is done. No label is read.
         """
         if len(X) >= self.min_traces:
-            traces = self._check_and_start(X)
+            traces = self._check_and_initialize(X)
             self.rocket_.precompute(traces, numbers)
 
-    def _start(self, traces: Floats) -> None:
-        super()._start(traces)
+    def _initialize(self, traces: Floats) -> None:
+        super()._initialize(traces)
         self.rocket_.init_encoder(traces)
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
-        """As `TorchReducer._build`; `rocket_` is made as well, before the network."""
+        """Make `rocket_`, then all that `TorchReducer._build` makes, for traces of this shape.
+
+        The kernels and classifier heads of `rocket_` are 0 as yet.
+        """
         # Before `encoder_`, by which other threads see that there is a module.
         self.rocket_ = RocketReducer(
             n_components=1,
@@ -230,9 +233,9 @@ class ConvReducer(TorchReducer):
         steps: int,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Fit the heads of `rocket_`, then train the network in the time that is left.
+        """Fit the classifier heads of `rocket_`, then train the network until `stop` ends it.
 
-        `numbers` (n,) identify the traces; see `RocketReducer.train`. Returns the points of the
+        `numbers` (n,) identify the traces, see `RocketReducer.train`. Returns the points of the
         traces, float32 (n, d), with averaged logits, row i in space ``folds[i]``.
         """
         probabilities = self.rocket_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
@@ -240,7 +243,10 @@ class ConvReducer(TorchReducer):
         return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:
-        """As `Reducer.embed`; the first coordinate has the mean of both logits."""
+        """Embed traces (n, C, T) in every space; return float32 (n, K, d).
+
+        The logit of the first coordinate is the mean of those of the network and of `rocket_`.
+        """
         traces = self.check_traces(X)
         points = torch.from_numpy(super().embed(traces))
         return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
@@ -254,9 +260,10 @@ class ConvReducer(TorchReducer):
         return super().get_state() | rocket
 
     def set_state(self, state: Arrays) -> Self:
-        """As `TorchReducer.set_state`, also for the inner reducer `rocket_`.
+        """Restore what `get_state` returned, `rocket_` included; return self.
 
-        Raises StoreError for a state without one, as an older conv stored it.
+        The parameters must be the same. Raises StoreError if the state holds no `rocket_`, because
+        an older release stored it, and if the state is of another network.
         """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone

@@ -39,8 +39,8 @@ class Members(nn.Module):
     ----------
     network : callable
         ``network(channels, samples)`` returns a module from (B, channels, samples) to
-        (B, features). A factory that also takes ``members`` returns one module for all members,
-        from (B, K * channels, samples) to (B, K * features).
+        (B, features). If it has a parameter ``members``, it returns one module for all copies, from
+        (B, K * channels, samples) to (B, K * features).
     channels, samples : int
         Shape of a preprocessed trace.
     count : int
@@ -49,8 +49,8 @@ class Members(nn.Module):
     Raises
     ------
     SettingError
-        If `network` is a module instead of its class, the module does not give features, or members
-        share weights that are trained: they would see the labels of every fold.
+        If `network` is a module instead of its class, the module does not give features, or two
+        copies share weights that are trained: these would see the labels of every fold.
     """
 
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
@@ -83,11 +83,14 @@ class Members(nn.Module):
         self.offset = nn.Parameter(torch.full((count,), -INITIAL_SLOPE))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Traces of each member (B, K, channels, samples) -> logits (B, K)."""
+        """Preprocessed traces for each copy (B, K, channels, samples) -> logits (B, K)."""
         return self.logits(self.units(x))
 
     def units(self, x: Tensor) -> Tensor:
-        """Traces of each member (B, K, channels, samples) -> units (B, K, 2), from 0 to 1."""
+        """Preprocessed traces for each copy (B, K, channels, samples) -> units (B, K, 2).
+
+        The units lie between 0 and 1.
+        """
         features = self.networks(x)  # (B, K, F)
         units: Tensor = (features.unsqueeze(2) @ self.weight).squeeze(2) + self.bias
         return units.sigmoid()
@@ -98,7 +101,7 @@ class Members(nn.Module):
 
 
 class Grouped(nn.Module):
-    """Compute all members by one module, `network`: (B, K, C', L) -> (B, K, F)."""
+    """Compute all copies of a network by one module, `network`: (B, K, C', L) -> (B, K, F)."""
 
     def __init__(self, network: NetworkFactory, channels: int, samples: int, count: int) -> None:
         super().__init__()
@@ -111,7 +114,7 @@ class Grouped(nn.Module):
 
 
 class Separate(nn.Module):
-    """Compute each member by a module of its own: (B, K, C', L) -> (B, K, F)."""
+    """Compute each copy of a network by a module of its own: (B, K, C', L) -> (B, K, F)."""
 
     def __init__(self, networks: list[nn.Module]) -> None:
         super().__init__()
@@ -130,7 +133,7 @@ class FoldableSequential(nn.Sequential):
 
 
 class Encoder(nn.Module):
-    """Embed raw traces in the space of every member: (B, C, T) -> (B, K, dim).
+    """Embed raw traces in K spaces, one for each copy of a network: (B, C, T) -> (B, K, dim).
 
     Parameters
     ----------
@@ -156,10 +159,10 @@ class Encoder(nn.Module):
 
     @torch.jit.export
     def embed(self, x: Tensor) -> Tensor:
-        """Preprocessed traces of each member (B, K, C', L) -> embedding (B, K, dim).
+        """Preprocessed traces for each copy of the network (B, K, C', L) -> embedding (B, K, dim).
 
-        The first coordinate is the probability of success; the second, if `dim` is 2, is the
-        difference of the two units, times 0.1.
+        The first coordinate is the probability of success. The second, if `dim` is 2, is 0.1 times
+        the difference of the copy's two units, see `Members`.
         """
         units = self.members.units(x)
         probability = self.members.logits(units).sigmoid()
@@ -172,10 +175,10 @@ class Encoder(nn.Module):
 def fold_batch_norms(module: nn.Module) -> nn.Module:
     """Fold the batch normalisations of each `FoldableSequential` of a module into convolutions.
 
-    Each is folded into the `Conv1d` right before it, by `fuse_conv_bn_eval`; other batch
-    normalisations stay. The module must be in evaluation mode. It is changed in place and returned.
-    A `FoldableSequential` becomes a new, plain `Sequential`, so use the return value. The engine
-    and an exported file both compute with the folded module, so that their numbers are the same.
+    Each is folded into the `Conv1d` right before it, by `fuse_conv_bn_eval`. Batch normalisations
+    without a `Conv1d` before them, and those outside a `FoldableSequential`, stay. The module must
+    be in evaluation mode. It is changed in place and returned; use the return value, because a
+    `FoldableSequential` becomes a new, plain `Sequential`.
     """
     for name, child in module.named_children():
         setattr(module, name, fold_batch_norms(child))
@@ -191,17 +194,17 @@ def fold_batch_norms(module: nn.Module) -> nn.Module:
 
 
 def count_trained(module: nn.Module) -> int:
-    """Return the number of tensors of a module that are trained; what is shared counts once."""
+    """Return the number of tensors of a module that are trained; a shared tensor counts once."""
     return sum(weight.requires_grad for weight in module.parameters())
 
 
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
-    """Return the number of features of each member, by a trial on three traces of zeros.
+    """Return how many features a copy of a network gives, by a trial on three traces of zeros.
 
     `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
     evaluation mode, so that no statistics change; afterwards the networks are in training mode.
-    Raises ValueError unless the output is a tensor of floats of shape (3, any, at least 1).
-    Exceptions of the networks' `forward` are not caught.
+    Raises ValueError unless the output is a tensor of floats with three dimensions, three rows and
+    at least one feature. Exceptions of the networks' `forward` are not caught.
     """
     networks.eval()
     with torch.no_grad():

@@ -1,7 +1,7 @@
 """Cross-fitted logistic heads for `RocketReducer`: `fit_heads` fits K logistic regressions with a
-ridge penalty at once, head k on the rows outside fold k. With the heads come their leave-one-out
-logits, by which `RocketReducer` weighs its towers, without a row having trained the logit that it
-gets.
+ridge penalty at once, head k on the rows outside fold k. It also returns their leave-one-out
+logits, by which `RocketReducer` weighs its towers: the logit of a row there is of a head that was
+not trained on that row.
 
 References
 ----------
@@ -24,15 +24,15 @@ HALVINGS = 6  # of a step that raises the objective
 
 
 class HeadsFit(NamedTuple):
-    """K fitted heads.
+    """K fitted classifier heads: logistic regressions, each trained without one fold.
 
     Attributes
     ----------
     w : Tensor of float64, shape (K, W + 1)
         Weights, the bias last.
     left_out : Tensor of float64, shape (K, n)
-        Leave-one-out logit of each row by each head, valid where the row trains the head; the logit
-        of the base rate for heads in `at_base_rate`.
+        Leave-one-out logit of each row by each head, of use only if the row trains the head; the
+        logit of the base rate for heads in `at_base_rate`.
     at_base_rate : list of int
         Heads that predict their base rate.
     n_steps : int
@@ -69,10 +69,11 @@ class RidgeProblem:
 
     @classmethod
     def from_features(cls, g: Tensor, y: Tensor, outside: Tensor, l2: float) -> Self:
-        """Return the problem of features g (n, W), labels y (n,) and masks `outside` (K, n).
+        """Return the problem for features g (n, W), labels y (n,) and masks `outside` (K, n).
 
-        Head k is trained by the rows that its mask selects. A column of ones is appended to the
-        features. `l2` is the ridge of every weight but the bias, whose ridge is `BIAS_RIDGE`.
+        Head k, the logistic regression of fold k, is trained on the rows that mask k selects. A
+        column of ones is appended to the features. `l2` is the ridge of every weight but the bias,
+        whose ridge is `BIAS_RIDGE`.
         """
         g32 = torch.cat([g, torch.ones(len(g), 1)], 1)
         ridge = torch.full((len(outside), g32.size(1)), l2, dtype=torch.float64)
@@ -90,10 +91,10 @@ class RidgeProblem:
         return (self.mask * (p - self.y)) @ self.g + self.ridge * w
 
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
-        """Return the lower Cholesky factor of head k's Hessian, float64 (W + 1, W + 1).
+        """Return the lower Cholesky factor of the Hessian for head k, float64 (W + 1, W + 1).
 
-        `p` (n,) are the head's probabilities, at which the Hessian is taken. The product of
-        features is computed in float32, since a Newton step need not be exact.
+        The Hessian of logistic regression k depends on `p` (n,), the probabilities that head k
+        gives. The product of features is computed in float32, since a Newton step may be inexact.
         """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact
@@ -111,12 +112,14 @@ def fit_heads(
     stop: StopRule | None,
     min_steps: int = 0,
 ) -> HeadsFit:
-    """Fit K ridge logistic regressions by Newton's method with a line search.
+    """Fit K classifier heads, ridge logistic regressions, by Newton's method with a line search.
 
-    Each minimises the sum of its log losses plus ``l2 / 2 * |w| ** 2``, the bias nearly free. That
-    is convex, so it ends at the same weights wherever it starts, unless the steps are limited. A
-    head whose leave-one-out loss is above that of its base rate predicts the base rate. Each head
-    decides this alone: a common decision would let the labels of fold k choose head k.
+    Head k, trained without the labels of fold k, minimises the sum of its log losses plus
+    ``l2 / 2 * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the
+    same weights wherever it starts, unless the steps are limited. If the leave-one-out loss of a
+    head is above the loss of its base rate, the share of successes among its rows, the head is
+    replaced by the base rate. This is decided for each head alone, since a common decision would
+    let the labels of fold k choose head k.
 
     Parameters
     ----------
@@ -127,20 +130,21 @@ def fit_heads(
     outside : Tensor of bool, shape (K, n)
         Which rows train head k.
     w : Tensor of float64, shape (K, W + 1)
-        Where the heads start, the bias last; it is not changed.
+        Weights from which the heads start, the bias last; the tensor is not changed.
     l2 : float
         Ridge.
     max_iter : int
         Largest number of steps.
     stop : StopRule, optional
-        Asked before each step. None: until all heads have converged, or `max_iter`.
+        Asked before each step, which all heads take together. None: the steps go on until all heads
+        have converged, or `max_iter`.
     min_steps : int, default 0
-        Steps that are taken even after the deadline of `stop`, not beyond its `max_steps`.
+        Steps that are taken even after the deadline of `stop`, but not beyond its `max_steps`.
 
     Returns
     -------
     HeadsFit
-        Weights, leave-one-out logits, heads at their base rate and number of steps.
+        Weights, leave-one-out logits, heads that were replaced by the base rate, number of steps.
     """
     problem = RidgeProblem.from_features(g, y, outside, l2)
     # Every head takes part in every product, whether it has converged or not: a product of another
@@ -187,18 +191,18 @@ def fit_heads(
 def base_rate_if_better(
     w: Tensor, left_out: Tensor, y: Tensor, mask: Tensor
 ) -> tuple[Tensor, Tensor, list[int]]:
-    """Return heads, each that does worse than its base rate replaced by that rate.
+    """Replace each classifier head that does worse than its base rate by the base rate.
 
-    A head does worse if its leave-one-out log loss is larger than that rate's loss. The base rate
-    is the share of successes among all rows that train the head. Its loss is not a leave-one-out
-    loss, and therefore slightly too small.
+    The base rate is the share of successes among all rows that train the head. A head does worse if
+    its leave-one-out log loss is larger than the log loss of the base rate, which is slightly too
+    small, because it is no leave-one-out loss. A head whose rows are all of one class is kept.
 
     Parameters
     ----------
     w : Tensor of float64, shape (K, W + 1)
-        Heads, the bias last; they stay as they are.
+        Weights of the heads, the bias last; the tensor is not changed.
     left_out : Tensor of float64, shape (K, n)
-        Their leave-one-out logits.
+        Leave-one-out logits of the heads; the tensor is not changed.
     y : Tensor of float64, shape (n,)
         Labels, 1 or 0.
     mask : Tensor of float64, shape (K, n)
@@ -207,10 +211,10 @@ def base_rate_if_better(
     Returns
     -------
     w, left_out : Tensor
-        New tensors like the arguments. For a head at its base rate, all weights are 0 but the bias,
-        and its row of `left_out` is the logit of that rate.
+        New tensors like the arguments. For a head that was replaced, all weights but the bias are
+        0, and its row of `left_out` is the logit of the base rate.
     at_base_rate : list of int
-        The heads that were set to it.
+        The heads that were replaced.
     """
     rate = torch.logit((mask @ y) / mask.sum(1))[:, None].expand_as(left_out)
     # Of rows of one class, the rate has an infinite logit and a loss of NaN: the head stays.
@@ -222,21 +226,21 @@ def base_rate_if_better(
 
 
 def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:
-    """Approximate the logit that each head would give to every row, were it fitted without it.
+    """Approximate the logit of each row by each head as if the head was fitted without the row.
 
     Parameters
     ----------
     problem : RidgeProblem
         Features and labels.
     logits : Tensor of float64, shape (K, n)
-        By the heads that were fitted with the row.
+        Logits by the fitted heads.
     factors : Tensor of float64, shape (K, W + 1, W + 1)
         Cholesky factors of the heads' Hessians.
 
     Returns
     -------
     Tensor of float64, shape (K, n)
-        Exact to first order for rows that train the head; of no use for others.
+        Exact to first order for rows that train the head; of no use for other rows.
 
     References
     ----------
@@ -250,7 +254,7 @@ def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Ten
 
 
 def masked_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
-    """Compute mean log losses, in nats, of the rows of a mask.
+    """Compute mean log losses, in nats, over the rows that each mask selects.
 
     logits (..., K, n), labels y (n,), mask (K, n) of 1 and 0. Returns (..., K).
     """

@@ -57,9 +57,10 @@ class PcaReducer(Reducer):
         Raises
         ------
         SettingError
-            If there are no more than `n_components` traces, or fewer samples in a trace.
+            If there are no more traces than `n_components`, or if a trace has fewer samples than
+            that, all channels together.
         TraceError, ValueError
-            For an X of another shape, and for values that are not finite.
+            If X has a shape that is none of traces, or a value is not finite.
         """
         rows = as_rows(self.check_traces(X, reset=True))
         if len(rows) <= self.n_components:
@@ -85,8 +86,8 @@ class PcaReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit.
 
-        They are "mean" (C * T,), "components" (n_components, C * T) and "shape", (C, T); not
-        copies. Raises NotFittedError before `fit`.
+        They are "mean" (C * T,), "components" (n_components, C * T) and "shape", (C, T). The first
+        two are the reducer's own arrays, not copies. Raises NotFittedError before `fit`.
         """
         check_is_fitted(self, "components_")
         return {

@@ -46,11 +46,12 @@ class Preprocessor(nn.Module):
 
     @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
-        """Set mean and scale of each channel, and the scale of its differences, in place.
+        """Set the mean and scale of each channel, and the scale of its differences, in place.
 
-        They are read from the first 256 of the traces (n, C, T), after averaging. A scale is one
-        over the standard deviation, to which a small floor is added, for a channel that never
-        moved: a channel becomes (x - mean) * scale.
+        Only the first 256 of the traces (n, C, T) are read. First `average` neighbouring samples
+        are averaged to one. A channel x is then standardised to (x - mean) * scale, clipped at
+        ±8. `difference_scale` is for the differences in time of the standardised channel. A scale
+        is 1 / (standard deviation + a small floor); the floor is for a channel that never moved.
         """
         averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])
@@ -62,8 +63,7 @@ class Preprocessor(nn.Module):
         """Raw traces (B, C, T) -> averaged, standardised, with differences: (B, 2 * C, L).
 
         Channel 2 c + 1 holds the differences of channel 2 c in time, of which the first is 0. All
-        values are clipped at ±8. Samples that do not fill a mean are left out at the start of the
-        trace.
+        values are clipped at ±8. If T is no multiple of `average`, the first samples are left out.
         """
         x = self.standardise(self.average_samples(x))
         differences = (x[:, :, 1:] - x[:, :, :-1]) * self.difference_scale
@@ -85,7 +85,7 @@ def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
     Parameters
     ----------
     traces : Tensor of float32, shape (n, C, T)
-        At least one; of many, 256 at most that are evenly spaced are read.
+        At least one; at most 256 of them, evenly spaced, are read.
     min_frames : int, default 200
         Smallest number of samples of an averaged trace.
 

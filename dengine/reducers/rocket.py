@@ -72,11 +72,13 @@ MAX_INTEGER = 10**9  # of a parameter
 
 
 class FeatureEmbedding(nn.Module):
-    """Embed raw traces in the space of every head: (B, C, T) -> (B, K, d).
+    """Embed raw traces in each of K spaces: (B, C, T) -> (B, K, d).
 
-    Axis 1 is the success probability of head k, axis 2 the first principal component of tower 1.
-    A probability is the natural axis for counting: parts that are certain lie close together, and a
-    radius of 0.05 means "parts as promising as this one, give or take five in a hundred".
+    The first coordinate in space k is the success probability by head k, a classifier head that is
+    trained without the labels of fold k. The second is a sigmoid of the first principal component
+    of the first `Tower`. A probability is the natural axis for counting: parts that are certain lie
+    close together, and a radius of 0.05 means "parts as promising as this one, give or take five in
+    a hundred".
 
     Parameters
     ----------
@@ -86,7 +88,7 @@ class FeatureEmbedding(nn.Module):
     dim : int
         d, 1 or 2.
     n_leading : int
-        Components of tower 1 whose products are features.
+        Number of components of the first `Tower` whose products are features.
     """
 
     weight: Tensor
@@ -115,10 +117,12 @@ class FeatureEmbedding(nn.Module):
         return self.embed_features(self.encoder(x))
 
     def embed_features(self, f: Tensor) -> Tensor:
-        """Scaled features (B, P) -> embedding (B, K, d).
+        """Scaled features (B, P) -> embedding (B, K, d), a point in each of the K spaces.
 
-        The first axis is the probability of success by head k, from 0 to 1; the second, if d is 2,
-        is a sigmoid of a principal component, from 0 to 0.04, the same in every space.
+        Head k, the classifier that is trained without the labels of fold k, gives the first
+        coordinate in space k: the probability of success, from 0 to 1. If d is 2, the second
+        coordinate is the sigmoid of a principal component, scaled to 0 to 0.04; it is the same in
+        all spaces.
         """
         columns = torch.addmm(self.bias, f, self.weight)
         products = pairwise_products(columns.narrow(1, self.n_scores, self.n_leading))
@@ -132,17 +136,19 @@ def pairwise_products(g: Tensor) -> Tensor:
 
 
 class Tower(NamedTuple):
-    """Principal components of some of the features, and the heads on them.
+    """A group of features with its principal components, and K classifier heads on these.
+
+    Head k is a logistic regression that is trained without the labels of fold k.
 
     Attributes
     ----------
     axes : Tensor of float32, shape (p, W)
-        Principal axes of the tower's p features, scaled so that all components together have the
-        variance of the tower.
+        Principal axes of the tower's p features, scaled so that all components together have a
+        fixed variance.
     centre : Tensor of float32, shape (W,)
         Added to the components, so that their mean is 0.
     w : Tensor of float64, shape (K, W + 1)
-        Heads on the components, the bias last.
+        Weights of the heads on the components, the bias last.
     """
 
     axes: Tensor
@@ -153,7 +159,9 @@ class Tower(NamedTuple):
     def from_features(
         cls, f: Tensor, width: int, variance: float, weights: Tensor, mean_logits: Tensor
     ) -> Self:
-        """Compute the components of features, and the heads on them that are nearest to given ones.
+        """Compute the principal components of features, and classifier heads on the components.
+
+        The heads are the ones nearest to given heads on the features themselves.
 
         Parameters
         ----------
@@ -162,16 +170,17 @@ class Tower(NamedTuple):
         width : int
             W, the largest number of components.
         variance : float
-            Of all components together.
+            Variance of all components together.
         weights : Tensor of float32, shape (p, K)
             Weights of the given heads on the features.
         mean_logits : Tensor of float32, shape (K,)
-            Mean logit of each given head on these features, which becomes the bias.
+            Mean logit of each given head over the rows of `f`; it becomes the bias.
 
         Returns
         -------
         Tower
-            With the largest components first; axes of components that are no more than noise are 0.
+            Its components are sorted by variance, the largest first. The axes of components that
+            are no more than noise are 0.
         """
         centred = f - f.mean(0)
         # In float32, in half the time: components are told from noise to 1e-6.
@@ -189,9 +198,9 @@ class Tower(NamedTuple):
         return torch.addmm(self.centre, f, self.axes)
 
     def heads(self) -> tuple[Tensor, Tensor]:
-        """Return the heads as weights (p, K) and biases (K,) on the tower's features, float32.
+        """Return the classifier heads as weights (p, K) and biases (K,) on the features, float32.
 
-        They give the same logits as the heads `w` on the components.
+        They give the same logits on the tower's features as `w` on its components.
         """
         w = self.w[:, :-1]
         bias = self.w[:, -1]
@@ -202,21 +211,20 @@ class Tower(NamedTuple):
 def weigh_towers(
     left_out: list[Tensor], penalties: list[float], y: Tensor, outside: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Choose for each head the shares by which the logits of towers are mixed to one logit.
+    """Choose for each fold the shares by which the logits of several towers are mixed to one logit.
 
-    A tower is a group of features with heads of its own.
-
-    Tower by tower, the towers before keep a share of the mix, and the tower gets the rest. The kept
-    share is that of eleven values from 0 to 1 with the smallest penalised log loss on the rows
-    outside fold k, so that labels of fold k do not reach head k.
+    Each `Tower` has a head k, trained without the labels of fold k. The first tower starts with a
+    share of 1. Then each further tower gets a share of 0 to 1 in steps of 0.1, and the shares of
+    the towers before it are multiplied by the rest. The share is chosen that has the smallest
+    penalised log loss on the rows outside fold k, so that labels of fold k do not reach space k.
 
     Parameters
     ----------
     left_out : list of Tensor of float64, shape (K, n)
         Leave-one-out logits of each tower.
     penalties : list of float
-        Nats that a tower must save over all rows if nothing of the towers before is kept, and that
-        part of them if it gets a part of the mix. That of the first tower is not read.
+        For each tower, by how many nats it must lower the log loss, summed over the rows, to get a
+        share of 1; for a smaller share, in proportion less. The first value is not read.
     y : Tensor of int64, shape (n,)
         Labels.
     outside : Tensor of bool, shape (K, n)
@@ -225,9 +233,9 @@ def weigh_towers(
     Returns
     -------
     shares : list of Tensor of float32, shape (K,)
-        Share of each tower; they sum to 1.
+        Shares of each tower; over all towers they sum to 1.
     losses : Tensor of float64, shape (K,)
-        Leave-one-out log loss of each head with these shares, in nats per row.
+        Leave-one-out log loss of the mixed logit k over the rows outside fold k, in nats per row.
     """
     n_heads = len(outside)
     n_rows = outside.sum(1)
@@ -247,7 +255,7 @@ def weigh_towers(
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class RocketReducer(Reducer):
-    """Embed traces by drawn kernels and cross-fitted logistic heads.
+    """Embed traces by random convolution kernels and cross-fitted classifier heads.
 
     The first axis of the embedding is the predicted probability of success. The second is there
     for pictures.
@@ -257,13 +265,13 @@ class RocketReducer(Reducer):
     n_components : {1, 2}, default 2
         1 leaves the second axis out.
     folds : int, default 5
-        K, heads and spaces.
+        K, the number of folds, and so of classifier heads and of spaces.
     kernels, dilations, regions : int, default 28, 5, 3
-        Sizes of the first tower, F, D and R.
+        Sizes of the first `Tower`, F, D and R, see `RocketEncoder`.
     groups : int, default 2
-        G, groups of competing kernels of the second tower; 0 leaves it out.
+        G, groups of competing kernels of the second `Tower`; 0 leaves it out.
     width : int, default 128
-        Principal components of each tower.
+        Largest number of principal components of each `Tower`.
     l2 : float, default 0.5
         Ridge of the heads, in units of one label each.
     max_iter : int, default 20
@@ -276,7 +284,7 @@ class RocketReducer(Reducer):
     n_iter_ : int
         Steps of the last fit.
     holdout_losses_ : array of float64, shape (K,)
-        Leave-one-out log losses of the heads, each on rows outside its fold.
+        Leave-one-out log loss of the logit of each space, over the rows outside its fold.
     note_ : str
         One line for the operator.
 
@@ -310,7 +318,7 @@ class RocketReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Draw the kernels anew and fit the heads; earlier fits are forgotten.
+        """Draw the kernels anew and fit the classifier heads; earlier fits are forgotten.
 
         Parameters
         ----------
@@ -318,7 +326,7 @@ class RocketReducer(Reducer):
         y : array, shape (n,)
             Labels of two classes, the larger one for success.
         folds : array of int64, shape (n,), optional
-            Permanent folds. None: by the traces' content.
+            Fold of each trace, 0 to K - 1. None: by a hash of its content.
 
         Returns
         -------
@@ -328,14 +336,14 @@ class RocketReducer(Reducer):
         ------
         SettingError
             If a parameter is out of its range, labels or folds do not fit the traces, a trace has
-            one sample, or the traces outside a fold have a single class.
+            a single sample, or the traces outside a fold have a single class.
         TraceError, ValueError
-            For an X of another shape, and for values that are not finite.
+            If X has a shape that is none of traces, or a value is not finite.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
         folds = folds_of(traces, self.folds, folds)
-        self._start(traces)
+        self._initialize(traces)
         check_classes(labels, self.training_masks(folds))
         self._fit_heads(self.raw_features(traces), labels, folds)
         return self
@@ -348,19 +356,20 @@ class RocketReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Fit the heads from their present weights; the kernels stay those of the first training.
+        """Fit the classifier heads, starting from their last weights; return the reference points.
 
-        X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,)
-        identify the traces from call to call, so that the features of traces in the last call come
-        from a cache. `stop` may end the Newton steps. Of more than 4000 traces the heads read 4000,
-        which a hash of the numbers draws. The module `net_`, and so what `module` returned before,
-        is changed in place. Returns the points of all traces, float32 (n, d), row i in space
-        ``folds[i]``. Raises SettingError for fewer than 20 traces, and if the traces outside a fold
-        have a single class.
+        The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
+        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,) identify the
+        traces: a trace that was in the last call has its features in a cache. `stop` may end the
+        Newton steps. If there are more than 4000 traces, the heads are fitted to 4000 of them,
+        chosen by a hash of the numbers. The module `net_`, and so the module that `module` returned
+        before, is changed in place. The points are float32 (n, d), row i in space ``folds[i]``.
+        Raises SettingError for fewer than 20 traces, and if the traces outside a fold have a single
+        class.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
-        traces = self._check_and_start(X)
+        traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
         check_classes(labels, self.training_masks(folds))
         return self.train_heads(traces, labels, folds, stop, numbers)
@@ -373,12 +382,12 @@ class RocketReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Fit the logistic heads, without checking the input, and return the held-out embedding.
+        """Fit the classifier heads like `train`, but without checking the input.
 
-        Call `init_encoder` first: without it all kernels are 0 and the result is meaningless,
+        Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
         without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `net_`
-        is changed in place. The other parameters and the result, float32 (n, d), are those of
-        `train`.
+        is changed in place. Returns the points of the traces, float32 (n, d), row i in space
+        ``folds[i]``, whose head did not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -387,39 +396,39 @@ class RocketReducer(Reducer):
             return points_in_fold_space(points.numpy(), folds)
 
     def untrained_module(self, X: Floats) -> FeatureEmbedding:
-        """Return the module that embeds traces, with drawn kernels, to compile before a training.
+        """Return the module that embeds traces, so that it can be compiled before the training.
 
-        Before a training the heads of all spaces are 0. If no kernels are drawn yet, they are drawn
-        here from X (n, C, T), and the module is `net_` itself, which later trainings change in
-        place. But with fewer than `MIN_TRACES` traces it is the module of a clone, and this reducer
-        stays as it is, since the first training will draw the kernels from more traces. Raises
-        SettingError for a parameter out of its range or fewer than 2 samples.
+        It is `net_`, which later trainings change in place; before the first training its
+        classifier heads are 0. If no kernels are drawn yet, they are drawn here from the traces X
+        (n, C, T). If these are fewer than `MIN_TRACES`, the kernels are drawn in a clone, whose
+        module is returned, and this reducer stays as it is. Raises SettingError for a parameter out
+        of its range or fewer than 2 samples.
         """
-        is_started = "net_" in vars(self)
-        reducer: Self = self if len(X) >= MIN_TRACES or is_started else clone(self)
-        reducer._check_and_start(X)
+        is_initialized = "net_" in vars(self)
+        reducer: Self = self if len(X) >= MIN_TRACES or is_initialized else clone(self)
+        reducer._check_and_initialize(X)
         return reducer.net_
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces (n, C, T), and cache them for the next `train`.
 
-        They are found again by `numbers`, those of the labels; without these nothing is cached. The
-        first call with enough traces draws the kernels. It does nothing with fewer than
-        `MIN_TRACES` traces.
+        `train` finds them again by `numbers`, the numbers of the labels; without numbers nothing is
+        cached. The first call also draws the kernels. With fewer than `MIN_TRACES` traces nothing
+        is done.
         """
         if len(X) >= MIN_TRACES:
-            self.raw_features(self._check_and_start(X), numbers)
+            self.raw_features(self._check_and_initialize(X), numbers)
 
-    def _check_and_start(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T).
+    def _check_and_initialize(self, X: Floats) -> Floats:
+        """Check traces and return them as (n, C, T); build the module `net_` at the first call.
 
-        The first ones set the shape, the scales and the kernels.
+        The first traces set the shape, the scales of the channels and the kernels.
         """
         if "net_" not in vars(self):
-            self._start(self.check_traces(X, reset=True))
+            self._initialize(self.check_traces(X, reset=True))
         return self.check_traces(X)
 
-    def _start(self, traces: Floats) -> None:
+    def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
         No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
@@ -437,10 +446,11 @@ class RocketReducer(Reducer):
         self.net_.encoder.learn(torch.from_numpy(traces), generator)
 
     def build(self, channels: int, samples: int, average: int) -> None:
-        """Set a module `net_` whose kernels and heads are 0, and an empty state, for this shape.
+        """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
-        `average` is the number of samples that are averaged to one. Raises SettingError for a
-        parameter out of its range or fewer than 2 samples.
+        Towers, counters and the cache of features become empty. `average` is the number of samples
+        that are averaged to one. Raises SettingError for a parameter out of its range or fewer than
+        2 samples.
         """
         self.check()
         self.trace_shape_ = (channels, samples)
@@ -472,12 +482,14 @@ class RocketReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> None:
-        """Fit head k of each tower on rows outside fold k, weigh the towers, and write to `net_`.
+        """Fit the classifier heads of each `Tower`, and write them to `net_`, weighed to one logit.
 
-        raw (n, P) are raw features. The heads start from their present weights. Principal
-        components are computed anew at the first fit, at every twentieth, and when the traces are
-        half as many again as at the last time. Of more than 4000 rows 4000 are used. It sets
-        `towers_`, `n_iter_`, `holdout_losses_`, `n_fits_` and `note_`.
+        Head k starts from its last weights and is fitted on the rows outside fold k of the raw
+        features `raw` (n, P); if there are more than 4000 rows, on 4000 of them (`sample_rows`).
+        `stop` may end the Newton steps; at the first fit its deadline does so after three steps at
+        the earliest. The principal components are computed anew at the first fit, after every 20
+        fits, and if there are at least 1.5 times as many rows as when they were computed last. It
+        sets `towers_`, `n_iter_`, `holdout_losses_`, `n_fits_` and `note_`.
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -517,10 +529,10 @@ class RocketReducer(Reducer):
         self.note_ = note if useless else ""
 
     def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
-        """Write the heads of all towers to `net_`: their weights and biases, each times a share.
+        """Write the classifier heads of all towers to `net_`, each multiplied by its share.
 
-        `shares` has a tensor (K,) for each tower, its share of the logit. The heads that were there
-        are overwritten.
+        `shares` has a tensor (K,) for each `Tower`, its share of logit k. The heads in `net_` are
+        overwritten.
         """
         net = self.net_
         logit_columns = slice(0, net.n_scores, self.n_components)
@@ -532,23 +544,30 @@ class RocketReducer(Reducer):
             net.bias[logit_columns] += share * bias
 
     def _tower_features(self, f: Tensor) -> list[Tensor]:
-        """Return the features (n, p) of each tower from scaled ones (n, P), the products last."""
+        """Return the features (n, p) of each `Tower` from all scaled features (n, P).
+
+        The last are the products of the leading components.
+        """
         features = [f[:, columns] for columns in self.net_.encoder.towers]
         leading = self.towers_[0].components(features[0])[:, : self.net_.n_leading]
         return [*features, pairwise_products(leading)]
 
     def training_masks(self, folds: Ints) -> NDArray[np.bool_]:
-        """Return which rows (n,) train head k, those outside fold k: (K, n)."""
+        """Return masks (K, n): row k selects the traces outside fold k, which train head k."""
         return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compute_components(self, raw: Tensor) -> None:
-        """Set feature scales, principal components and second axis anew from raw features (n, P).
+        """Compute feature scales and principal components anew from raw features (n, P).
 
-        At most about 1000 rows, evenly spaced, are read; `n_component_traces_` becomes n. The heads
-        in `towers_` (a `Tower` for each group of features, the last for products of components)
-        become the nearest ones on the new components; those of the products begin at 0, since they
-        are products of other components now. Scales, leading components and second axis are written
-        to `net_` at once, the heads not: call `_set_heads` before `net_` is used.
+        About 1000 rows at most, evenly spaced, are read; `n_component_traces_` becomes n.
+
+        A `Tower` holds a group of features, their principal components, and one linear classifier,
+        a head, for each fold. `towers_` gets a new tower for each group; its heads are the ones
+        nearest to the old heads, or 0 if there are none. The last tower is for the products of the
+        leading components. These components are new, so its heads are 0.
+
+        The scales, the leading components and, if `n_components` is 2, the second axis of the
+        embedding are written to `net_`. The heads are not: call `_set_heads` before `net_` is used.
         """
         net = self.net_
         encoder = net.encoder
@@ -586,10 +605,11 @@ class RocketReducer(Reducer):
             self._set_second_axis(f[:, columns], first.axes[:, 0])
 
     def _set_second_axis(self, f: Tensor, axis: Tensor) -> None:
-        """Write a component's axis (p,) on tower 1's features (n, p) to `net_` as second axis.
+        """Write the second coordinate of the embedding to `net_`: a sigmoid of a component.
 
-        It is centred; within the sigmoid one standard deviation is 2, and the sign is the one that
-        is nearer to the second axis before.
+        `axis` (p,) is the axis of the component on the features `f` (n, p) of the first `Tower`.
+        Before the sigmoid the component is scaled to mean 0 and standard deviation 2 over `f`. Its
+        sign is changed if it would point against the last second coordinate.
         """
         net = self.net_
         columns = net.encoder.towers[0]
@@ -599,11 +619,11 @@ class RocketReducer(Reducer):
         net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
-        """Return the raw features (n, P) of traces (n, C, T), from the cache where they are in it.
+        """Return the raw features (n, P) of traces (n, C, T), from the cache as far as it has them.
 
-        `numbers` (n,), increasing, identify the traces. The cache then holds the features of these
-        traces and no others, and is itself returned, not a copy. Without numbers it is neither read
-        nor written.
+        `numbers` (n,), increasing, identify the traces. Afterwards the cache holds the features of
+        these traces and no others; the tensor that is returned shares its memory. Without numbers
+        the cache is neither read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -645,9 +665,9 @@ class RocketReducer(Reducer):
     def embed(self, X: ArrayLike) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
-        Space k is that of head k, which was fitted without the labels of fold k. Raises
-        NotFittedError before a fit, ValueError for traces of another shape and for values that are
-        not finite.
+        The points in space k come from head k, the classifier that was fitted without the labels of
+        fold k. Raises NotFittedError before a fit, ValueError for traces of another shape and for
+        values that are not finite.
         """
         traces = self.check_traces(X)
         with torch.inference_mode():
@@ -665,9 +685,9 @@ class RocketReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape, counters, losses, the towers and, after "net.", the module's tensors. The
-        cache of features is not among them. Losses and towers are not copies. Raises NotFittedError
-        before a fit.
+        They are the shape, the counters, the losses, the fields of each `Tower`, and the tensors of
+        `net_`, whose names begin with "net.". The cache of features is not among them. Losses and
+        towers are not copies. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "net_")
         counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
@@ -683,8 +703,8 @@ class RocketReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        The cache of features is empty and `note_` is "" afterwards. Raises StoreError if the sizes
-        are not those of the parameters.
+        Afterwards the cache of features is empty and `note_` is "". Raises StoreError if the sizes
+        do not follow from the parameters.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
@@ -729,8 +749,8 @@ def sample_rows(n: int, numbers: Ints | None) -> Ints:
     """Draw `MAX_TRAINING_TRACES` of n rows, in order, without reading labels.
 
     A hash of the labels' numbers (n,) draws them, evenly in time. So most rows are those of the
-    last fit, and the heads start near where they end. None: the numbers are 0 to n - 1. n must be
-    larger than `MAX_TRAINING_TRACES`.
+    last fit, and the heads start near their final weights. If `numbers` is None, they are 0 to
+    n - 1. n must be larger than `MAX_TRAINING_TRACES`.
     """
     values = np.arange(n) if numbers is None else numbers
     hashes = values.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)

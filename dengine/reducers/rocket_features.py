@@ -53,7 +53,7 @@ PARALLEL_CHUNK = 512  # traces that a thread takes at once
 
 
 class RocketEncoder(nn.Module):
-    """Compute the features of both towers from raw traces: (B, C, T) -> (B, P).
+    """Compute both groups of features, tower 1 and 2, from raw traces: (B, C, T) -> (B, P).
 
     Parameters
     ----------
@@ -153,9 +153,10 @@ class RocketEncoder(nn.Module):
         return self.scale_features(self.raw_features(x))
 
     def raw_features(self, x: Tensor) -> Tensor:
-        """Raw traces (B, C, T) -> features (B, P) of both towers, tower 1 first, before scaling.
+        """Raw traces (B, C, T) -> unscaled features (B, P) of tower 1, then those of tower 2.
 
-        Without groups tower 1 is alone. `scale_features` standardises the features.
+        Tower 1 are the means of ramps, tower 2 the competing kernels, see the module. If `groups`
+        is 0, there is no tower 2. `scale_features` standardises the features.
         """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps
@@ -176,7 +177,7 @@ class RocketEncoder(nn.Module):
     def average_samples(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> averaged traces (B, C, L), with channels of one scale.
 
-        Samples that do not fill a mean are left out at the start of a trace. The values are cut at
+        If T is no multiple of `average`, the first samples are left out. The values are clipped at
         ±1e6.
         """
         if self.average > 1:
@@ -187,10 +188,11 @@ class RocketEncoder(nn.Module):
         return torch.addcmul(self.shift, x, self.scale).clamp_(-1e6, 1e6)
 
     def read_taps(self, x: Tensor) -> Tensor:
-        """Read the value at each tap from averaged traces (B, C, L): (C, taps, B).
+        """Read the inputs of the kernels from averaged traces (B, C, L): (C, taps, B).
 
-        A tap reads a frame of the trace, a difference of two successive frames, or a 0 beyond the
-        ends, as `taps` says. The batch is the last axis, so that reading a tap copies a row of it.
+        A tap is an input of a kernel at a place. `taps` has its position: a frame of the trace, a
+        difference of two successive frames, or a 0 for a tap beyond the ends. The batch is the last
+        axis, so that reading a tap copies a row.
         """
         batch = x.size(0)
         differences = x[:, :, 1:] - x[:, :, :-1]
@@ -200,9 +202,10 @@ class RocketEncoder(nn.Module):
         return rows.permute(1, 2, 0).contiguous().index_select(1, self.taps)
 
     def as_windows(self, values: Tensor, n: int) -> Tensor:
-        """Arrange values (C, n * 9 * P, B) of n dilations as windows (n, C * 9, P * B).
+        """Arrange the inputs (C, n * 9 * P, B) of n dilations as windows (n, C * 9, P * B).
 
-        A column is what a kernel sees at a place of a trace, so that a convolution is a product.
+        A column holds all inputs of a kernel at one place of one trace, so that a convolution is a
+        matrix product.
         """
         channels = values.size(0)
         taps = self.kernel_size
@@ -215,10 +218,10 @@ class RocketEncoder(nn.Module):
     def ramp_features(self, windows: Tensor, batch: int) -> Tensor:
         """Compute the features of tower 1: (B, D * F * R).
 
-        `windows` (D, C * 9, P * B) are those of `batch` = B traces. A kernel's answer at a place
-        goes through a ramp from 0 to 1 around its threshold. A feature is the mean of that over a
-        region, plus twice the mean over the whole trace. Dilations are the slowest axis, regions
-        the fastest.
+        `windows` (D, C * 9, P * B) are the inputs from `batch` = B traces, see `as_windows`. The
+        output of a kernel at a place goes through a ramp from 0 to 1 around its threshold. A
+        feature is the mean of the ramp over a region, plus twice its mean over the whole trace. In
+        the order of the features, dilations vary slowest and regions fastest.
         """
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P * B)
         if batch == 1:  # one product whose columns are the regions takes four times as long
@@ -232,10 +235,11 @@ class RocketEncoder(nn.Module):
     def competition_features(self, windows: Tensor, batch: int) -> Tensor:
         """Compute the features of tower 2: (B, 4D * G * 8).
 
-        `windows` (2D, C * 9, Q * B) are those of `batch` = B traces. A feature of the first half is
-        the root of the share of places at which a kernel's answer is the largest of its group, one
-        of the second half that of the places at which it is the smallest. An answer that is less
-        than 1 away from the largest or smallest one counts in part.
+        `windows` (2D, C * 9, Q * B) are the inputs from `batch` = B traces, see `as_windows`. Each
+        kernel has two features: the root of the share of places at which its output is the largest
+        of its group, and, in the second half of the features, the root of the share of places at
+        which it is the smallest. A place at which the output is less than 1 away from the largest
+        or smallest output counts in part.
         """
         n_groups = 2 * self.n_dilations * self.n_groups
         size = self.group_size
@@ -254,9 +258,9 @@ class RocketEncoder(nn.Module):
     def learn(self, X: Tensor, rng: np.random.Generator) -> None:
         """Set channel scales, kernels and thresholds, in place, from traces X (n, C, T).
 
-        `rng` draws the traces that are read, at most 256 for the scales and 64 for the thresholds,
-        and the kernels. A channel then becomes scale * x + shift. Call it once: a second call sets
-        everything anew, and the features of every trace change.
+        `rng` draws the kernels, and the traces that are read: at most 256 for the scales, and 64 of
+        these for the thresholds. A channel x is then scaled to scale * x + shift. Call this method
+        once: a second call sets everything anew, and the features of every trace change.
         """
         if len(X) > SCALE_TRACES:
             X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]
@@ -270,11 +274,12 @@ class RocketEncoder(nn.Module):
         self.learn_filters(torch.addcmul(self.shift, sample, self.scale), rng)
 
     def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
-        """Draw the kernels, and set thresholds and widths of ramps from what they give on traces.
+        """Draw the kernels, and set their scales and thresholds from their outputs on traces.
 
-        x : Tensor of float32, shape (n, C, T), with channels scaled by `shift` and `scale`, which
-        are set before. It writes the buffers `kernel`, `threshold` and, if there are groups,
-        `competing_kernel`.
+        `x`, float32 (n, C, T), are traces whose channels are scaled by `shift` and `scale`, which
+        must be set before. It writes the buffers `kernel`, `threshold` and, if there are groups,
+        `competing_kernel`. A kernel of tower 1 is scaled so that its ramp is two standard
+        deviations of its outputs wide, those of tower 2 so that this deviation is 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)
@@ -303,10 +308,11 @@ class RocketEncoder(nn.Module):
                 self.competing_kernel[d] = kernels / width
 
     def learn_feature_scales(self, raw: Tensor) -> None:
-        """Set `gain` and `offset` so that `offset + gain * raw` is standardised, from raw (n, P).
+        """Set `gain` and `offset` so that `offset + gain * raw` is standardised.
 
-        The features of the second tower share one deviation. A small floor is added to each
-        deviation, so that a feature that never varied does not explode.
+        They are computed from raw features (n, P). All features of tower 2 are divided by the same
+        standard deviation, the root mean square of theirs. A small floor is added to each deviation
+        so that a feature that never varied does not explode.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more
@@ -336,9 +342,9 @@ class ChunkedFeatures(nn.Module):
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
     """Compute the raw features of traces (n, C, T): float32 (n, P).
 
-    A trace has the same features to the bit whatever other traces are with it, since every chunk is
-    full; the last one is filled up with zeros. From `PARALLEL_TRACES` traces on the encoder is
-    compiled and two threads compute; the call returns when all is done.
+    The features of a trace are the same to the bit whatever other traces it comes with, since every
+    chunk is full; the last chunk is filled up with zeros. For `PARALLEL_TRACES` traces or more the
+    encoder is compiled and two threads compute; the call returns when both are done.
     """
     x = torch.from_numpy(traces)
     n = len(traces)
@@ -378,8 +384,9 @@ def dilation_steps(samples: int, n: int) -> list[int]:
 def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]:
     """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
-    `dilations` is the largest D; D is smaller for short traces. A tap beyond the ends of the trace
-    reads position ``2 * frames - 1``, where a zero stands.
+    A tap is one of the nine inputs of a kernel. `dilations` is the largest D; D is smaller for
+    short traces. For a tap beyond the ends of the trace the position is ``2 * frames - 1``, at
+    which `RocketEncoder.read_taps` has a zero.
     """
     steps = np.array(dilation_steps(frames, dilations), dtype=np.int64)
     middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
@@ -390,9 +397,9 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
-    Each of the N is drawn n / N times, rounded up or down: none twice unless n exceeds N. A kernel
-    reads between one and all channels, few more often than many, equally weighted, and has unit
-    size; its weights on the other channels are 0.
+    Each of the N choices is drawn n / N times, rounded up or down, so none twice unless n exceeds
+    N. A kernel reads one to all channels; a small number of channels is more likely. These channels
+    have equal weights, all others 0, and the norm of the whole kernel is 1.
     """
     drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
     kernels = choices[torch.from_numpy(drawn)]

@@ -6,7 +6,7 @@ it averages with that of `rocket`.
     >>> reducer = TorchReducer(network=MyNetwork)  # MyNetwork(channels, samples) is an nn.Module
     >>> DataEngine(reducer=reducer)
 
-Member k of the network is trained on the labels outside fold k alone, so that labels of fold k may
+Copy k of the network is trained on the labels outside fold k alone, so that labels of fold k may
 be counted in space k. A retrain goes on from the last one: `fit_loop` takes some AdamW steps on
 augmented batches, at a constant learning rate. An exponential average of the weights answers, with
 the statistics of batch normalisation estimated anew.
@@ -91,12 +91,12 @@ class Augmentation:
     mixup: float
 
     def __call__(self, x: Tensor, y: Tensor, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-        """Augment a batch; a trace is mixed with one of the same member.
+        """Augment a batch; a trace is mixed with another trace of the same copy of the network.
 
         Parameters
         ----------
         x : Tensor of float32, shape (B, K, C', L)
-            Preprocessed traces of each member.
+            Preprocessed traces for each of the K copies of the network.
         y : Tensor of float32, shape (B, K)
             Labels.
         rng : numpy.random.Generator
@@ -124,7 +124,7 @@ class Augmentation:
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class TorchReducer(Reducer):
-    """Embed traces by a PyTorch network that is trained with cross-fitting, a bit at each retrain.
+    """Embed traces by a PyTorch network, cross-fitted, that is trained some steps at each retrain.
 
     The first axis of the embedding is the predicted probability of success, the second the
     difference of the two units behind it, times 0.1 (see `dengine.reducers.encoder`). Distances are
@@ -135,29 +135,30 @@ class TorchReducer(Reducer):
     network : callable
         ``network(channels, samples)`` returns an `nn.Module` from preprocessed traces
         (B, channels, samples) to features (B, features). Of each channel of a trace it sees two:
-        the averaged, standardised trace and its differences. A factory that also takes `members`
-        returns all members in one module, see `dengine.reducers.encoder.Members`.
+        the averaged, standardised trace and its differences. If it has a parameter `members`, it
+        returns all copies in one module, see `dengine.reducers.encoder.Members`.
     n_components : {1, 2}, default 2
         1 leaves the second axis out.
     folds : int, default 5
-        K, members and spaces. Member k is trained without the labels of fold k.
+        K, the number of folds, and so of copies of the network and of spaces. Copy k is trained
+        without the labels of fold k.
     steps : int, default 12
         AdamW steps of a retrain; twice as many while training is behind (see `n_steps_left_`).
     fit_steps : int, default 400
         Steps of `fit`, and of the training after many labels came at once; twice as many hardly
         lower the loss.
     batch_size : int, default 32
-        Traces of each member in a step.
+        Traces in a step, for each copy of the network.
     learning_rate, weight_decay : float, default 4e-3, 0.02
         Of AdamW. The rate is constant, since training never ends.
     weight_averaging : float, default 0.97
-        Share of the averaged weights that a step keeps.
+        Share of the averaged weights that remains in a step; the rest comes from the new weights.
     shift, gain, noise, mixup : default 5, 0.05, 0.03, 0.1
         Augmentation: frames of shift in time, standard deviations of a factor and of white noise,
         and the parameter of mixup; 0 turns each off.
     checkpoint : str, default ""
-        File of tensors that `save_checkpoint` wrote, from which all members start. It must not have
-        been trained on parts that are counted later.
+        File of tensors that `save_checkpoint` wrote, from which all copies of the network start.
+        They must not have been trained on parts that are counted later.
     random_state : int, RandomState or None, default 0
         Seed of the initial weights, the batches and the augmentation.
 
@@ -166,11 +167,12 @@ class TorchReducer(Reducer):
     n_steps_ : int
         Steps of all trainings so far.
     n_steps_left_ : int
-        Steps that are missing to complete training: many after many labels came at once, some after
-        the first retrains and where `steps` are few for the labels between two retrains. While
-        there are any, an engine retrains after every part.
+        Steps that are missing until training is complete: many if many labels came at once, some
+        after the first retrains, and some if `steps` is small for the number of labels between two
+        retrains. If there are some, an engine without a product retrains again without waiting for
+        new labels.
     loss_ : float
-        Mean training loss of the last retrain, in nats; NaN where it took no step.
+        Mean training loss of the last retrain, in nats; NaN if it took no step.
     """
 
     uses_labels = True
@@ -209,7 +211,7 @@ class TorchReducer(Reducer):
         y : array, shape (n,)
             Labels of two classes, the larger one for success.
         folds : array of int64, shape (n,), optional
-            Permanent folds. None: by the traces' content.
+            Fold of each trace, 0 to K - 1. None: by a hash of its content.
 
         Returns
         -------
@@ -219,15 +221,15 @@ class TorchReducer(Reducer):
         ------
         SettingError
             If a parameter is out of its range, labels or folds do not fit the traces, the network
-            does not give (B, features), the checkpoint cannot be used, a trace has one sample, or
-            fewer than two traces lie outside a fold.
+            does not give (B, features), the checkpoint cannot be used, a trace has a single sample,
+            or fewer than two traces lie outside a fold.
         TraceError, ValueError
-            For an X of another shape, and for values that are not finite.
+            If X has a shape that is none of traces, or a value is not finite.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
         folds = folds_of(traces, self.folds, folds)
-        self._start(traces)
+        self._initialize(traces)
         self._train(traces, labels, folds, StopRule(), steps=self.fit_steps)
         return self
 
@@ -241,12 +243,12 @@ class TorchReducer(Reducer):
     ) -> Floats:
         """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
-        It takes `n_steps_due` steps, or fewer if `stop` ends them, from the present weights, or
-        from initial ones the first time. `numbers` is not read. Returns the points of the traces,
-        float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20 traces in
-        the first training, and for fewer than two outside a fold.
+        It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
+        the last training, or from initial weights the first time. `numbers` is not read. Returns
+        the points of the traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError
+        for fewer than 20 traces in the first training, and for fewer than two outside a fold.
         """
-        traces = self._check_and_start(X)
+        traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
         steps = self.n_steps_due(len(traces))
         return self._train(traces, labels, folds, stop or StopRule(), steps, numbers)
@@ -264,28 +266,29 @@ class TorchReducer(Reducer):
     def _n_steps_wanted(self, n_labels: int) -> int:
         """Return the number of steps, over all trainings, that make training complete.
 
-        It is 36 and 1.2 for each label, at most `fit_steps`.
+        It is 36 plus 1.2 for each label, but at most `fit_steps`.
         """
         return int(min(self.fit_steps, INITIAL_STEPS + STEPS_PER_LABEL * n_labels))
 
-    def _check_and_start(self, X: Floats) -> Floats:
-        """Check traces and return them as (n, C, T); the first call starts the reducer.
+    def _check_and_initialize(self, X: Floats) -> Floats:
+        """Check traces and return them as (n, C, T); build the networks at the first call.
 
-        Raises SettingError if the first call has fewer than 20 traces.
+        The first traces set the shape and the scales of the channels; no label is read. Raises
+        SettingError if the first call has fewer than 20 traces, or a parameter is not usable.
         """
-        if not vars(self).get("is_started_"):
+        if not vars(self).get("is_initialized_"):
             do = "verify more parts first"
             expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
-            self._start(self.check_traces(X, reset=True))
+            self._initialize(self.check_traces(X, reset=True))
         return self.check_traces(X)
 
-    def _start(self, traces: Floats) -> None:
-        """Build preprocessor and members anew for traces (n, C, T); no label is read.
+    def _initialize(self, traces: Floats) -> None:
+        """Build preprocessor, networks and `encoder_` anew for traces (n, C, T).
 
-        The channels' scales are read from the traces, the weights from the checkpoint, if any.
-        Earlier trainings are forgotten. Raises SettingError for a parameter out of its range, fewer
-        than 2 samples, a network that does not give (B, features), or a checkpoint that cannot be
-        used.
+        Earlier trainings are forgotten; no label is read. The scales of the channels are read from
+        the traces, the weights from the checkpoint, if one is given. Raises SettingError for a
+        parameter out of its range, fewer than 2 samples, a network that does not give
+        (B, features), or a checkpoint that cannot be used.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -294,15 +297,16 @@ class TorchReducer(Reducer):
             load_checkpoint(self.members_, self.checkpoint)
             self.averaged_members_.load_state_dict(self.members_.state_dict())
         self.encoder_ = self._new_encoder()
-        self.is_started_ = True
+        self.is_initialized_ = True
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
-        """Set initial weights and an empty state for traces of this shape; no trace is read.
+        """Build preprocessor and networks for traces of this shape, with initial weights.
 
-        `average` is the number of samples that are averaged to one. Without a `seed` one is drawn;
-        torch's global generator keeps its state. The caller sets `encoder_`.
-        Raises SettingError for a parameter out of its range, fewer than 2 samples, or a network
-        that does not give (B, features).
+        Counters and the state of the optimiser are reset. `encoder_` is not set: that is left to
+        the caller. `average` is the number of samples that are averaged to one. Without `seed` the
+        seed comes from `random_state`; torch's global generator keeps its state. Raises
+        SettingError for a parameter out of its range, fewer than 2 samples, or a network that does
+        not give (B, features).
         """
         self.check()
         if samples < 2:
@@ -317,7 +321,7 @@ class TorchReducer(Reducer):
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
         self.can_compile_: bool | None = None  # until it was tried
-        self.is_started_ = False  # until scales and checkpoint are read
+        self.is_initialized_ = False  # until scales and checkpoint are read
         self.n_steps_ = 0
         self.n_steps_left_ = 0
         self.n_new_steps_ = 0
@@ -334,10 +338,10 @@ class TorchReducer(Reducer):
     ) -> Floats:
         """Take `steps` steps on traces (n, C, T), or fewer if `stop` ends them; replace `encoder_`.
 
-        The averaged members, with new statistics of batch normalisation, become `encoder_`. It sets
-        `n_steps_left_`: 0 if `stop` limits the number of steps, else those that are missing to
-        complete training. `numbers` is not read. Returns the points of the traces, float32 (n, d),
-        row i in space ``folds[i]``.
+        The networks with averaged weights and new statistics of batch normalisation become
+        `encoder_`. `n_steps_left_` becomes 0 if `stop` limits the number of steps, else the number
+        of steps that are missing until training is complete. `numbers` is not read. Returns the
+        points of the traces, float32 (n, d), row i in space ``folds[i]``.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -350,11 +354,12 @@ class TorchReducer(Reducer):
         return self._embed_in_fold_space(x, folds)
 
     def fit_loop(self, x: Tensor, y: Tensor, folds: Ints, stop: StopRule, steps: int) -> None:
-        """Take AdamW steps, member k on the rows outside fold k.
+        """Take AdamW steps, copy k of the network on the rows outside fold k.
 
-        It changes the members and their averages in place, keeps the optimiser's moments, and sets
-        `n_steps_`, `n_new_steps_` and `loss_` (NaN if `stop` allows no step). `encoder_`, the
-        module that embeds, stays as it is; the members are in training mode afterwards.
+        It changes `members_`, the K copies, and their averages in place, and stores the optimiser's
+        moments. `n_new_steps_` becomes the number of steps taken, by which `n_steps_` grows, and
+        `loss_` their mean loss (NaN if `stop` allows no step). `encoder_`, the module that embeds,
+        stays as it is. Afterwards `members_` is in training mode.
 
         Parameters
         ----------
@@ -392,8 +397,8 @@ class TorchReducer(Reducer):
     def train_step(self, optimizer: torch.optim.Optimizer, x: Tensor, y: Tensor) -> float:
         """Take one step on x (B, K, C', L) and y (B, K); return the mean loss, in nats.
 
-        The averaged weights move as well, and `n_steps_` grows by 1. The loss is that before the
-        step, the mean over batch and members.
+        The averaged weights move as well, and `n_steps_` grows by 1. The loss is the one before the
+        step, the mean over the batch and over the K copies of the network.
         """
         logits = self.members_(x)  # (B, K)
         loss = F.binary_cross_entropy_with_logits(logits, y)
@@ -406,10 +411,10 @@ class TorchReducer(Reducer):
         return float(loss.detach())
 
     def make_optimizer(self) -> torch.optim.Optimizer:
-        """Return a new AdamW for the members, with the moments that the last training left.
+        """Return a new AdamW for `members_`, with the moments that the last training left.
 
-        The moments are not copied: a step of the optimiser changes `optimizer_state_`.
-        Weights decay; biases and the parameters of batch normalisation do not.
+        The moments are not copied: a step of the optimiser changes `optimizer_state_`. Weight decay
+        is for weights only, not for biases and the parameters of batch normalisation.
         """
         decayed: list[nn.Parameter] = []
         others: list[nn.Parameter] = []
@@ -427,10 +432,11 @@ class TorchReducer(Reducer):
 
     @torch.no_grad()
     def average_weights(self) -> None:
-        """Move the averaged members' parameters, in place, towards the trained ones.
+        """Move the parameters of `averaged_members_`, in place, towards those of `members_`.
 
-        They keep the share `weight_averaging`, in the first steps a smaller one. Statistics of
-        batch normalisation are not averaged.
+        An averaged parameter becomes `weight_averaging` times itself plus the rest of the trained
+        one; in the first steps the factor is smaller. Statistics of batch normalisation are not
+        averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
         averages = self.averaged_members_.parameters()
@@ -441,10 +447,10 @@ class TorchReducer(Reducer):
     def estimate_statistics(self, x: Tensor) -> None:
         """Estimate the running statistics of batch normalisation anew, for the averaged weights.
 
-        As `torch.optim.swa_utils.update_bn`, from preprocessed traces x (n, C', L): at most 256 of
-        them, drawn at random but the same for the same n. No label is read, so each member may see
-        all folds. Other buffers are copied from the trained members. The averaged members are in
-        evaluation mode afterwards.
+        This is what `torch.optim.swa_utils.update_bn` does. At most 256 of the preprocessed traces
+        x (n, C', L) are read; which ones depends on n alone. No label is read, so each copy of the
+        network may see all folds. Other buffers are copied from `members_`. Afterwards
+        `averaged_members_` is in evaluation mode.
         """
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
@@ -460,7 +466,7 @@ class TorchReducer(Reducer):
         members.eval()
 
     def _new_encoder(self) -> Encoder:
-        """Return a new module that embeds: the preprocessor and a copy of the averaged members."""
+        """Return a new module that embeds: the preprocessor and a copy of `averaged_members_`."""
         members = fold_batch_norms(copy.deepcopy(self.averaged_members_).eval())
         encoder = Encoder(self.preprocessor_, members, self.n_components)  # type: ignore[arg-type]
         return encoder.eval().requires_grad_(False)
@@ -469,7 +475,7 @@ class TorchReducer(Reducer):
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
         """Embed preprocessed traces (n, C', L): float32 (n, d), row i in space ``folds[i]``.
 
-        Member k computes the rows of fold k alone, so this takes 1 / K of the time of `embed`.
+        Network k computes the rows of fold k alone, so this takes 1 / K of the time of `embed`.
         """
         rows_of_fold = [np.flatnonzero(folds == k) for k in range(self.folds)]
         longest = max(map(len, rows_of_fold))
@@ -491,9 +497,9 @@ class TorchReducer(Reducer):
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
-        Space k is that of member k, which was trained without the labels of fold k. Raises
-        NotFittedError before a fit, ValueError for traces of another shape and for values that are
-        not finite.
+        The points in space k come from network k, which was trained without the labels of fold k.
+        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
+        that are not finite.
         """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
@@ -506,11 +512,12 @@ class TorchReducer(Reducer):
         warm_optimizer()
 
     def untrained_module(self, X: Floats) -> nn.Module | None:
-        """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
+        """Return a module that can be compiled before the training on traces X (n, C, T).
 
-        If there is an `encoder_`, as after a training, it is the present `module()`; else that of a
-        clone with initial weights. None, with a warning in the log, if TorchScript cannot compile
-        the network. Raises SettingError for a parameter or a network that cannot be used.
+        It is `module()` if the reducer has an `encoder_` already. Otherwise it is the module of a
+        clone with initial weights, and this reducer stays as it is. None, with a warning in the
+        log, if TorchScript cannot compile the network. Raises SettingError for a parameter or a
+        network that cannot be used.
         """
         if "encoder_" in vars(self):
             return self.module()
@@ -520,10 +527,11 @@ class TorchReducer(Reducer):
         return untrained.module()
 
     def module(self) -> nn.Module | None:
-        """As `Reducer.module`: the present `encoder_`, which no later training changes.
+        """Return the module that embeds, (B, C, T) -> (B, K, d), for compiling or exporting.
 
-        None, with a warning in the log, if TorchScript cannot compile the network, which is tried
-        once. Raises NotFittedError before a fit.
+        It is the present `encoder_`, which later trainings replace and do not change. None if
+        TorchScript cannot compile the network: the first call finds this out, and logs a warning.
+        Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
@@ -533,11 +541,11 @@ class TorchReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last training: its steps, steps that are missing, and a note.
+        """Return the report of the last training: its steps, the missing steps, and a note.
 
-        The note gives the loss and the number of steps so far, if the last training took a step,
-        and the number of missing steps, if there are any; else it is "". Raises NotFittedError
-        before a fit.
+        The note gives the loss and the number of all steps so far if the last training took a step,
+        and the number of missing steps if there are any. If neither holds, it is "". Raises
+        NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
@@ -548,9 +556,9 @@ class TorchReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape, counters, loss, and tensors of preprocessor, members, averaged members and
-        optimiser, so that training can go on, and the points of a fixed trace, by which `set_state`
-        recognises the network. Raises NotFittedError before a fit.
+        They are shape, counters, loss, and the tensors of preprocessor, networks, averaged networks
+        and optimiser, so that training can go on. They include the points of a fixed trace, by
+        which `set_state` recognises the network. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.preprocessor_.average, self.seed_, self.n_steps_]
@@ -589,7 +597,7 @@ class TorchReducer(Reducer):
             i, key = name.split(".")
             moments = self.optimizer_state_.setdefault(int(i), {})
             moments[key] = torch.from_numpy(np.array(value))
-        self.is_started_ = True
+        self.is_initialized_ = True
         self.encoder_ = self._new_encoder()
         points = state.get("points")
         if points is not None and not np.allclose(points, self._embed_ramp(), atol=SAME_POINTS):
@@ -597,7 +605,10 @@ class TorchReducer(Reducer):
         return self
 
     def _modules(self) -> dict[str, nn.Module]:
-        """Return the modules whose tensors are the state, by the prefix of their names there."""
+        """Return the modules whose tensors are in the state.
+
+        The keys are the prefixes that the names of these tensors have in the state.
+        """
         return {
             "preprocessor.": self.preprocessor_,
             "members.": self.members_,
@@ -617,9 +628,9 @@ class TorchReducer(Reducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        Folds and batch_size are integers of at least 2, steps and fit_steps of at least 1;
-        n_components is 1 or 2, learning_rate above 0, weight_averaging below 1, and no other is
-        negative.
+        folds must be an integer from 2 to 1000, batch_size one of at least 2, steps and fit_steps
+        of at least 1. n_components is 1 or 2, learning_rate above 0, weight_averaging below 1, and
+        no other number is negative. checkpoint is a text or path; no file is looked at.
         """
         expect(self.n_components in (1, 2), "n_components 1 or 2", self.n_components)
         smallest = {"folds": 2, "steps": 1, "fit_steps": 1, "batch_size": 2, "shift": 0}
@@ -642,21 +653,23 @@ class TorchReducer(Reducer):
 def draw_batches(
     folds: Ints, n_folds: int, batch_size: int, steps: int, rng: np.random.Generator
 ) -> Iterator[Tensor]:
-    """Yield the rows of each step and member, in shuffled passes over the rows of the member.
+    """Yield, for each step, the rows on which each of K networks is trained.
+
+    Network k passes over all rows outside fold k in random order, and then again in another order.
 
     Parameters
     ----------
     folds : array of int, shape (n,)
-        Member k gets no row of fold k.
+        Network k gets no row of fold k.
     n_folds, batch_size, steps : int
-        K, B and the number of batches. B is reduced, for all members, to the number of rows of the
-        member that has the fewest.
+        K, B and the number of batches. If a network has fewer than B rows, B is reduced to the
+        smallest number of rows of a network.
     rng : numpy.random.Generator
 
     Yields
     ------
     Tensor of int64, shape (B, K)
-        Column k holds rows of member k.
+        Column k holds rows for network k.
 
     Raises
     ------
@@ -700,9 +713,9 @@ def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
 def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
     """Return whether TorchScript compiles a network; log a warning if it does not.
 
-    A user's network may hold Python that TorchScript does not support. Two members of it are built,
-    compiled and run to find out, once for each network and shape; torch's global generator keeps
-    its state.
+    A user's network may hold Python that TorchScript does not support. To find out, two copies of
+    it are built, compiled and run, once for each network and shape. The state of torch's global
+    random generator does not change.
     """
     try:
         with torch.random.fork_rng(devices=[]), torch.inference_mode():

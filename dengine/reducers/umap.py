@@ -76,7 +76,7 @@ class UmapEncoder(nn.Module):
     ----------
     make_frames : Frames
     references : Tensor of float32, shape (n, F)
-        Frames of the references.
+        Frames of the references, as `make_frames` computes them.
     points : Tensor of float32, shape (n, dim)
         Embedding of the references.
     n_neighbors : int
@@ -124,10 +124,10 @@ class UmapEncoder(nn.Module):
 
     @torch.jit.export
     def embed_frames(self, frames: Tensor) -> Tensor:
-        """Embed traces among the references: (B, F) -> (B, dim); each is a vector of F averages.
+        """Embed traces, each a vector of F frames, among the references: (B, F) -> (B, dim).
 
         A trace starts at the mean of its nearest references' points, weighted by their membership
-        strengths. Five times, it is then moved to the mean of the same points, weighted by the
+        strengths. It is then moved five times to the mean of the same points, weighted by the
         coefficients of attraction at its current distances.
         """
         # Half the squared distances, less half the squared norm of each trace.
@@ -146,8 +146,8 @@ class UmapEncoder(nn.Module):
     def strengths(self, distances: Tensor) -> Tensor:
         """Distances to the nearest references (B, n_neighbors) -> membership strengths, same shape.
 
-        A strength lies between 0 and 1 and is 1 for the nearest; those of a row sum to about
-        ``log2(n_neighbors)``.
+        A strength lies between 0 and 1 and is 1 for the nearest reference. The strengths of a row
+        sum to about ``log2(n_neighbors)``.
         """
         beyond = distances - distances.amin(1, keepdim=True)
         beyond = beyond / (beyond.mean(1, keepdim=True) + 1e-12)
@@ -195,7 +195,7 @@ class UmapReducer(Reducer):
         Epochs of every training. By default `fit` takes 200; `train` takes 240,000 / n, from 60
         to 200, and at most 400,000 / n, which bounds its time.
     random_state : int, RandomState or None, default 0
-        Seed of the negative samples and of the noise on a start.
+        Seed of the negative samples, and of the noise on the points from which a layout starts.
 
     Attributes
     ----------
@@ -204,8 +204,8 @@ class UmapReducer(Reducer):
     n_epochs_ : int
         Epochs since the spectral start.
     n_steps_left_ : int
-        Epochs that are missing to the 200 that a layout needs from a spectral start. While some
-        are, an engine trains after every cycle.
+        Epochs that are missing to the 200 that a layout needs from a spectral start. If there are
+        some, an engine without a product trains again without waiting for new labels.
 
     References
     ----------
@@ -246,11 +246,11 @@ class UmapReducer(Reducer):
             If a parameter is out of its range, or there are no more traces than `n_neighbors` or
             than `n_components`.
         TraceError, ValueError
-            For an X of another shape, and for values that are not finite.
+            If X has a shape that is none of traces, or a value is not finite.
         """
         traces = self.check_traces(X, reset=True)
         self.check(len(traces))
-        self._start(traces)
+        self._initialize(traces)
         self._train(traces, None, StopRule(), self._n_first_epochs)
         return self
 
@@ -262,28 +262,28 @@ class UmapReducer(Reducer):
         stop: StopRule | None = None,
         numbers: Ints | None = None,
     ) -> Floats:
-        """Lay traces out, from the last layout if it can, and make them the encoder's references.
+        """Compute a layout of traces X (n, C, T), and make them the references of a new `encoder_`.
 
-        X are traces (n, C, T); `numbers` (n,), increasing, identify them from training to training;
-        labels and folds are not read. `stop` may end the epochs; after its deadline at most ten
-        more are taken. The layout starts anew without `numbers`, or if fewer than half of the
-        traces were in the last training. Returns the points of the traces, float32 (n,
-        n_components), not a copy of `embedding_`. Raises SettingError for a parameter out of its
-        range, or too few traces.
+        `numbers` (n,), increasing, identify the traces from training to training; labels and folds
+        are not read. The layout goes on from the last one if at least half of the traces were in
+        it; otherwise, or without `numbers`, it starts anew. `stop` may end the epochs; after its
+        deadline at most ten more are taken. Returns the points of the traces, float32 (n,
+        n_components), which share their memory with `embedding_`. Raises SettingError for a
+        parameter out of its range, or too few traces.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
         if numbers is None or not self._has_searched_any(numbers):
-            self._start(traces)
+            self._initialize(traces)
         self._train(traces, numbers, stop or StopRule())
         return as_points(self.embedding_.numpy())
 
     def n_epochs_due(self, n_traces: int) -> int:
         """Return the number of epochs that the next training takes on `n_traces` traces.
 
-        That is `n_epochs` if it was given. Otherwise it is those that are missing to the first 200,
-        or, if none are, 240,000 / n_traces but at least 60; in both cases at most 200 and at most
-        400,000 / n_traces, but at least 1.
+        It is `n_epochs` if that was given. Otherwise it is the number of epochs that are missing to
+        the first 200; if none is missing, it is 240,000 / n_traces but at least 60. In both cases
+        it is at most 200, and at most 400,000 / n_traces but at least 1.
         """
         if self.n_epochs is not None:
             return self.n_epochs
@@ -294,16 +294,16 @@ class UmapReducer(Reducer):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Search the neighbours of traces X (n, C, T), and keep them for the next training.
 
-        It does nothing without the numbers of the traces' labels, by which they are found again.
-        Before the first training it sets shape, seed and frames. Raises SettingError for a
-        parameter out of its range, or too few traces.
+        `train` finds them again by `numbers`, the numbers of the traces' labels; without numbers
+        nothing is done. Before the first training it also sets the shape, draws the seed and fits
+        the frames. Raises SettingError for a parameter out of its range, or too few traces.
         """
         if numbers is None:
             return
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
         if not self._is_fitted:
-            self._start(traces)
+            self._initialize(traces)
         neighbors = self.neighbors_.update(traces, numbers, self.make_frames_)
         self.precomputed_neighbors_: Neighbors | None = neighbors
 
@@ -312,20 +312,20 @@ class UmapReducer(Reducer):
         return "encoder_" in vars(self)
 
     def _has_searched_any(self, numbers: Ints) -> bool:
-        """Return whether any of these labels' traces was in the last search of neighbours.
+        """Return whether a trace with one of these label numbers was in the last neighbour search.
 
-        The last search is that of `precompute`, else that of the last training. If none was,
-        training starts anew.
+        The last search is the one of `precompute`, or without that the one of the last training.
+        False if there was no search.
         """
         if "neighbors_" not in vars(self):
             return False
         neighbors = self.precomputed_neighbors_ or self.neighbors_
         return bool(np.isin(numbers, neighbors.numbers).any())
 
-    def _start(self, traces: Floats) -> None:
+    def _initialize(self, traces: Floats) -> None:
         """Forget all trainings, draw the seed, and fit the frames to traces (n, C, T).
 
-        Of many traces 256 at most, evenly spaced, are read. An earlier `encoder_` stays until the
+        At most 256 of the traces, evenly spaced, are read. An earlier `encoder_` stays until the
         next layout replaces it.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
@@ -349,8 +349,8 @@ class UmapReducer(Reducer):
         """Train on traces (n, C, T) with their labels' numbers, and make a new `encoder_`.
 
         It finds neighbours, joins them to a graph, and moves the points for `n_epochs` epochs
-        (None: as many as are due) or fewer if `stop` ends them. Without numbers all traces are new.
-        Neighbours, points, encoder and the counters of epochs are replaced.
+        (None: `n_epochs_due`), or fewer if `stop` ends them. Without numbers all traces count as
+        new. Neighbours, points and encoder are replaced, and the counters of epochs grow.
         """
         if numbers is None:
             numbers = np.arange(-len(traces), 0)  # numbers that no label has
@@ -376,9 +376,9 @@ class UmapReducer(Reducer):
     ) -> Tensor:
         """Return the points (n, n_components), float32, at which a layout starts.
 
-        These are the last embedding, with new traces where the encoder puts them and a little
-        noise, if at least half of the traces were in it. Otherwise it is a spectral start, which
-        sets `n_epochs_` to 0.
+        If at least half of the traces were in the last training, they start at their last points,
+        and a new trace starts where the encoder puts it, plus a little noise. Otherwise all start
+        at the points of `spectral_start`, and `n_epochs_` becomes 0.
         """
         last_rows = self.neighbors_.rows_of(neighbors.numbers)
         is_old = last_rows >= 0
@@ -418,10 +418,10 @@ class UmapReducer(Reducer):
         return torch.cat([self.encoder_(chunk) for chunk in torch.split(traces, CHUNK)]).numpy()
 
     def untrained_module(self, X: Floats) -> UmapEncoder:
-        """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
+        """Return a module that can be compiled before the training on traces X (n, C, T).
 
-        After a training it is the present `encoder_` itself; before, a new one whose references are
-        all 0.
+        After a first training it is the present `encoder_` itself. Before, it is a new encoder
+        whose references are all 0.
         """
         if self._is_fitted:
             return self.encoder_
@@ -445,11 +445,11 @@ class UmapReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last training: its epochs, and those that are missing.
+        """Return the report of the last training: its epochs, and the epochs that are missing.
 
         A first layout, which starts from eigenvectors of the graph, takes 200 epochs (or
-        `n_epochs`), in one training or in several. The note says how many of them are missing, ""
-        if none are. Raises NotFittedError before a fit.
+        `n_epochs`), in one training or in several. The note says how many of them are missing; it
+        is "" if none is missing. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         left = self.n_steps_left_
@@ -459,9 +459,9 @@ class UmapReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape, counters, and of the last training numbers, frames, neighbours, distances
-        and points, not all of them copies. Neighbours that `precompute` found are not among them.
-        Raises NotFittedError before a fit.
+        They are shape and counters, and the numbers, frames, neighbours, distances and points of
+        the last training. Not all of them are copies. Neighbours that `precompute` found are not
+        among them. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]

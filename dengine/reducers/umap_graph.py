@@ -78,8 +78,8 @@ class Frames(nn.Module):
 def frames_for(traces: Floats) -> Frames:
     """Return a new `Frames` module for traces (n, C, T), which has yet to `learn` them.
 
-    It makes 100 to 199 frames of each channel, more where an oscillation would be lost, and fewer,
-    one for each sample, of traces shorter than that.
+    It makes 100 to 199 frames of each channel, or more if an oscillation would be lost. Traces of
+    fewer than 100 samples get a frame for each sample.
     """
     _, channels, samples = traces.shape
     n_frames = samples // averaging(torch.from_numpy(traces), MIN_FRAMES)
@@ -108,9 +108,9 @@ class Neighbors:
 
     @classmethod
     def empty(cls, n_features: int, k: int) -> Self:
-        """Return an object without traces, whose `update` finds k neighbours of each.
+        """Return an object without traces, whose `update` finds k neighbours of each trace.
 
-        `n_features` is F, the length of a trace's frames.
+        `n_features` is F, the number of frames of a trace.
         """
         return cls(
             numbers=np.zeros(0, dtype=np.int64),
@@ -120,24 +120,24 @@ class Neighbors:
         )
 
     def rows_of(self, numbers: Ints) -> Tensor:
-        """Return the row of each number (m,) as int64 (m,), -1 for a number that is not here."""
+        """Return the row of each number (m,) as int64 (m,); -1 if `numbers` lacks the number."""
         row = np.searchsorted(self.numbers, numbers)
         return torch.from_numpy(np.where(np.isin(numbers, self.numbers), row, -1))
 
     def update(self, traces: Floats, numbers: Ints, make_frames: Frames) -> "Neighbors":
         """Return a new object with the neighbours among these traces; this one does not change.
 
-        Neighbours are searched of the traces that are new, of those that lost a neighbour, and of
-        those to which a new trace is nearer than their farthest neighbour. All others are copied.
-        If more than half of the traces are new, all are searched.
+        Neighbours are searched for the new traces, for traces that lost a neighbour, and for traces
+        to which a new trace is nearer than their farthest neighbour. The neighbours of all other
+        traces are copied. If more than half of the traces are new, they are searched for all.
 
         Parameters
         ----------
         traces : array of float32, shape (n, C, T)
             More than k.
         numbers : array of int64, shape (n,)
-            Increasing; the same number is the same trace as before. Traces whose number is missing
-            here have left.
+            Increasing; the same number stands for the same trace as before. A trace of this object
+            whose number is not among them is dropped.
         make_frames : Frames
             The module that computed `frames`.
 
@@ -246,15 +246,16 @@ def squared_distances(x: Tensor, y: Tensor) -> Tensor:
 def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
     """Compute the membership strengths of the neighbours of each trace.
 
-    A strength is ``exp(-(distance - rho) / sigma)``. rho is the distance to the nearest
-    neighbour that is not identical, and sigma is such that the strengths sum to
-    ``log2(n_neighbors)``, but no less than a small share of the mean distance. It is umap-learn's
-    `smooth_knn_dist` and `compute_membership_strengths` with a local connectivity of 1.
+    A strength is ``exp(-(distance - rho) / sigma)``, but at most 1. rho is the distance to the
+    nearest neighbour that is not identical. sigma is chosen such that the strengths of a trace sum
+    to ``log2(n_neighbors)``, but it is at least a small share of the mean distance. The method is
+    that of `smooth_knn_dist` and `compute_membership_strengths` in umap-learn, with a local
+    connectivity of 1.
 
     Parameters
     ----------
     distances : Tensor of float32, shape (n, n_neighbors - 1)
-        To the nearest other traces, increasing.
+        Distances to the nearest other traces, increasing.
     n_neighbors : int
         A trace counts as one of its own neighbours.
 
@@ -287,20 +288,20 @@ def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
 def fuzzy_simplicial_set(indices: Tensor, strengths: Tensor) -> csr_matrix:
     """Unite the neighbourhoods of all traces to one symmetric graph.
 
-    An edge has the strength ``p + q - p * q``, where p and q are the strengths in both directions,
-    0 where there is none.
+    An edge has the strength ``p + q - p * q``, where p and q are the strengths in its two
+    directions; a direction that is missing has strength 0.
 
     Parameters
     ----------
     indices : Tensor of int64, shape (n, k)
         Neighbours of each trace, itself excluded.
     strengths : Tensor of float32, shape (n, k)
-        Their membership strengths.
+        Membership strengths of these neighbours.
 
     Returns
     -------
     csr_matrix of float32, shape (n, n)
-        From 0 to 1.
+        Strengths from 0 to 1.
 
     References
     ----------

@@ -46,17 +46,17 @@ def spectral_start(
 ) -> Tensor:
     """Place traces by eigenvectors of their graph, as the start of a layout.
 
-    These are the eigenvectors of the normalised Laplacian with the smallest eigenvalues, without
-    the first. A graph of several components says nothing of the points within each, so principal
-    components of the frames are used instead, as where the solver does not converge; umap-learn
-    places each component by eigenvectors of its own.
+    They are the eigenvectors of the normalised Laplacian with the smallest eigenvalues, without
+    the first. Principal components of the frames take their place if the graph is not connected,
+    because eigenvectors then say nothing of the points within a component, and if the solver does
+    not converge. umap-learn places each component by eigenvectors of its own.
 
     Parameters
     ----------
     graph : csr_matrix of float32, shape (n, n)
         The fuzzy simplicial set.
     frames : Tensor of float32, shape (n, F)
-        Used where the graph has several components.
+        Frames of the traces, for the principal components.
     n_components : int
         Dimension of the points.
     rng : numpy.random.Generator
@@ -65,7 +65,7 @@ def spectral_start(
     Returns
     -------
     Tensor of float32, shape (n, n_components)
-        Centred, with 10 as the largest coordinate in size, and a little noise.
+        Centred and scaled so that the largest coordinate is 10 or -10, plus a little noise.
 
     References
     ----------
@@ -92,7 +92,7 @@ def leading_eigenvectors(
 
     They belong to the n largest eigenvalues after the very largest. Returns them as columns,
     float64 (n_traces, n), in the order of increasing eigenvalues, or None if the solver does not
-    converge. `rng` draws its start.
+    converge. `rng` draws the vector from which the solver starts.
     """
     root = np.sqrt(np.asarray(graph.sum(1), dtype=np.float64)).ravel()
     coordinates = graph.tocoo()
@@ -113,8 +113,8 @@ def leading_eigenvectors(
 def principal_components(frames: Tensor, n: int) -> NDArray[np.float64]:
     """Return the first n principal components of frames (m, F), float64 (m, n).
 
-    The axes are computed from at most about 256 of the frames, evenly spaced. Columns are zeros
-    where there are fewer than n components.
+    The axes are computed from at most 256 of the rows, evenly spaced. If there are fewer than n
+    components, the last columns are 0.
     """
     centred = (frames - frames.mean(0)).double()
     sample = centred[:: 1 + len(centred) // PCA_TRACES]
@@ -126,10 +126,10 @@ def principal_components(frames: Tensor, n: int) -> NDArray[np.float64]:
 
 @cache
 def find_ab_params(min_dist: float) -> tuple[float, float]:
-    """Fit a and b of the membership strength ``1 / (1 + a * d ** (2 * b))`` of two points.
+    """Fit a and b of the membership strength ``1 / (1 + a * d ** (2 * b))`` at a distance d.
 
-    The curve approximates 1 up to `min_dist` and an exponential decay beyond it, at a spread of 1.
-    The result is cached for each `min_dist`.
+    The curve approximates 1 up to `min_dist`, and ``exp(min_dist - d)`` beyond it. The result is
+    cached for each `min_dist`.
 
     Parameters
     ----------
@@ -157,10 +157,11 @@ class Edges:
     Attributes
     ----------
     head, tail : Tensor of int64, shape (E,)
+        The two points that an edge joins.
     strength : Tensor of float32, shape (E,)
         Divided by the largest one: an edge's share of the epochs in which umap-learn samples it.
     counts : Tensor of int64, shape (n,)
-        Edges of each head.
+        Number of edges with each point as head.
     """
 
     head: Tensor
@@ -170,9 +171,9 @@ class Edges:
 
     @classmethod
     def from_graph(cls, graph: csr_matrix) -> Self:
-        """Return the edges of a symmetric graph (n, n): row i holds the edges with head i.
+        """Return the edges of a symmetric graph (n, n), whose row i holds the edges with head i.
 
-        Strengths are divided by the largest one.
+        The strengths are divided by the largest strength.
         """
         counts = torch.from_numpy(np.diff(graph.indptr).astype(np.int64))
         strength = torch.from_numpy(graph.data.astype(np.float32))
@@ -192,9 +193,9 @@ class Edges:
 def attraction_coefficients(strengths: Tensor, squared: Tensor, a: float, b: float) -> Tensor:
     """Compute how strongly edges pull: ``strength * d^(2b - 2) / (1 + a d^(2b))``.
 
-    The gradient of UMAP's loss has this factor times 4 a b. `squared` holds the squared distances
-    d^2, which must be above 0; it has the shape of `strengths`, and so has the result. `a` and `b`
-    are those of `find_ab_params`.
+    In the gradient of UMAP's loss this factor stands with 4 a b. `squared` holds the squared
+    distances d^2, which must be above 0; it has the shape of `strengths`, and so has the result.
+    `a` and `b` are those of `find_ab_params`.
     """
     power = squared.pow(b)
     return strengths * power / (squared * (1.0 + a * power))
@@ -203,9 +204,9 @@ def attraction_coefficients(strengths: Tensor, squared: Tensor, a: float, b: flo
 def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor, Tensor]:
     """Compute the pull of each point towards its neighbours.
 
-    The gradient of the cross entropy along an edge is ``-4 a b d^(2b - 2) / (1 + a d^(2b))`` times
-    the edge's strength and the offset, since umap-learn moves both ends of an edge and holds each
-    edge twice.
+    An edge pulls with the coefficient ``4 a b d^(2b - 2) / (1 + a d^(2b))`` times its strength,
+    along the offset to the neighbour; this is the negative gradient of the cross entropy. The
+    factor is 4, not 2, since umap-learn moves both ends of an edge and holds each edge twice.
 
     Parameters
     ----------
@@ -221,7 +222,7 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     pull : Tensor of float32, shape (d, n)
         Direction and size of the move; the points are not moved here.
     stiffness : Tensor of float32, shape (n,)
-        Sum of the coefficients of all offsets.
+        For each point the sum of the coefficients of its edges.
 
     References
     ----------
@@ -239,9 +240,9 @@ def negative_samples(
     count: int,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Draw other points for each point: those that follow it in a shuffled circle.
+    """Draw `count` other points for each point: the next ones after it in a shuffled circle.
 
-    umap-learn draws each sample independently. Here every point is also drawn equally often.
+    umap-learn draws each sample independently. Here every point is drawn equally often.
 
     Parameters
     ----------
@@ -268,8 +269,8 @@ def negative_samples(
 def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
     """Compute the mean push of each point away from its negative samples.
 
-    The gradient is ``2 b / ((0.001 + d^2) (1 + a d^(2b)))`` times the offset, each coordinate cut
-    to ±4.
+    A sample pushes with ``2 b / ((0.001 + d^2) (1 + a d^(2b)))`` times the offset, whose
+    coordinates are then clipped at ±4.
 
     Parameters
     ----------
@@ -298,8 +299,8 @@ def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
 def learning_rates(n_epochs: int, stop: StopRule) -> Iterator[float]:
     """Yield the learning rate of each epoch, which falls from 1 towards 0.
 
-    `stop` is asked before each epoch. A limit in steps is known in advance, so the rate falls
-    within it. After the deadline ten more epochs at most are taken, over which the rate falls to 0:
+    `stop` is asked before each epoch. If it limits the number of steps, the rate falls within that
+    number. After its deadline at most ten more epochs are taken, over which the rate falls quickly:
     at a high rate the points would stay scattered by the negative samples of the last epoch.
     """
     if stop.max_steps is not None:
@@ -326,7 +327,7 @@ def optimize_layout(
     Parameters
     ----------
     points : Tensor of float32, shape (n, d)
-        Where they start; this tensor is not changed.
+        Points from which the layout starts; the tensor is not changed.
     graph : csr_matrix of float32, shape (n, n)
         The fuzzy simplicial set.
     min_dist : float
@@ -341,8 +342,9 @@ def optimize_layout(
     Returns
     -------
     points : Tensor of float32, shape (n, d)
+        The points after the last epoch.
     n_epochs : int
-        Epochs that were taken.
+        Number of epochs that were taken.
     """
     a, b = find_ab_params(min_dist)
     edges = Edges.from_graph(graph)

@@ -25,8 +25,9 @@ class UmapLearnReducer(Reducer):
     store, so an engine that is opened fits again. With a `random_state` the library uses one
     thread, and a run repeats exactly.
 
-    `transform` places the traces of a batch together: with those beside it, a trace moves by up to
-    a tenth of the embedding's radius. `embed` places each trace alone, as a cell decides.
+    `transform` places the traces of a batch together: the point of a trace depends on the other
+    traces by up to a tenth of the embedding's radius. `embed` places each trace alone, as a cell
+    does.
 
     Parameters
     ----------
@@ -72,9 +73,9 @@ class UmapLearnReducer(Reducer):
         Raises
         ------
         SettingError
-            If there are no more than `n_neighbors` traces.
+            If there are no more traces than `n_neighbors`.
         TraceError, ValueError
-            For an X of another shape, and for values that are not finite.
+            If X has a shape that is none of traces, or a value is not finite.
         ImportError
             If umap-learn is not installed.
         """
@@ -116,9 +117,9 @@ class UmapLearnReducer(Reducer):
 def shielded() -> Iterator[None]:
     """Context manager that keeps umap-learn's warnings and thread count out of the process.
 
-    Warnings of umap and of scikit-learn's manifolds are ignored within the block; at its end
-    torch's number of threads is set back, also after an exception. At its first kernel numba sets
-    OpenMP's number of threads for the whole process, torch's too. Other work then takes up to forty
+    Warnings of umap and of scikit-learn's manifolds are ignored within the block. At its end the
+    number of threads of torch is set back to what it was, also after an exception: numba sets it
+    for the whole process when it runs its first kernel, and other work would then take up to forty
     times as long.
     """
     threads = torch.get_num_threads()
