@@ -2,8 +2,6 @@ from .cells.base import Cell as Cell
 from .cells.replay import ReplayCell as ReplayCell
 from .cells.simulation.cell import SimulatedCell as SimulatedCell
 from .cells.ur.cell import UrCell as UrCell
-from .cells.ur.controller import FakeController as FakeController
-from .cells.ur.controller import RobotProgram as RobotProgram
 from .cells.ur.recorder import RtdeRecorder as RtdeRecorder
 from .datasets import Dataset as Dataset
 from .datasets import Description as Description

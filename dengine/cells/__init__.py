@@ -1,6 +1,5 @@
 """Cells that an engine drives: the protocol `Cell`, recordings (`ReplayCell`), a simulation in
-MuJoCo (`SimulatedCell`), and Universal Robots over RTDE (`UrCell`, with a recorder and a simulated
-controller).
+MuJoCo (`SimulatedCell`), and Universal Robots over RTDE (`UrCell`, with a recorder).
 """
 
 import lazy_loader

@@ -19,8 +19,8 @@ import pytest
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
 
 from dengine import Action, DataEngine, Dataset, Recipe
-from dengine.cells import FakeController
 from tests.support.exports import trained
+from tests.support.robots import FakeController
 from tests.support.serving import REPO, WAIT, started
 
 SAMPLES = 80

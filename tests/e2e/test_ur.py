@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from dengine import DataEngine, Dataset, Policy, ReplayCell
-from dengine.cells import Cell, FakeController, RtdeRecorder, UrCell
-from dengine.cells.ur import RobotProgram
+from dengine.cells import Cell, RtdeRecorder, UrCell
 from dengine.cells.ur.cell import (
     ANSWER,
     MAX_NUMBER,
@@ -38,10 +37,9 @@ from dengine.cells.ur.stream import RtdeClient, RtdeStream
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError, DengineError
 from tests.support.command_line import dengine, document, line_of, succeed
-from tests.support.robots import FaultyController, Trouble
+from tests.support.robots import FORCE, FakeController, RobotProgram, Trouble
 
 SAMPLES = 80
-FORCE = "actual_TCP_force[2]"
 WAIT = 60.0  # seconds, for what takes milliseconds here: a machine may be busy
 # Relative to real time. Without a limit the controller fills the recorder's buffer of 60 s of
 # packages while a model is retrained, and the oldest packages are lost, as they should be.
@@ -94,7 +92,7 @@ def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(
     refused: PackageType | str, column: str, text: str
 ) -> None:
     with (
-        FaultyController(speed=None, refuses=[refused]) as fake,
+        FakeController(refuses=[refused]) as fake,
         pytest.raises(DengineError, match=text),
     ):
         RtdeClient(fake.host, fake.port, (column,), (ORDER,))
@@ -129,7 +127,7 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(
     parts: Dataset,
 ) -> None:
     with (
-        FaultyController(RobotProgram(parts), TROUBLES, speed=SPEED) as fake,
+        FakeController(RobotProgram(parts), TROUBLES, speed=SPEED) as fake,
         cell_of(fake) as cell,
     ):
         for part in range(16):
@@ -267,7 +265,7 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
         program.restart()
         del program.step
 
-    with FaultyController(program, speed=20.0) as fake, cell_of(fake) as cell:
+    with FakeController(program, speed=20.0) as fake, cell_of(fake) as cell:
         program.step = lambda inputs: program.outputs  # it answers nothing
         if value == "is deaf":
             cell.order_timeout = 0.3
@@ -292,7 +290,7 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
 
 def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
     now, order = [0.0], encode_message(7, Verb.INSERT)
-    fake = FaultyController(speed=20.0)
+    fake = FakeController(speed=20.0)
 
     def until(true: Callable[[], bool]) -> None:
         while not true():
@@ -366,7 +364,7 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(
 ) -> None:
     store = tmp_path / "cell.db"
     gap = Trouble(3, 9, "drop", 2)
-    with FaultyController(RobotProgram(parts), [gap], speed=SPEED) as fake:
+    with FakeController(RobotProgram(parts), [gap], speed=SPEED) as fake:
         result = document(*run_on(fake, store), "--reducer", "pca", "--cycles", 12)
         shown = line_of(*run_on(fake, store), "--cycles", 3)
     assert (result["total"]["verified"], result["cell"]["incomplete"]) == (12, 1)
@@ -385,10 +383,8 @@ def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(
 def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
     parts, tmp_path: Path
 ) -> None:
-    program, store = (
-        RobotProgram((parts.X[:10], parts.y[:10])),
-        tmp_path / "cell.db",
-    )  # then its bin is empty
+    program = RobotProgram(Dataset(parts.X[:10], parts.y[:10]))  # then its bin is empty
+    store = tmp_path / "cell.db"
     with FakeController(program, speed=SPEED) as fake:
         done = dengine(*run_on(fake, store), "--reducer", "pca", "--cycles", 14)
         shown = " ".join(done.output.split())
@@ -402,7 +398,7 @@ def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goe
             f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 continues there."
             in shown
         )
-        program.played.clear()  # somebody has filled it
+        program.played = 0  # somebody has filled it
         succeed(*run_on(fake, store), "--cycles", 4)
     with DataEngine.open(store) as engine:
         assert engine.store.decisions.counts()["decisions"] == 14

@@ -1,7 +1,7 @@
 """Universal Robots: record insertions and drive a cell over RTDE (TCP port 30004). `RtdeRecorder`
-records traces, `UrCell` also gives the robot its orders, `FakeController` plays a controller for
-tests. Below them, and not exported here, are `stream.RtdeStream`, which receives packages and
-reconnects, and the protocol's encoding in `protocol`.
+records traces, and `UrCell` also gives the robot its orders. Below them, and not exported here,
+are `stream.RtdeStream`, which receives packages and reconnects, and the protocol's encoding in
+`protocol`.
 
 dengine has an RTDE client of its own, since a trace must hold every sample or say which are
 missing. The library ur_rtde keeps only the newest package and records at the PC's clock, so that
@@ -10,14 +10,11 @@ last values for ever.
 """
 
 from .cell import UrCell
-from .controller import FakeController, RobotProgram
 from .recorder import InsertionRecord, RtdeRecorder
 from .stream import StreamReport
 
 __all__ = [
-    "FakeController",
     "InsertionRecord",
-    "RobotProgram",
     "RtdeRecorder",
     "StreamReport",
     "UrCell",

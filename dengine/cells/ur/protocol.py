@@ -1,7 +1,7 @@
 """Encoding and decoding of RTDE, the protocol over which a Universal Robots controller sends data.
 `Package` and `PackageReader` convert between bytes and packages, `RtdeRecipe` between a data
 package and its values, and `CHANNELS` has the names of forces and poses. The client in stream.py
-and the simulated controller use them; nothing is sent here.
+uses them; nothing is sent here.
 
 A package is its size (uint16, with the header), its type (uint8) and a payload; all numbers are
 big-endian. A recipe is a list of fields to which the controller has assigned types. A data package
