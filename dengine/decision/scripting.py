@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from ..errors import StoreError
 from ..records import Arrays, State
-from .code import remember_code
 
 _SCRIPTING = threading.Lock()
 # Attributes in which torch keeps parameters, submodules and hooks; scripting adds the last.
@@ -30,8 +29,8 @@ def script(module: nn.Module) -> Any:
     Parameters
     ----------
     module : nn.Module
-        The module to compile. Its source code is remembered, so that `code.is_code_changed` can
-        tell later whether it was changed.
+        The module to compile. TorchScript keeps the first code of a class: a method that is
+        replaced afterwards is not compiled again.
 
     Returns
     -------
@@ -45,9 +44,7 @@ def script(module: nn.Module) -> Any:
     """
     with _SCRIPTING, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r".*torch\.jit\..* is deprecated.*")
-        scripted = torch.jit.script(module)
-    remember_code(module)
-    return scripted
+        return torch.jit.script(module)
 
 
 def reason_of(error: Exception) -> str:

@@ -31,7 +31,6 @@ import torch
 
 from .. import __version__
 from ..decision import member_rules
-from ..decision.code import is_code_changed
 from ..decision.decider import DecisionConditions
 from ..decision.intervals import SCALAR_BOUNDS
 from ..decision.members import SAFE_MODES
@@ -126,8 +125,8 @@ def prepare_export(
     ExportError
         For a baseline, before the first training, for a rule, an interval or a reducer that
         TorchScript cannot compile or run, if the compiled decision embeds a trace elsewhere than
-        the reducer does, for code that was changed after it was compiled, if the rule is stale,
-        because an update of it failed, and if the store was changed from outside.
+        the reducer does, if the rule is stale, because an update of it failed, and if the store was
+        changed from outside.
     OutputError
         If `path`, its checksum or its signature must not be written; this is checked first.
     """
@@ -140,10 +139,6 @@ def prepare_export(
             f"{type(model.rule).__name__} with the interval {model.rule.interval!r} does not "
             f"compile to TorchScript; use {' or '.join(SCALAR_BOUNDS)}, and a rule that does."
         )
-    for module in (model.rule, encoder):
-        if module is not None and is_code_changed(module):
-            problem = f"The code of {type(module).__name__} was changed after it was compiled"
-            raise ExportError(f"{problem}; start Python anew, then export.")
     if model.rule_is_stale:
         problem = "The rule has missed what became of a part"
         raise ExportError(f"{problem}; open the engine's store again, then export.")

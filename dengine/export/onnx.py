@@ -94,10 +94,9 @@ def export_onnx(
         If the engine audits (checks some parts that the model is certain of), has force limits, or
         a rule other than that of the guarantee "local" with stops "some", or a part is among the
         references more than once; the message names all of these that apply. If nothing was trained
-        yet; for a baseline; if the reducer or the interval has no module; for code that was changed
-        after it was compiled; if the rule is stale, because an update of it failed; if the store
-        was changed from outside; if the key cannot be read, or a package is missing; and if
-        onnxruntime does not decide as the model does.
+        yet; for a baseline; if the reducer or the interval has no module; if the rule is stale,
+        because an update of it failed; if the store was changed from outside; if the key cannot be
+        read, or a package is missing; and if onnxruntime does not decide as the model does.
     OutputError
         If `path` cannot be written.
     """

@@ -119,9 +119,8 @@ def export_torchscript(
     ------
     ExportError
         If nothing was trained yet, for a baseline, if the reducer, the interval or the rule cannot
-        be compiled, for code that was changed after it was compiled, if the rule is stale, because
-        an update of it failed, if the store was changed from outside, and if the key cannot be
-        read.
+        be compiled, if the rule is stale, because an update of it failed, if the store was changed
+        from outside, and if the key cannot be read.
     OutputError
         If `path` cannot be written; a file that was there is then unchanged.
     """

@@ -28,7 +28,6 @@ from sklearn.base import clone
 from torch import Tensor, nn
 
 from ..decision.classifier import WilsonRadiusClassifier
-from ..decision.code import is_code_changed
 from ..decision.decider import Decider, DecisionConditions, Predicted, Verdict
 from ..decision.members import SAFE_MODES
 from ..decision.neighbours import RadiusNeighbours
@@ -45,7 +44,7 @@ from ..decision.scripting import (
     restore,
     script,
 )
-from ..errors import ExportError, StoreError, expect, listed, log
+from ..errors import ExportError, StoreError, expect
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, describe_estimator
 from ..records import ACTIONS, REASONS, REPEATS, Arrays, Reason, State, TraceSpec, as_success
@@ -224,23 +223,6 @@ def _as_key(value: object) -> object:
             key = _as_key(item)
         keys.append((repr(name), key))
     return (type(value), *sorted(keys))
-
-
-def _is_code_unchanged(*modules: nn.Module) -> bool:
-    """Return whether no module's code was changed since TorchScript compiled it.
-
-    Otherwise a warning is logged. TorchScript keeps the first code of a class that it
-    compiled, so a class whose code was changed, in a notebook for example, must run in Python. Code
-    that was never compiled counts as unchanged. The warning names the classes.
-    """
-    changed = [type(module).__name__ for module in modules if is_code_changed(module)]
-    if changed:
-        log.warning(
-            "the code of %s was changed after it was compiled: it answers in Python; "
-            "start Python anew to have it compiled",
-            listed(changed),
-        )
-    return not changed
 
 
 def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
@@ -507,8 +489,7 @@ class ModelPrediction(EngineModel):
         computes in a thread of its own. Before the first training, if reducer and rule can be
         compiled, the caller's thread compiles a decider meanwhile, because the first retrain has no
         time for that; the process keeps it as a template (`template_of`). The call returns when
-        both are done, and raises what either raised. A warning is logged if code was changed after
-        it was compiled.
+        both are done, and raises what either raised.
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -516,7 +497,7 @@ class ModelPrediction(EngineModel):
             computing = pool.submit(self.spaces.precompute, X, numbers)
             is_untrained = "index" not in vars(self)
             is_scriptable = encoder is not None and self.rule.scriptable
-            if is_untrained and is_scriptable and _is_code_unchanged(self.rule, encoder):
+            if is_untrained and is_scriptable:
                 self._compile_template(encoder, X.shape[1:])
             computing.result()
 
@@ -570,8 +551,7 @@ class ModelPrediction(EngineModel):
         -------
         Decider
             Compiled if encoder and rule can be compiled. Otherwise it runs in Python, and only some
-            of its submodules are compiled. This is also so if the code of the rule or the encoder
-            was changed after it was compiled; a warning is then logged.
+            of its submodules are compiled.
 
         Raises
         ------
@@ -585,17 +565,14 @@ class ModelPrediction(EngineModel):
         neighbours: Any = self.classifier.neighbours_over(self.index, self.rule, self.spaces.scores)
         scale = torch.from_numpy(self.scale)
         shape = (self.n_spaces, self.index.dim)
-        rule_compiles = self.rule.scriptable and _is_code_unchanged(self.rule)
-        if encoder is not None and not _is_code_unchanged(encoder):
-            encoder = None
-        if encoder is not None and rule_compiles:
+        if encoder is not None and self.rule.scriptable:
             predictor = Predictor(encoder, scale, self.gate, neighbours)
             decider: Decider = compiled(
                 Decider(predictor, conditions, shape).eval(), self.trace_shape
             )
             return decider
         encoder = InPython(self.spaces) if encoder is None else script(encoder)
-        neighbours = script(neighbours) if rule_compiles else neighbours
+        neighbours = script(neighbours) if self.rule.scriptable else neighbours
         predictor = Predictor(encoder, scale, script(self.gate), neighbours)
         return Decider(predictor, conditions, shape).eval()
 

@@ -6,7 +6,6 @@ import importlib
 import linecache
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -187,122 +186,35 @@ def test_a_rule_that_cannot_be_had_is_named(name: str, message: str) -> None:
 
 
 RULE = """
-import torch
-from torch import nn
 from dengine.decision.rule import DecisionRule
-import {limits}
-
-
-def helper(x: float) -> float:
-    return x
-
-
-class Part(nn.Module):
-    def forward(self, x: float) -> float:
-        return x
 
 
 class MyRule(DecisionRule):
-    def __init__(self, alpha: float, lower_bound: float, interval: str = "wilson") -> None:
-        super().__init__(alpha, lower_bound, interval)
-        self.part = Part()
-
-    @property
-    def level(self) -> float:
-        return 0.5
-
     def action(self, lower: float, upper: float) -> int:
-        return {accept} if helper(self.part(lower)) >= {limits}.LIMIT else 0
+        return {action}
 """
-
-
-def lower_by_one(self: object, x: float) -> float:
-    return x - 1.0
-
-
-def level(self: object) -> float:
-    return 0.5
-
-
-def rejects(self: object, lower: float, upper: float) -> int:
-    return 2
-
-
-CHANGES = {  # of a rule's module, whose rule accepts: what is replaced, by what, and the action then
-    "a constant of a module": (lambda rules: rules.limits, "LIMIT", 2.0, Action.VERIFY),
-    "a function": (lambda rules: rules, "helper", lambda x: x - 1.0, Action.VERIFY),
-    "a helper's method": (lambda rules: rules.Part, "forward", lower_by_one, Action.VERIFY),
-    "its own method": (lambda rules: rules.MyRule, "action", rejects, Action.REJECT),
-    "a setter": (lambda rules: rules.MyRule, "level", property(level, lower_by_one), Action.ACCEPT),
-}
-
-
-def rule_module(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, accept: int = 1
-) -> ModuleType:
-    """A module of an outside author with `MyRule`, and beside it the constant that it reads."""
-    monkeypatch.syspath_prepend(str(folder))
-    (folder / f"limits_{name}.py").write_text("LIMIT = 0.5\n", encoding="utf-8")
-    (folder / f"{name}.py").write_text(
-        RULE.format(limits=f"limits_{name}", accept=accept), encoding="utf-8"
-    )
-    module = importlib.import_module(name)
-    module.limits = getattr(module, f"limits_{name}")
-    return module
-
-
-def says(rule: type[DecisionRule], data: Dataset) -> tuple[Action, ModelPrediction]:
-    """What a model under this rule decides on a trace whose neighbours are good."""
-    model = ModelPrediction("pca", rule=rule(0.2, 0.8), novelty=0.0).fit(
-        data.X, np.ones(len(data), dtype=int)
-    )
-    return model.decide(good(data)[None])[0], model
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_rule_whose_code_was_changed_in_this_process_is_asked_as_it_is_now_and_not_exported_as_it_was(
-    data: Dataset, tmp_path: Path, monkeypatch, change: str
-) -> None:
-    owner, name, value, action = CHANGES[change]
-    rules = rule_module(tmp_path, monkeypatch, f"rules_{list(CHANGES).index(change)}")
-    assert says(rules.MyRule, data)[0] is Action.ACCEPT
-    monkeypatch.setattr(owner(rules), name, value)
-    result, model = says(rules.MyRule, data)
-    assert result is action
-    with pytest.raises(
-        ExportError, match="MyRule was changed after it was compiled; start Python anew"
-    ):
-        export_torchscript(model, tmp_path / "model.ts")
-
-
-def test_a_rule_with_a_variable_that_has_no_value_is_compiled(data: Dataset) -> None:
-    folder = Path()
-
-    class MyRule(DecisionRule):
-        @torch.jit.unused
-        def note(self) -> str:
-            return str(folder)  # noqa: F821  # it is deleted below
-
-    del folder
-    result, model = says(MyRule, data)
-    assert (result, model.is_compiled) == (Action.ACCEPT, True)
 
 
 def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_asked_for_themselves(
     data: Dataset, tmp_path: Path, monkeypatch
 ) -> None:
-    answers = []
+    monkeypatch.syspath_prepend(str(tmp_path))
+    rules = []
     for name, action in (("rule_a", 1), ("rule_b", 2)):
-        module = rule_module(tmp_path, monkeypatch, name, action)
-        answers.append(says(module.MyRule, data)[0])
+        (tmp_path / f"{name}.py").write_text(RULE.format(action=action), encoding="utf-8")
+        rules.append(importlib.import_module(name).MyRule)
     for number, action in enumerate((1, 2, 0)):
-        cell = RULE.format(limits="math", accept=action).replace("math.LIMIT", "0.5")
-        lines, name = cell.splitlines(keepends=True), f"<cell {number}>"
+        cell, name = RULE.format(action=action), f"<cell {number}>"
+        lines = cell.splitlines(keepends=True)
         monkeypatch.setitem(linecache.cache, name, (len(cell), None, lines, name))
         notebook: dict[str, type[DecisionRule]] = {"__name__": "__main__"}
         exec(compile(cell, name, "exec"), notebook)  # as a notebook does
-        result, model = says(notebook["MyRule"], data)
-        assert model.is_compiled
-        answers.append(result)
+        rules.append(notebook["MyRule"])
+    y = np.ones(len(data), dtype=int)
+    models = [
+        ModelPrediction("pca", rule=rule(0.2, 0.8), novelty=0.0).fit(data.X, y) for rule in rules
+    ]
+    assert all(model.is_compiled for model in models)
     accept, reject, verify = Action.ACCEPT, Action.REJECT, Action.VERIFY
+    answers = [model.decide(good(data)[None])[0] for model in models]
     assert answers == [accept, reject, accept, reject, verify]
