@@ -12,12 +12,12 @@ lines so far, each without its own. If it does not fit, a line was changed, or i
 or moved: that line and all after it are set aside. FILE.head beside the journal has the number of
 its lines and the last CRC; if it knows of a line that the journal lacks, the journal says so, and a
 missing head is logged. A last line without its end was being written when the program was killed:
-it is left out. Anything else that does not fit is a DataError that names the line.
+it is left out. A line that fits its checksum was written by a cell; if it cannot be read, as when
+its traces have another contract, it is a DataError that names the line.
 """
 
 import os
 import zlib
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,22 +25,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..datasets.dataset import expect_data
 from ..datasets.importing import ImportReport, import_parts
-from ..errors import DataError, StoreError, instead, log
+from ..errors import DataError, StoreError, TraceError, instead, log
 from ..files import FilePath
 from ..recipe import Recipe
-from ..records import FITS, Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
+from ..records import Action, Decision, Reason, TraceArray, TraceSpec, stored_trace_spec
 from ..store.opening import opening
-from ..traces import as_trace, can_fit_length
+from ..traces import as_trace
 
 if TYPE_CHECKING:
     from ..store.opening import StoreLike
 
 FORM = 4
-LABELS = {"1": True, "0": False}
-LARGEST_COUNT = 2**62
-N_DECISION_WORDS = 10  # of a part's line, before its samples
+LABELS = {"1": True, "0": False, "": None}
 EXPORTED = "export"  # the kind of the events that record a model's sum
 
 
@@ -113,8 +110,8 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     Raises
     ------
     DataError
-        For a file that is no journal of this form, a line that cannot be read, a second line of a
-        part, or no accepted and no labelled part.
+        For a file that is no journal of this form, a line that this contract cannot read, or no
+        accepted and no labelled part.
     OSError
         If the file cannot be read.
     """
@@ -143,17 +140,21 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
             )
             break
         crcs.append(crc)
-        kind, *words = _split_words(content, where)
+        problem = f"{where} is no line of this store's cell"
+        with (
+            instead(DataError, problem, ValueError, LookupError, TraceError),
+            np.errstate(over="ignore"),  # a sample beyond float32 is infinite
+        ):
+            kind, *words = content.decode().split(",")
+            if kind == "part":
+                line = _parse_part(words, spec)
+            else:
+                line = replace(parts[words[0]], label=LABELS[words[1]])
         if kind == "part":
-            line = _parse_part(words, spec, where)
-            is_new = line.decision.id not in parts
-            wanted = f"one line of each part, in {where}"
-            expect_data(is_new, wanted, line.decision.id, "the journal was pasted together")
             # Only when the next part comes is an accepted one of unknown outcome counted.
             lines += unlabelled
             unlabelled = [line] if line.label is None else []
         else:
-            line = _parse_label(words, parts, where)
             is_late = line.decision.id not in [earlier.decision.id for earlier in unlabelled]
             line = replace(line, late=is_late)
             unlabelled = unlabelled if is_late else []
@@ -191,92 +192,35 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
     return "" if has_line else f"{path} does not hold line {number}, which its head knows: {risk}"
 
 
-def _split_words(content: bytes, where: str) -> list[str]:
-    """Return the words of a line between its commas; the first is "part" or "label".
-
-    Raises DataError, naming `where`, if the line is not UTF-8 or begins with another word.
-    """
-    with instead(
-        DataError, f"Expected UTF-8 in {where}, it is damaged, or no journal", UnicodeDecodeError
-    ):
-        words = content.decode("utf-8").split(",")
-    is_known = words[0] in ("part", "label")
-    expect_data(is_known, f"a line that begins with part or label in {where}", words[0])
-    return words
-
-
-def _parse_label(words: list[str], parts: Mapping[str, JournalLine], where: str) -> JournalLine:
-    """Return the earlier part that a label's line names, as a new `JournalLine` with the label.
-
-    `words` are id and label, 1 or 0; `parts` has the parts so far by id. Raises DataError, naming
-    `where`, for other words, an id that is not in `parts`, and a part that was rejected or has a
-    label.
-    """
-    is_valid = len(words) == 2 and words[0] in parts and words[1] in LABELS
-    expect_data(is_valid, f"an earlier part's id and a label of 1 or 0 in {where}", ",".join(words))
-    line = parts[words[0]]
-    is_open = line.decision.action is not Action.REJECT and line.label is None
-    expect_data(is_open, f"one label of a part that was not rejected in {where}", words[0])
-    return replace(line, label=LABELS[words[1]])
-
-
-def _parse_part(words: list[str], spec: TraceSpec, where: str) -> JournalLine:
+def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
     """Return decision, trace and label of a part's line, whose first word is left out.
 
-    The trace of a part with the action REJECT is empty, (1, 0); the label is None if there is none.
-    The line lacks embedding, model version and propensity (the probability of this action); None, 0
-    and 1 stand for these. Raises DataError, naming `where`, for impossible values.
+    The trace of a part with the action REJECT is empty, (1, 0); another one is fitted as `spec.fit`
+    says. The line lacks embedding, model version and propensity (the probability of this action);
+    None, 0 and 1 stand for these. Raises ValueError, LookupError or TraceError for other words.
     """
-    padded = [*words[:N_DECISION_WORDS], *[""] * (N_DECISION_WORDS - len(words))]
-    id_, label, part, action, predicted, reason, lower, upper, n_success, n_failure = padded
-    with instead(DataError, f"The decision in {where} cannot be read", ValueError):
-        decision = Decision(
-            id=id_,
-            action=Action(action),
-            predicted=Action(predicted),
-            lower=float(lower),
-            upper=float(upper),
-            n_success=int(n_success),
-            n_failure=int(n_failure),
-            embedding=None,
-            model_version=0,
-            reason=Reason(reason),
-            audit=reason == Reason.AUDIT.value,
-            propensity=1.0,
-            part=part or None,
-        )
-    counts = (decision.n_success, decision.n_failure)
-    has_counts = 0 <= min(counts) <= max(counts) < LARGEST_COUNT
-    is_valid = 0.0 <= decision.lower <= decision.upper <= 1.0 and has_counts
-    expect_data(is_valid, f"bounds between 0 and 1 and counts in {where}", ",".join(padded[6:]))
-    is_rejected = decision.action is Action.REJECT
-    is_valid = id_ != "" and (label == "" or (label in LABELS and not is_rejected))
-    expect_data(is_valid, f"an id, and a label of 1, 0 or nothing in {where}", (id_, label))
-    trace = np.zeros((1, 0), dtype=np.float32)
-    if not is_rejected:
-        trace = _parse_trace(words[N_DECISION_WORDS:], spec, where)
-    return JournalLine(decision, trace, LABELS.get(label))
-
-
-def _parse_trace(words: list[str], spec: TraceSpec, where: str) -> TraceArray:
-    """Return samples, channel after channel, as a trace of the contract, float32 (C, T).
-
-    Another number of samples is fitted as `spec.fit` says. Raises DataError, naming `where`, for
-    words that are no numbers ("nan" and "inf" are), for a number of them that cannot be fitted, and
-    for one that is no multiple of the channels.
-    """
-    n = spec.channels * spec.samples
-    samples, rest = divmod(len(words), spec.channels)
-    is_valid = rest == 0 and can_fit_length(samples, spec.samples, FITS.index(spec.fit))
-    expect_data(
-        is_valid, f"{n} samples in {where}", len(words), "it is damaged, or of another cell"
+    id_, label, part, action, predicted, reason, *numbers = words
+    lower, upper, n_success, n_failure, *samples = numbers
+    decision = Decision(
+        id=id_,
+        action=Action(action),
+        predicted=Action(predicted),
+        lower=float(lower),
+        upper=float(upper),
+        n_success=int(n_success),
+        n_failure=int(n_failure),
+        embedding=None,
+        model_version=0,
+        reason=Reason(reason),
+        audit=reason == Reason.AUDIT.value,
+        propensity=1.0,
+        part=part or None,
     )
-    with (
-        instead(DataError, f"The samples in {where} are no row of numbers", ValueError),
-        np.errstate(over="ignore"),
-    ):
-        values = np.array([float(word) for word in words]).astype(np.float32)
-    return as_trace(values.reshape(spec.channels, -1), spec)
+    trace = np.zeros((1, 0), dtype=np.float32)
+    if decision.action is not Action.REJECT:
+        values = np.array(samples, dtype=np.float32)
+        trace = as_trace(values.reshape(spec.channels, -1), spec)
+    return JournalLine(decision, trace, LABELS[label])
 
 
 def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) -> ImportReport:
