@@ -13,7 +13,7 @@ import argparse
 import re
 import time
 from collections.abc import Iterable
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,24 @@ def select_first(
             "simulate more cycles."
         )
     return selected
+
+
+def save_with_conditions(path: Path, insertions: list[SimulatedInsertion]) -> None:
+    """Write the data set, and for each insertion how it ended and what was drawn for it."""
+    with np.load(save_insertions(path, insertions, force=True)) as saved:
+        arrays = dict(saved)
+    rows = [asdict(insertion.conditions) | asdict(insertion.sensor) for insertion in insertions]
+    names = [name for name in rows[0] if name != "fault"]
+    np.savez_compressed(
+        path,
+        **arrays,
+        cause=np.array([insertion.cause for insertion in insertions]),
+        height_mm=np.array([insertion.height_mm for insertion in insertions], dtype=np.float32),
+        cycle=np.array([insertion.cycle for insertion in insertions], dtype=np.int32),
+        conditions=np.array([[row[name] for name in names] for row in rows], dtype=np.float32),
+        condition_names=np.array(names),
+        seed=np.int64(SEED),
+    )
 
 
 def draw_causes(data: Dataset, path: Path) -> None:
@@ -358,7 +376,7 @@ def main() -> None:
         insertions = simulate(N_CYCLES, SEED, n_jobs=arguments.jobs)
         print(f"{time.perf_counter() - start:.0f} s for {N_CYCLES} cycles")
         selected = select_first(insertions, N_SUCCESSES, N_FAILURES)
-        save_insertions(arguments.out / "insertion.npz", selected, SEED, force=True)
+        save_with_conditions(arguments.out / "insertion.npz", selected)
     print(write_card(arguments.out, arguments.steps, arguments.jobs))
 
 

@@ -217,7 +217,7 @@ def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bo
 
     with progress_bar(f"simulating {scenario}", n) as advance:
         insertions = simulate_insertions(n, seed, scenario, n_jobs, progress=advance)
-    path = save_insertions(out, insertions, seed, scenario, force)
+    path = save_insertions(out, insertions, force)
     successes = sum(insertion.success for insertion in insertions)
     record = {
         "simulated": True,

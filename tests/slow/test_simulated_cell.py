@@ -111,9 +111,6 @@ def test_scenarios_change_what_they_say_and_nothing_else() -> None:
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
-        (lambda: CellParameters(friction=(0.5, 0.1)), "low <= high"),
-        (lambda: CellParameters(debris=8.0), "probability"),
-        (lambda: CellParameters(debris=0.6, weak_grip=0.6), "sum to at most 1"),
         (lambda: find_scenario("rain"), "nominal, wear, variant, bias_jump"),
         (lambda: simulate(0), "at least 1"),
         (lambda: push(good(), time_step_s=0.0007), "divides 2 ms"),
@@ -126,13 +123,11 @@ def test_a_bad_setting_says_what_was_expected(bad: object, message: str) -> None
 
 def test_saved_traces_come_back_within_one_step(tmp_path) -> None:
     created = simulate(4, seed=6, n_jobs=1)
-    with np.load(
-        save_insertions(tmp_path / "traces.npz", created, seed=6), allow_pickle=False
-    ) as saved:
+    path = save_insertions(tmp_path / "traces.npz", created)
+    with np.load(path, allow_pickle=False) as saved:
         assert (saved["X"].dtype, saved["X"].shape) == (np.int16, (4, 1000))
         np.testing.assert_allclose(
             saved["X"] * saved["scale"], traces(created), atol=0.51 * float(saved["scale"].max())
         )
         np.testing.assert_array_equal(saved["y"], [item.success for item in created])
-        np.testing.assert_array_equal(saved["cause"], [item.cause for item in created])
         assert float(saved["rate_hz"]) == 500

@@ -16,8 +16,6 @@ Range = tuple[float, float]  # (low, high) of a uniform draw
 SAMPLES = 1000
 RATE_HZ = 500.0
 FAULTS = ("missed_grasp", "weak_grip", "debris", "wrong_part")
-_PROBABILITIES = {"unreported_share", "confirm_share", *FAULTS}
-_SIGNED = {"bias_n", "drift_n", "bias_offset_n"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +76,6 @@ class CellParameters:
         Of the sensor's low-pass filter.
     bias_offset_n : float
         Added to every bias; zero but in the scenario "bias_jump".
-
-    Raises
-    ------
-    SettingError
-        For a range, a probability or a size that cannot be.
     """
 
     cycle_s: float = 47.0
@@ -133,22 +126,6 @@ class CellParameters:
     dropped_share: Range = (0.0, 0.02)
     bandwidth_hz: float = 90.0
     bias_offset_n: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in (field.name for field in fields(self)):
-            value = getattr(self, name)
-            low, high = value if isinstance(value, tuple) else (value, value)
-            expect(low <= high, f"{name} as (low, high) with low <= high", value, "swap them")
-            probable = name not in _PROBABILITIES or 0 <= low <= 1
-            expect(probable, f"{name} as a probability from 0 to 1", value, "give a share of 1")
-            expect(
-                name in _SIGNED or low >= 0,
-                f"{name} to be at least 0",
-                value,
-                "the unit is in its name",
-            )
-        faults = self.missed_grasp + self.weak_grip + self.debris + self.wrong_part
-        expect(faults <= 1, "fault probabilities that sum to at most 1", faults, "lower one")
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +201,11 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     Returns
     -------
     Conditions
+
+    Raises
+    ------
+    ValueError
+        For a range (high, low), a negative deviation, and probabilities of faults that are none.
     """
     p = parameters
 

@@ -2,11 +2,10 @@
 (`save_insertions`). A seed gives the same insertions for any number of processes. `dengine
 simulate` uses it.
 
-    save_insertions("traces.npz", simulate(100, seed=0), seed=0)
+    save_insertions("traces.npz", simulate(100, seed=0))
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from io import BytesIO
 from pathlib import Path
 
@@ -72,11 +71,7 @@ def simulate(
 
 
 def save_insertions(
-    path: str | Path,
-    insertions: Sequence[SimulatedInsertion],
-    seed: int,
-    scenario: str = "nominal",
-    force: bool = False,
+    path: str | Path, insertions: Sequence[SimulatedInsertion], force: bool = False
 ) -> Path:
     """Write insertions as a compressed .npz file that `load_dataset` reads; return its path.
 
@@ -84,17 +79,13 @@ def save_insertions(
     rounded to integer steps of `scale`, 0.01 N or more.
 
     The arrays are X int16 (n, 1000) with `scale`, so that X * scale is in `unit`; y int8 (n,);
-    cause str; height_mm float32; cycle int32; `conditions` float32 (n, m), all numbers that were
-    drawn, with their names `condition_names`; and rate_hz, unit, seed, scenario, simulated.
+    rate_hz and unit.
 
     Parameters
     ----------
     path : str or path
     insertions : sequence of SimulatedInsertion
         At least one.
-    seed : int
-    scenario : str, default "nominal"
-        Seed and scenario are stored, so that the file can be made again.
     force : bool, default False
         Replace a file that exists.
 
@@ -110,22 +101,12 @@ def save_insertions(
     buffer = BytesIO()
     X = np.stack([insertion.trace for insertion in insertions])
     scale = max(0.01, float(np.abs(X).max()) / 32000)  # newtons per integer step
-    rows = [asdict(insertion.conditions) | asdict(insertion.sensor) for insertion in insertions]
-    names = [name for name in rows[0] if name != "fault"]
     np.savez_compressed(
         buffer,
         X=np.round(X / scale).astype(np.int16),
         scale=np.float32(scale),
         y=np.array([insertion.success for insertion in insertions], dtype=np.int8),
-        cause=np.array([insertion.cause for insertion in insertions]),
-        height_mm=np.array([insertion.height_mm for insertion in insertions], dtype=np.float32),
-        cycle=np.array([insertion.cycle for insertion in insertions], dtype=np.int32),
-        conditions=np.array([[row[name] for name in names] for row in rows], dtype=np.float32),
-        condition_names=np.array(names),
         rate_hz=np.float32(RATE_HZ),
         unit=np.array("N"),
-        seed=np.int64(seed),
-        scenario=np.array(scenario),
-        simulated=np.array(True),
     )
     return write_output(path, buffer.getvalue(), force, make_folder=True)
