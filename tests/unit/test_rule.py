@@ -214,7 +214,7 @@ def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_as
     models = [
         ModelPrediction("pca", rule=rule(0.2, 0.8), novelty=0.0).fit(data.X, y) for rule in rules
     ]
-    assert all(model.is_compiled for model in models)
     accept, reject, verify = Action.ACCEPT, Action.REJECT, Action.VERIFY
     answers = [model.decide(good(data)[None])[0] for model in models]
     assert answers == [accept, reject, accept, reject, verify]
+    assert all(model.is_compiled for model in models)
