@@ -27,7 +27,6 @@ Tan, Dempster, Bergmeir and Webb (2022), MultiRocket, Data Min. Knowl. Disc. 36:
 and differences.
 """
 
-from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations, pairwise
 
 import numpy as np
@@ -35,7 +34,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..decision.scripting import script
 from ..errors import SettingError
 from .base import Floats
 
@@ -48,8 +46,6 @@ FEATURE_CLIP = 4.0  # deviations; an outlier may not carry a score by itself
 SCALE_TRACES = 256  # from which the scales of the channels are read
 FILTER_TRACES = 64  # from which thresholds and widths of ramps are read
 CHUNK = 32  # traces that are computed at once: what they need stays in the cache
-PARALLEL_TRACES = 3200  # from which on a second core is used
-PARALLEL_CHUNK = 512  # traces that a thread takes at once
 
 
 class RocketEncoder(nn.Module):
@@ -322,47 +318,17 @@ class RocketEncoder(nn.Module):
         self.offset.copy_(-mean / (deviation + floor))
 
 
-class ChunkedFeatures(nn.Module):
-    """Compute the raw features of many traces, chunk by chunk, into a given tensor.
-
-    Compiled, it releases Python's lock, so that an engine can open or compile at the same time.
-    """
-
-    def __init__(self, encoder: RocketEncoder) -> None:
-        super().__init__()
-        self.encoder = encoder
-        self.chunk = CHUNK
-
-    def forward(self, x: Tensor, out: Tensor) -> None:
-        """Write the features of x (n, C, T) to `out` (n, P); n is a multiple of the chunk."""
-        for i in range(0, x.size(0), self.chunk):
-            out[i : i + self.chunk] = self.encoder.raw_features(x[i : i + self.chunk])
-
-
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
     """Compute the raw features of traces (n, C, T): float32 (n, P).
 
     The features of a trace are the same to the bit whatever other traces it comes with, since every
-    chunk is full; the last chunk is filled up with zeros. For `PARALLEL_TRACES` traces or more the
-    encoder is compiled and two threads compute; the call returns when both are done.
+    chunk is full; the last chunk is filled up with zeros.
     """
-    x = torch.from_numpy(traces)
-    n = len(traces)
-    n_whole = n // CHUNK * CHUNK
-    out = torch.empty(n, len(encoder.gain))
-    rest = torch.zeros(CHUNK, *x.shape[1:])
-    rest[: n - n_whole] = x[n_whole:]
-    out[n_whole:] = encoder.raw_features(rest)[: n - n_whole]
-    if n < PARALLEL_TRACES:
-        ChunkedFeatures(encoder)(x[:n_whole], out[:n_whole])
-        return out
-    compute = script(ChunkedFeatures(encoder))
-    for _ in range(2):  # TorchScript's first calls compile
-        compute(x[:CHUNK], out[:CHUNK])
-    starts = range(0, n_whole, PARALLEL_CHUNK)
-    parts = [slice(i, min(i + PARALLEL_CHUNK, n_whole)) for i in starts]
-    with ThreadPoolExecutor(2, "dengine-features", torch.set_num_threads, (1,)) as pool:
-        list(pool.map(lambda part: compute(x[part], out[part]), parts))
+    out = torch.empty(len(traces), len(encoder.gain))
+    for start in range(0, len(traces), CHUNK):
+        chunk = torch.from_numpy(traces[start : start + CHUNK])
+        full = nn.functional.pad(chunk, [0, 0, 0, 0, 0, CHUNK - len(chunk)])
+        out[start : start + CHUNK] = encoder.raw_features(full)[: len(chunk)]
     return out
 
 
