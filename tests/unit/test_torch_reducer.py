@@ -266,21 +266,15 @@ def test_every_member_starts_from_the_weights_of_a_checkpoint(network: Any, tmp_
     torch.testing.assert_close(several.eval()(x.expand(-1, 3, -1, -1)), expected)
 
 
-VARIANCE = "networks.network.convolutions.1.running_var"
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (b"no checkpoint", "of named dense tensors alone"),
         (None, "cannot be read"),
         (b"\x80\x02a.", "of named dense tensors alone"),  # a pickle whose stack is empty
-        ("other", r"of this network for traces .* has shape and type \(.*\), not \("),
-        ("float64", r"of this network for traces .*torch.float64\), not \(.*torch.float32\)"),
+        ("other", "finite weights of this network"),
         ("a whole training", "of named dense tensors alone"),
-        ({"bias": torch.full((1, 2), float("nan"))}, "finite weights .*others in bias"),
-        ({"bias": torch.full((1, 2), -1e30)}, "finite weights .*others in bias"),
-        ({VARIANCE: torch.full((8,), -1.0)}, f"variances of at least 0.*others in {VARIANCE}"),
+        ({"bias": torch.full((1, 2), float("nan"))}, "finite weights of this network"),
         ({"bias": torch.zeros(1, 2).to_sparse()}, "of named dense tensors alone"),
         ({"bias": torch.zeros(1, 2, device="meta")}, "of named dense tensors alone"),
     ],
@@ -294,8 +288,6 @@ def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(
         save_checkpoint(Members(ConvNetwork, 6, 120, 1), path)
     elif content == "a whole training":
         torch.save({"epoch": 3, "model": state}, path)
-    elif content == "float64":
-        torch.save({name: value.double() for name, value in state.items()}, path)
     elif isinstance(content, dict):
         torch.save(state | content, path)
     elif content is not None:
