@@ -40,7 +40,7 @@ from ..engine.engine import DataEngine
 from ..errors import ExportError, instead
 from ..files import UNREADABLE, FilePath, check_output, read_key, write_output
 from ..model.base import N_EXAMPLES, NOT_TRAINED, Exportable
-from ..model.neighbours import compare_points
+from ..model.neighbours import ModelPrediction, compare_points
 from ..records import Action, Reason, TraceSpec
 from .decision import FIELDS, DecisionModule
 
@@ -167,9 +167,11 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
     """Return the model that decides at present, with the engine's settings, for an exporter.
 
     It is no copy: the model goes on learning. `trace` replaces the trace contract of the engine or
-    the model. Raises ExportError before the first training, for a baseline, and where the engine's
-    store was changed from outside.
+    the model. An `Exportable` is returned as it is. Raises ExportError before the first training,
+    for a baseline, and where the engine's store was changed from outside.
     """
+    if isinstance(engine_or_model, Exportable):
+        return engine_or_model
     engine = engine_or_model if isinstance(engine_or_model, DataEngine) else None
     model = engine_or_model
     if engine is not None:
@@ -178,16 +180,14 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
             raise ExportError(f"Expected a store as it was written, to export from: {error}")
         trace = trace or engine.trace
         model = engine.model
-        if model is None:
-            raise ExportError(NOT_TRAINED)
-    try:
-        source: Exportable = model.exported(trace)
-    except AttributeError as error:
-        actual = type(model).__name__
+    if model is None or (isinstance(model, ModelPrediction) and not hasattr(model, "trace_shape")):
+        raise ExportError(NOT_TRAINED)
+    if not isinstance(model, ModelPrediction):
         raise ExportError(
-            f"Expected a DataEngine or a ModelPrediction to export, got {actual}; a baseline stays "
-            "in Python."
-        ) from error
+            f"Expected a DataEngine or a ModelPrediction to export, got {type(model).__name__}; a "
+            "baseline stays in Python."
+        )
+    source = Exportable(model, trace or model.trace_spec, examples=model.examples)
     if engine is None:
         return source
     return replace(

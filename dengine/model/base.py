@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
@@ -509,10 +509,3 @@ class Exportable:
     recipe: str = ""
     examples: Floats = field(default_factory=lambda: NO_TRACES)
     note: Callable[[str, str], object] | None = None
-
-    def exported(self, trace: TraceSpec | None = None) -> Exportable:
-        """Return itself if `trace` is None, otherwise a copy with this `TraceSpec`.
-
-        A `ModelPrediction` has this method as well, so an exporter takes either.
-        """
-        return self if trace is None else replace(self, trace=trace)

@@ -44,7 +44,7 @@ from ..decision.scripting import (
     restore,
     script,
 )
-from ..errors import ExportError, StoreError, expect
+from ..errors import StoreError, expect
 from ..folds import content_hash, fold_of
 from ..recipe import NOVELTY, Recipe, describe_estimator
 from ..records import ACTIONS, REASONS, REPEATS, Arrays, Reason, State, TraceSpec, as_success
@@ -63,10 +63,8 @@ from ..traces import ForceLimitsGate, as_labels, as_traces, clip_extremes
 from .base import (
     N_EXAMPLES,
     NO_TRACES,
-    NOT_TRAINED,
     Embedding,
     EngineModel,
-    Exportable,
     Prediction,
 )
 
@@ -875,16 +873,6 @@ class ModelPrediction(EngineModel):
     def needs_refit(self, state: Arrays) -> bool:
         """Return whether a state does not hold the reducer, which must then be trained again."""
         return not arrays_with_prefix(state, "reducer.")
-
-    def exported(self, trace: TraceSpec | None) -> Exportable:
-        """Return an `Exportable` of this model, from which an exporter starts.
-
-        Its `TraceSpec` is `trace`, or if that is None, the shape of the training traces. Raises
-        ExportError before the first training.
-        """
-        if "trace_shape" not in vars(self):
-            raise ExportError(NOT_TRAINED)
-        return Exportable(self, trace or self.trace_spec, examples=self.examples)
 
     def __getstate__(self) -> dict[str, Any]:
         # A scripted module does not travel between processes; the receiver builds its own.
