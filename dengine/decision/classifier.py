@@ -15,8 +15,10 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from ..records import ACTIONS
 from .neighbours import RadiusNeighbours
 from .policy import Policy, check_radius
-from .references import Counts, RadiusIndex
+from .references import RadiusIndex
 from .rule import DecisionRule
+
+Ints = NDArray[np.int64]
 
 
 # scikit-learn ships no types
@@ -88,7 +90,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self.index_.add(Z, success)
         return self
 
-    def count(self, Z: ArrayLike) -> Counts:
+    def count(self, Z: ArrayLike) -> tuple[Ints, Ints]:
         """Count the labels within the radius of each row; NotFittedError before `fit`.
 
         Parameters

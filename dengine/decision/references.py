@@ -4,7 +4,7 @@ engine's model, the scikit-learn classifier and the exported file count by it.
 
     >>> index = RadiusIndex(dim=2, capacity=10_000)
     >>> index.add(points, labels, spaces)
-    >>> n_success, n_failure = index.count(queries, radius=0.3)
+    >>> n_success, n_failure = index.count_near(index.squared_distances(query), radius=0.3)
 
 The search is brute force in float32. It takes tens of microseconds and compiles to TorchScript, so
 one implementation counts in the engine, in the scikit-learn classifier and in the exported file.
@@ -32,8 +32,6 @@ N_NEIGHBOURS = 30  # of other parts, whose labels say what is usual around a poi
 SAMPLE = 3000  # newest points that are looked at: the work does not grow
 FILTER_SIZE = 2**16  # bits, a power of two
 CONFIDENCE = 1.645  # standard errors above the estimate: 95 %, one-sided
-
-Counts = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 def label_agreement(
@@ -449,27 +447,6 @@ class RadiusIndex(nn.Module):
         self.repeats.fill_(int((slots != np.arange(self.capacity)).sum()))
         self.part_filter.zero_()
         self.part_filter[torch.from_numpy(parts & self.filter_mask)] = True
-
-    def count(self, queries: ArrayLike, radius: float) -> Counts:
-        """Count labels around each query; no part is excluded.
-
-        Parameters
-        ----------
-        queries : array, shape (n, d) or (n, K, d)
-            (n, K, d) for K embedding spaces.
-        radius : float
-            A point at this distance counts.
-
-        Returns
-        -------
-        n_success, n_failure : array of int64, shape (n,)
-            Rounded votes if any part in the index came more than once, as of `count_near`.
-        """
-        z = torch.from_numpy(np.array(queries, dtype=np.float32))
-        z = z[:, None, :] if z.dim() == 2 else z  # (n, K, d)
-        pairs = [self.count_near(self.squared_distances(query), radius) for query in z]
-        counts = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        return counts[:, 0], counts[:, 1]
 
     def get_state(self) -> dict[str, NDArray[Any]]:
         """Return copies of the index's arrays, by name, from which `from_state` makes it again.

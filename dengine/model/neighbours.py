@@ -33,7 +33,7 @@ from ..decision.members import SAFE_MODES
 from ..decision.neighbours import RadiusNeighbours
 from ..decision.novelty import NoveltyGate, fit_novelty
 from ..decision.policy import Policy
-from ..decision.references import Counts, RadiusIndex
+from ..decision.references import RadiusIndex
 from ..decision.rule import DecisionRule
 from ..decision.scripting import (
     arrays_with_prefix,
@@ -749,7 +749,7 @@ class ModelPrediction(EngineModel):
         """
         return [self.predict_one(x) for x in as_traces(X, self.trace_spec)]
 
-    def count(self, X: ArrayLike) -> Counts:
+    def count(self, X: ArrayLike) -> tuple[Ints, Ints]:
         """Count the labels in the neighbourhood of each trace of X, summed over the K spaces.
 
         X has the shape (n, samples) or (n, channels, samples). Returns (n_success, n_failure), each
