@@ -155,7 +155,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> list[Row]:
         table_row("decisions compared", len(X)),
         table_row("of them certain", n_certain),
         table_row("of them audits", sum(decision.audit for decision in decisions)),
-        difference_row("Python", map(Outcome.of, exported.decide_many(X)), expected),
+        difference_row("Python", map(Outcome.of, map(exported.decide, X)), expected),
         table_row("first call after loading", first_call, "µs", "<= 1 ms"),
     ]
     latencies = time_calls(exported.decide, recorded, arguments.calls)
@@ -181,8 +181,8 @@ def measure_onnx(
     onnx_file = export_onnx(engine.model, folder / "model.onnx", trace=engine.trace)
     plain_file = export_torchscript(engine.model, folder / "plain.ts", trace=engine.trace)
     runtime = load_onnx(onnx_file)
-    outcomes = map(Outcome.of, runtime.decide_many(drawn))
-    expected = map(Outcome.of, load_exported(plain_file).decide_many(drawn))
+    outcomes = map(Outcome.of, map(runtime.decide, drawn))
+    expected = map(Outcome.of, map(load_exported(plain_file).decide, drawn))
     latencies = time_calls(runtime.decide, recorded, calls)
     difference = difference_row("onnxruntime", outcomes, expected, target="")
     return [difference, *latency_rows("onnxruntime", latencies)]

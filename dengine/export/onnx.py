@@ -35,7 +35,7 @@ from ..files import FilePath
 from ..model.base import Exportable
 from ..model.neighbours import NOVEL
 from ..records import ACTIONS, REASONS, TraceSpec
-from ..traces import CONSTANT, LARGEST, NOT_FINITE, SATURATED, TOO_LARGE, as_trace, as_traces
+from ..traces import CONSTANT, LARGEST, NOT_FINITE, SATURATED, TOO_LARGE, as_trace
 from .bundle import (
     METADATA,
     Metadata,
@@ -200,10 +200,6 @@ class OnnxModel:
         numbers = (value.item() for value in counted)
         return ExportedDecision._make((ACTIONS[action], REASONS[reason], *numbers, z))
 
-    def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
-        """Decide on each trace of (n, T) or (n, C, T), as `decide` does."""
-        return [self.decide(x) for x in as_traces(X, self.trace)]
-
 
 class OnnxDecision(nn.Module):
     """The decision without a branch, in tensors; the references do not change.
@@ -330,7 +326,7 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     X = (rng.normal(size=shape) * scales).astype(np.float32)
     if spec.limit is not None:
         X = np.clip(X, -0.9 * spec.limit, 0.9 * spec.limit)
-    for actual, expected in zip(onnx_model.decide_many(X), model.predict_many(X), strict=True):
+    for actual, expected in zip(map(onnx_model.decide, X), model.predict_many(X), strict=True):
         is_near = np.allclose(actual.embedding, expected.embedding, rtol=TOLERANCE, atol=TOLERANCE)
         n_moved = abs(actual.n_success - expected.n_success) + abs(
             actual.n_failure - expected.n_failure

@@ -43,7 +43,7 @@ from ..records import (
     TraceSpec,
     as_success,
 )
-from ..traces import as_trace, as_traces
+from ..traces import as_trace
 from .bundle import (
     METADATA,
     Metadata,
@@ -224,14 +224,6 @@ class ExportedModel:
         return ExportedDecision(
             ACTIONS[action], REASONS[reason], lower, upper, n_success, n_failure, z.numpy()
         )
-
-    def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
-        """Decide on each trace of (n, T) or (n, C, T), one after the other, as `decide` does.
-
-        Each becomes the pending decision in turn, so that accepted ones before the last are
-        settled.
-        """
-        return [self.decide(x) for x in as_traces(X, self.trace)]
 
     def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.

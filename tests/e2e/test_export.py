@@ -238,7 +238,7 @@ def test_several_channels_are_exported_too(
         100, 40, 3, seed=1
     ).X  # a reference that is asked about itself has no vote in the file
     expected = model.predict_many(new)
-    assert [d[2:6] for d in exported.decide_many(new)] == [
+    assert [d[2:6] for d in map(exported.decide, new)] == [
         (k.lower, k.upper, k.n_success, k.n_failure) for k in expected
     ]
 

@@ -50,16 +50,16 @@ def test_both_formats_decide_alike(
     bad[0, 3], bad[1, 5], bad[2, 0], bad[3], bad[4] = np.nan, -np.inf, 1e30, 2.5, np.nan
     novel = 3.0 * make_data(50, seed=8).X
     X = np.concatenate([make_data(200, seed=9).X, make_data(50, seed=7, noise=3.0).X, novel, bad])
-    for result, expected in zip(first.decide_many(X), two.decide_many(X), strict=True):
+    for result, expected in zip(map(first.decide, X), map(two.decide, X), strict=True):
         assert result[:2] == expected[:2]
         assert result[2:4] == pytest.approx(expected[2:4], abs=1e-6)
         assert result[4:6] == expected[4:6]
         np.testing.assert_allclose(result.embedding, expected.embedding, rtol=1e-4, atol=1e-5)
     assert {Reason.NOT_FINITE, Reason.CONSTANT, Reason.SATURATED} <= {
-        d.reason for d in first.decide_many(bad)
+        d.reason for d in map(first.decide, bad)
     }
-    assert {d.reason for d in first.decide_many(novel)} == {Reason.NOVEL}
-    assert Action.ACCEPT in {d.action for d in first.decide_many(X)}
+    assert {d.reason for d in map(first.decide, novel)} == {Reason.NOVEL}
+    assert Action.ACCEPT in {d.action for d in map(first.decide, X)}
 
 
 class OwnRule(DecisionRule):

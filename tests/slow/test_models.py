@@ -16,7 +16,7 @@ def test_a_shipped_model_is_certain_and_right_of_most_of_its_own_data_and_its_ca
 ) -> None:
     model, data = load_exported(path), load_dataset("insertion")
     assert model.metadata["references"] == len(data)
-    decisions = model.decide_many(data.X[:300])
+    decisions = [model.decide(x) for x in data.X[:300]]
     accepted = np.array([d.action == "accept" for d in decisions])
     rejected = np.array([d.action == "reject" for d in decisions])
     assert (accepted | rejected).mean() > 0.5

@@ -285,7 +285,7 @@ def test_both_exports_decide_as_the_model_does(
     places = np.array([prediction.embedding for prediction in expected])
     assert {Action.ACCEPT, Action.REJECT} <= set(actions)
     for exported in (exported_onnx, two):
-        decided = exported.decide_many(new.X)
+        decided = [*map(exported.decide, new.X)]
         assert [decision.action for decision in decided] == actions
         results = [decision.embedding for decision in decided]
         np.testing.assert_allclose(results, places, rtol=1e-4, atol=1e-5)

@@ -62,7 +62,7 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
         env=os.environ | {"LC_ALL": "de_DE.UTF-8"},
     )
     *lines, last = completed.splitlines()
-    expected = load_exported(file, key=key).decide_many(X)
+    expected = [*map(load_exported(file, key=key).decide, X)]
     for line, decision in zip(lines, expected, strict=True):
         id_, *words = line.split()
         assert len(id_.split("-")[0]) == 12
@@ -102,7 +102,7 @@ def test_libtorch_alone_decides_by_calling_the_module(
     )
     run("cmake", "--build", build)
     lines = run(build / "plain", file, SAMPLES, tmp_path / "traces.f32").splitlines()
-    expected = [(d.action, d.reason) for d in load_exported(file).decide_many(X)]
+    expected = [(d.action, d.reason) for d in map(load_exported(file).decide, X)]
     assert [(ACTIONS[int(a)], REASONS[int(r)]) for a, r in map(str.split, lines)] == expected
     assert len({action for action, _ in expected}) > 1
 
