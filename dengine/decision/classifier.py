@@ -83,7 +83,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         """
         Z, y = validate_data(self, Z, y)
         self.classes_ = classes_of(y)
-        self._create_index(np.asarray(Z).shape[1])
+        self.index_ = RadiusIndex(np.asarray(Z).shape[1], self.capacity)
+        self.neighbours_ = self.neighbours_over(self.index_)
         success = np.asarray(y) == self.classes_[-1]
         if len(self.classes_) == 1 and self.classes_[0] in (0, False, -1):
             success = ~success  # a lone class of zeros is all failures
@@ -176,11 +177,6 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         """
         rule = rule or self.policy().rule()
         return RadiusNeighbours(index, rule, self.radius, scored and rule.sorts)
-
-    def _create_index(self, dim: int) -> None:
-        """Set `index_` and `neighbours_` to empty ones for points of `dim` dimensions."""
-        self.index_ = RadiusIndex(dim, self.capacity)
-        self.neighbours_ = self.neighbours_over(self.index_)
 
     def _decisions(self, Z: ArrayLike) -> NDArray[np.float64]:
         """Decide on each row of Z (n, d); raises NotFittedError before `fit`.

@@ -152,7 +152,8 @@ def prepare_export(
     )
     shape = (model.n_spaces, model.index.dim)
     examples = source.examples
-    points = model.scaled_points(examples) if len(examples) else examples
+    # (n, K, d), without the decider
+    points = model.spaces.embed(examples) / model.scale[:, None] if len(examples) else examples
     try:
         decider = model.build_decider(conditions)
         defect = next(filter(None, compare_points(decider, examples, points)), "")

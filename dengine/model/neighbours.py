@@ -811,10 +811,6 @@ class ModelPrediction(EngineModel):
         answers = (restored.embed(self.examples) for _ in range(N_CHECKS))
         return "" if all(is_close(z, points, SAME_BATCH) for z in answers) else NOT_RESTORED
 
-    def scaled_points(self, X: Floats) -> Floats:
-        """Return the scaled embeddings (n, K, d) of traces (n, C, T), without the decider."""
-        return self.spaces.embed(X) / self.scale[:, None]
-
     def check_answers(self) -> Iterator[str]:
         """Compare the decider's embeddings of `examples` with the points that `defect` kept.
 
