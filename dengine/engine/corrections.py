@@ -54,7 +54,7 @@ class Changed:
     text : str
         A sentence for people.
     event : int or None
-        Number of the recorded event; None where everything was so already, and nothing changed.
+        Number of the recorded event; None if nothing had to change.
     version : int
         Of the model that answers now.
     """
@@ -68,10 +68,10 @@ class Changed:
 class Corrections:
     """Carries out corrections in the store and in what the engine has learned.
 
-    Every verb first finishes what is under way: labels on their way to the store, news of peers. So
-    it blocks for the store, and raises StoreError where that does not answer. A training that is
-    under way in an executor is discarded, and another one begins afterwards, except after a
-    rollback.
+    Every method first finishes what is under way: it stores the labels that wait for the store, and
+    reads what peers have stored. So it waits for the store, and raises StoreError if the store does
+    not answer. A training that is under way in an executor is discarded, and another one begins
+    afterwards, except after a rollback.
 
     Parameters
     ----------
@@ -110,21 +110,22 @@ class Corrections:
         ----------
         decision_id : str
         success : bool
-            The right label. If it counts so already, nothing changes.
+            The right label. If this label counts already, nothing changes.
         author : str
             Who says so, for the record.
 
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
         ReportError
-            For an unknown decision, one without a label, and what is no label.
+            For an unknown decision, for a decision without a label, and for a `success` that is no
+            label.
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
+            If the store does not answer, and for an engine that is closed or was opened for
             reading.
         """
         label = as_success(success)
@@ -142,25 +143,26 @@ class Corrections:
         """Leave labels out of all that is learned and counted, from the next decision on.
 
         `correct` brings one back. Traces, and labels as they were reported, stay in the store, and
-        so do the versions that were trained with them. The one that answers goes on until the next
-        retrain, which starts from weights that never saw these labels; if a rollback pinned it, and
-        it saw one of these labels, it is released, so that retrains may replace it. A baseline is
-        retrained before this returns. A training under way in the executor is discarded, and begins
-        again. If a safe mode begins or ends by this, `on_safe_mode` is called. A guarantee assumes
-        that the choice of what is forgotten does not depend on the label. The certificate counts a
-        forgotten outcome of a certain decision as wrong, so that forgetting earns nothing.
+        so do the versions that were trained with them. The version that answers goes on until the
+        next retrain, which starts from weights that never saw these labels. If this version is
+        pinned and saw one of these labels, it is released, so that retrains may replace it. A
+        baseline is retrained before this returns. A training under way in the executor is
+        discarded, and begins again. If a safe mode begins or ends by this, `on_safe_mode` is
+        called. A guarantee assumes that the choice of what is forgotten does not depend on the
+        label. The certificate counts a forgotten outcome of a certain decision as wrong, so that
+        forgetting earns nothing.
 
         Parameters
         ----------
         *decision_ids : str
-            Labels among them that are forgotten already are left as they are.
+            Labels that are forgotten already stay as they are.
         author, reason : str
             For the record.
 
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
@@ -168,7 +170,7 @@ class Corrections:
             For an unknown decision, for one without a label, and for no id at all; then none is
             forgotten.
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
+            If the store does not answer, and for an engine that is closed or was opened for
             reading.
         """
         if not decision_ids:
@@ -193,11 +195,11 @@ class Corrections:
         return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
 
     def release(self, author: str = "") -> Changed:
-        """Let retrains replace a version again that `rollback` pinned.
+        """Let retrains replace again the version that `rollback` pinned.
 
         The same model goes on, stored as a new version. Labels that came meanwhile count for the
-        next retrain. A training under way in the executor is discarded, and begins again, also
-        where no version was pinned.
+        next retrain. A training under way in the executor is discarded, and begins again, even if
+        no version was pinned.
 
         Parameters
         ----------
@@ -207,12 +209,12 @@ class Corrections:
         Returns
         -------
         Changed
-            Its `event` is None where no version was pinned.
+            Its `event` is None if no version was pinned.
 
         Raises
         ------
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
+            If the store does not answer, and for an engine that is closed or was opened for
             reading.
         """
         self._bring_up_to_date()
@@ -227,32 +229,33 @@ class Corrections:
         Labels that came since, up to the training window's size, are among its references,
         corrections count, and the rule in force goes on. No automatic retrain replaces a pinned
         version, until `release`, a retrain that somebody asks for, or `forget` of a label that it
-        was trained with. Labels are stored and counted, and become its references, meanwhile. A
-        retrain after that starts from this version. A training under way in the executor is
-        discarded, and none begins. A reducer that is stored by its traces (umap-learn), and a
-        baseline, are fitted again: the first on the traces that it was fitted on, the second on the
-        same traces with the labels as they count now.
+        was trained with. Labels are stored and counted, and become its references, meanwhile. The
+        first retrain after the release starts from this version. A training under way in the
+        executor is discarded, and none begins. A reducer that is stored by its traces (umap-learn),
+        and a baseline, are fitted again: the first on the traces that it was fitted on, the second
+        on the same traces with the labels as they count now.
 
         Parameters
         ----------
         version : int
-            The one that answers now is stored as a new version, too, and pinned. One that is pinned
-            already changes nothing.
+            If this version answers already, it is stored as a new version, too, and pinned. If it
+            is pinned already, nothing changes.
         author : str
             For the record.
 
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
         SettingError
             For what is no whole number.
         StoreError
-            For a version that is not kept (it names those that are), for damaged traces, where the
-            store does not answer, and for an engine that is closed or was opened for reading.
+            For a version that is not kept (the message names the versions that are), for damaged
+            traces, if the store does not answer, and for an engine that is closed or was opened for
+            reading.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
             raise SettingError(
@@ -279,42 +282,42 @@ class Corrections:
         by. Labels on their way to the store are waited for; a training under way in the executor is
         discarded, and begins again.
 
-        Where alpha, lower_bound, interval, guarantee, stops or prices change, and under "pooled"
-        and "cost" with stops="some" where the audit rate does too, the decision rule (which turns
-        bounds into actions, and may learn from outcomes) starts anew. It is then updated with
-        decisions from now on only: alpha was not spent on a tolerance that was chosen after the
-        data was seen, and the old bounds are of another scale. `certificate` speaks of decisions
-        since any change of the policy; whoever may choose among the certificates of m policies errs
-        with probability up to m alpha.
+        The decision rule, which turns bounds into actions and may learn from outcomes, starts anew
+        if alpha, lower_bound, interval, guarantee, stops or prices change. Under "pooled" and
+        "cost" with stops="some" it also starts anew if the audit rate changes. From then on it is
+        updated only with new decisions, because a tolerance that is chosen after the data was seen
+        needs new evidence, and because the old bounds are of another scale. `certificate` counts
+        the decisions since the last change of the policy; whoever may choose among the certificates
+        of m policies errs with probability up to m alpha.
 
         A safe mode, in which every part is verified after an alarm, goes on until fresh evidence
-        ends it; where the new rule has none, it ends, and `on_safe_mode` is called. A part that was
-        accepted before, and was not reported, stays unreported. In the shadow mode,
+        ends it. If the new rule has no safe mode, it ends, and `on_safe_mode` is called. A part
+        that was accepted before, and was not reported, stays unreported. In the shadow mode,
         `Policy(shadow=True)`, each part that the model is certain of is an audit:
-        `Decision.predicted` says what the model would have done, and all is learned from as always.
-        It lasts over restarts.
+        `Decision.predicted` says what the model would have done, and the engine learns from all
+        labels as always. The shadow mode survives a restart.
 
         Parameters
         ----------
         policy : Policy
-            The whole policy; one equal to that in force changes nothing.
+            The whole policy. If it equals the policy in force, nothing changes.
         author : str
             For the record.
 
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
         SettingError
-            For what is no policy, for force limits that the traces cannot hold, or in seconds at an
-            unknown rate, for a guarantee whose class cannot be imported or made, and, of a model
-            that was handed in, for anything but audit_rate, stops, label_within, force_limits and
-            shadow.
+            If it is no policy; for force limits that the traces cannot hold, or that are in seconds
+            while the rate is unknown; for a guarantee whose class cannot be imported or made; and,
+            if a model was handed in, for a change of anything but audit_rate, stops, label_within,
+            force_limits and shadow.
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
+            If the store does not answer, and for an engine that is closed or was opened for
             reading.
         """
         expect(

@@ -108,7 +108,7 @@ def _close_forgotten(outbox: Outbox) -> None:
 class DataEngine(AbstractContextManager["DataEngine"]):
     """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
 
-    One engine belongs to one thread, which it limits to one torch thread.
+    An engine belongs to one thread, in which it lets torch use only one thread.
 
     Parameters
     ----------
@@ -118,8 +118,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     policy : Policy, optional
         The error level alpha, the lower bound, and what else the user decides.
     trace : TraceSpec, optional
-        The contract of traces; None: the first sound trace sets it, and does not tell rate and
-        unit.
+        The contract of traces. None: the first trace without a fault sets the shape, and rate and
+        unit are unknown.
     radius, folds, retrain_every, budget : optional
         As in `Recipe`; None: the recipe decides, or the reducer.
     store : str, path or SqlStore, optional
@@ -128,8 +128,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     seed : int
         The seed of the reducer and of the coin that draws audits.
     recipe : Recipe, str or path, optional
-        A recipe, its name or a TOML file, for all settings that are not given as arguments. It
-        names its own reducer.
+        A recipe, its name or a TOML file, for all settings that are not given as arguments. The
+        reducer is part of the recipe: another `reducer` beside it is refused.
     model : Model, optional
         A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
         force_limits and shadow count then.
@@ -324,18 +324,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         url : str, path or SqlStore
         reducer, model : object, optional
-            The same object again, if the engine had one of yours that the store cannot name.
+            If the engine had an object of yours that the store cannot name: the same object again.
         trace : TraceSpec, optional
-            The stored contract of traces, to state its rate, units or columns if they are
-            unknown.
+            The contract of traces as the store has it, together with a rate, units or columns that
+            were unknown so far.
         wait : float, optional
             Seconds that a call waits for the database, as `SqlStore` takes it.
         allow_import : bool or collection of str
             Whether a `module:Class` that the store names is imported, or which of these classes
             are. A class that `reducer` names is allowed.
         reading : bool
-            Neither decide nor learn, for example to export: such calls raise StoreError. Another
-            engine may own the cell.
+            Open the store only for reading, for example to export: calls that decide or learn raise
+            StoreError. Another engine may own the cell.
         **options
             executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With an
             executor the ids of all decisions are read before this returns (a second for a million),
@@ -350,8 +350,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             If the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            If an object is missing or differs from the one before, if a `model` is given to an
-            engine that has its own, or if `trace` contradicts the stored contract.
+            If an object of yours is missing or is another one than the engine had, if a `model` is
+            given to an engine that has its own, or if `trace` contradicts the stored contract.
         ImportRefusedError
             A SettingError, if a class would have to be imported that is not allowed.
         """
@@ -452,9 +452,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
         Labels of parts that the next decision confirmed, which wait in memory, are recorded first,
-        so that they are among the traces of the next training. A rule that a wrong confirmation
-        updated is put right, too, if the store has answered. Raises NotTakenError after `wait`
-        seconds; None: the store's own limit.
+        so that they are among the traces of the next training. If a wrong confirmation has updated
+        the rule, the rule is put right, too, if the store has answered. Raises NotTakenError after
+        `wait` seconds; None: the store's own limit.
         """
         self._feedback.store_confirmations()
         self._outbox.flush(wait)
@@ -499,7 +499,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         trace : array or DataFrame, shape (samples,) or (channels, samples)
             The rows of a DataFrame are samples.
         part : str or int, optional
-            The part's number. A part that comes again has one vote, and none on itself.
+            The part's number. The labels of a part that comes again count less than those of
+            different parts, and not at all for this part itself.
         decision_id : str, optional
             An id that the caller chooses. The same id and trace always have the same decision, and
             an ACCEPT or REJECT is on disk when this returns.
@@ -509,15 +510,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             fault, this fault is the reason instead.
         wait : bool, default True
             False is for a server that answers by a deadline: the call waits neither for another
-            call of the engine nor for the disk. Any thread may make it while no other thread uses
-            the engine; it has one torch thread from then on. The call returns None, and changes
-            nothing, if it cannot decide at once. That is so with an id, before the first trace,
-            while something must be stored or rebuilt first, and if the model is a baseline (handed
-            in as `model`), uses classes of the user's or is not compiled. Only a later `poll` lets
-            a trained version answer, and calls `on_safe_mode`. With `timed_out` another thread may
-            use the engine meanwhile. The VERIFY is recorded beside that thread's call, and this
-            call waits for the disk. With a store in memory, and before the first trace, it is not
-            recorded: call again with `wait`, in the engine's thread.
+            call of the engine nor for the disk. Any thread may make this call while no other thread
+            uses the engine; torch then uses one thread in it from then on. The call returns None,
+            and changes nothing, if it cannot decide at once. It cannot with an id, before the first
+            trace, and while something must be stored or rebuilt first. Nor can it if the model is a
+            baseline (handed in as `model`), uses classes of the user's or is not compiled. Only a
+            later `poll` lets a trained version answer, and calls `on_safe_mode`. With `timed_out`
+            another thread may use the engine meanwhile. The VERIFY is recorded beside that thread's
+            call, and this call waits for the disk. With a store in memory, and before the first
+            trace, it is not recorded: call again with `wait`, in the engine's thread.
 
         Returns
         -------
@@ -686,9 +687,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         In each cycle the cell inserts a part, the engine decides, and the cell verifies it, lets it
         go on or rejects it. A known outcome is reported, and retrains happen between cycles. When
         the iteration ends, also by an error of the cell, everything known is written. If the cell
-        has a `TraceSpec` as its attribute `spec`, the engine takes from it what it does not know of
-        its traces. Python's garbage collector works between decisions, and only on objects that are
-        newer than the first cycle (`gc.freeze`).
+        has a `TraceSpec` as its attribute `spec`, the engine takes from this spec what it does not
+        know about the traces yet. Python's garbage collector works between decisions, and only on
+        objects that are newer than the first cycle (`gc.freeze`).
 
         Parameters
         ----------
@@ -699,8 +700,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         iterator of Cycle
-            The first part is inserted with its first `next`, after a wait until a retrain could
-            begin at once.
+            The first `next` waits until a retrain could begin without delay, and then inserts the
+            first part.
 
         Raises
         ------
@@ -708,9 +709,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             Before the first part, for a cell that lacks one of its four methods, or whose `spec`
             cannot hold the force limits.
         ReportError
-            Where `verify` returns no label, or `proceed` no `Outcome`.
+            If `verify` returns no label, or `proceed` returns no `Outcome`.
         NotTakenError
-            At the end, where the disk does not take everything within 10 seconds.
+            At the end, if the disk does not take everything within 10 seconds.
         """
         check_cell(cell)
         return self._run(cell, cycles)
@@ -790,9 +791,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         wait : bool, default True
             False: begin to retrain in the executor, and return None, also if a retrain is under
-            way; `poll` brings it to its end. Without an executor it retrains in this thread.
-            True: a version that is trained is first brought to its end, and a training that is not
-            done is discarded. In the first two seconds of an engine the call also waits for the
+            way; `poll` brings it to its end. Without an executor it retrains in this thread. True:
+            a version that is already trained first answers or is dropped, and a training that is
+            not done is discarded. In the first two seconds of an engine the call also waits for the
             modules that a retrain imports.
 
         Returns
@@ -814,16 +815,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
 
         `run` does so after each part. In a loop of your own, `decide` and `report` do the same. But
-        each of their calls takes a version that the executor has trained only one step further.
+        if the executor has trained a version, each of their calls takes it only one step further.
         Without an executor a retrain that is due runs here, also with `brief`.
 
         Parameters
         ----------
         brief : bool, default False
-            True: bring a version that the executor has trained only one step further, which takes a
-            few milliseconds. False: bring it to its end, so that it answers or is dropped. In a
-            cell of a product, whose cells share labels and versions, it is always brought to its
-            end.
+            True: if the executor has trained a version, take it only one step further, in a few
+            milliseconds. False: take it through all steps, until it answers or is dropped. In a
+            cell of a product, whose cells share labels and versions, it is always taken through all
+            steps.
 
         Returns
         -------

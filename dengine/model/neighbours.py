@@ -370,7 +370,7 @@ class ModelPrediction(EngineModel):
         return f"{reducer} under {classifier}, {self.folds} folds, {type(self.rule).__name__}"
 
     def effective_recipe(self, recipe: Recipe) -> Recipe:
-        """Return the recipe with this model's own settings in place of its.
+        """Return the recipe, in which this model's own settings replace those of the recipe.
 
         These are radius, alpha, lower bound and interval of the classifier, folds (2 at least) and
         novelty. All else, such as the reducer and the window, stays as the recipe has it.
@@ -407,9 +407,9 @@ class ModelPrediction(EngineModel):
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
         """Train the reducer from scratch, and make the traces the references.
 
-        Of more traces than the classifier's capacity the last become references. Scales and novelty
-        gate are computed anew as well. The rule stays as it is. If the training raises, the reducer
-        is left untrained: fit again.
+        If there are more traces than the classifier's capacity, the last ones become references.
+        Scales and novelty gate are computed anew as well. The rule stays as it is. If the training
+        raises, the reducer is left untrained: fit again.
 
         Parameters
         ----------
@@ -417,7 +417,7 @@ class ModelPrediction(EngineModel):
         y : array of int, shape (n,)
             1 is success, 0 is failure.
         hashes : array of int64, shape (n,), optional
-            `folds.trace_hash` of each trace, which gives its fold; None: of its content.
+            `folds.trace_hash` of each trace, which gives its fold. None: the hash of its content.
 
         Returns
         -------
@@ -426,8 +426,8 @@ class ModelPrediction(EngineModel):
         Raises
         ------
         SettingError
-            Where the reducer cannot be trained, as by too few traces, or some reducers by one
-            class.
+            If the reducer cannot be trained, for example because there are too few traces or, for
+            some reducers, labels of one class only.
         TraceError, DataError
             For an array of another shape, and for labels other than 1 and 0.
         ValueError
@@ -527,9 +527,9 @@ class ModelPrediction(EngineModel):
 
         If either model is stale, because an update of its rule failed, this one is stale then. The
         decider is built for the conditions (force limits, sensor limit, audits) under which the
-        previous model decided, or if it never did, for this one's. If this model has a decider with
-        that rule for those conditions, it is kept. Nothing happens if the previous model is no
-        `ModelPrediction`. Raises ValueError if nothing was fitted.
+        previous model decided. If that model never decided, they are the conditions of this model.
+        If this model has a decider with that rule for those conditions, it is kept. Nothing happens
+        if the previous model is no `ModelPrediction`. Raises ValueError if nothing was fitted.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -555,8 +555,8 @@ class ModelPrediction(EngineModel):
         Returns
         -------
         Decider
-            Compiled if encoder and rule can be compiled. Otherwise it runs in Python, and those of
-            its parts that can be compiled are. A warning is logged if the code of a part was
+            Compiled if encoder and rule can be compiled. Otherwise it runs in Python, and each of
+            its parts is compiled if that is possible. A warning is logged if the code of a part was
             changed after it was compiled.
 
         Raises
@@ -627,9 +627,10 @@ class ModelPrediction(EngineModel):
     ) -> Floats:
         """Add one labelled trace (channels, samples) to the index, in the space of its fold.
 
-        The hash of its part, `hash_`, gives the fold. The reference is `point` as it is, else the
-        row of `embedding` for that space, else computed. A full index drops its oldest reference.
-        `number` is the label's sequence number. Returns the point, float32 (d,), scaled.
+        The hash of its part, `hash_`, gives the fold. If `point` is given, it is the reference.
+        Otherwise the reference is the row of `embedding` for that space or, without `embedding`, it
+        is computed. A full index drops its oldest reference. `number` is the label's sequence
+        number. Returns the point, float32 (d,), scaled.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
@@ -729,11 +730,11 @@ class ModelPrediction(EngineModel):
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
         """Decide on one raw trace x (C, T) by `decider(conditions)`, which may have to be built.
 
-        References of the part with this hash are not counted; for an unknown part, 0, the content
-        hash stands. Returns a `Verdict`, the tuple that `Decider.forward` returns, with the scaled
-        embedding (K, d), a point in each of the K spaces. Raises ValueError if nothing was fitted,
-        and RuntimeError if the rule is stale, because an update of it failed; but a trace with a
-        fault is verified all the same.
+        References of the part with this hash are not counted; if the part is unknown (0), the hash
+        of the content takes its place. Returns a `Verdict`, the tuple that `Decider.forward`
+        returns, with the scaled embedding (K, d), a point in each of the K spaces. Raises
+        ValueError if nothing was fitted, and RuntimeError if the rule is stale, because an update
+        of it failed; but a trace with a fault is verified all the same.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -780,7 +781,7 @@ class ModelPrediction(EngineModel):
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """Return an array of `Action`, shape (n,): what the model would do with each trace.
 
-        Force limits, fault checks and audits have no part in it. Raises as `count`.
+        Force limits, fault checks and audits have no part in it. Raises what `count` raises.
         """
         return np.array([prediction.action for prediction in self.predict_many(X)], dtype=object)
 
@@ -801,8 +802,8 @@ class ModelPrediction(EngineModel):
         """Return why an engine could not open a store with this version; "" if it could.
 
         The references, and the points of some training traces, must be finite, and a reducer that
-        is restored from this one's state must give these points, twice. A reducer without a state
-        must give them again itself. The points are kept for `check_answers`.
+        is restored from the state of this one must give the same points in two calls. A reducer
+        without a state must give them again itself. The points are kept for `check_answers`.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -823,17 +824,17 @@ class ModelPrediction(EngineModel):
         return self.spaces.embed(X) / self.scale[:, None]
 
     def check_answers(self) -> Iterator[str]:
-        """As `EngineModel.check_answers`, on the examples whose points `defect` has kept."""
+        """Check like `EngineModel.check_answers`, on the examples whose points `defect()` kept."""
         decider = self.decider(self._conditions)
         return compare_points(decider, self.examples, self._example_points)
 
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
 
-        Trace shape, references and scale are always there; "reducer.", "rule." and "novelty." begin
-        the names of what these parts have. An enabled novelty gate is there, a disabled one not. A
-        stale rule is not there, but "rule_is_stale" is. Scale and reducer may be views. Raises
-        AttributeError before the first training.
+        Trace shape, references and scale are always there. The names of the arrays of reducer, rule
+        and novelty gate begin with "reducer.", "rule." and "novelty.". A disabled novelty gate has
+        no arrays. A stale rule has none either, but then there is "rule_is_stale". Scale and
+        reducer may be views. Raises AttributeError before the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -849,11 +850,12 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale, rule and gate are restored, and the reducer if its state is there; else
-        (`needs_refit`) train this model on the same traces before the call. The decider is dropped.
-        A state of a stale rule leaves the rule as it is; `rule_is_stale` always stays as it is.
-        Raises StoreError if the fitted reducer keeps a state but this one lacks it, and for a rule
-        or gate of other sizes; KeyError or ValueError for the state of another reducer.
+        References, scale, rule and gate are restored. The reducer is restored if its state is
+        there. If it is not (see `needs_refit`), train this model on the same traces before the
+        call. The decider is dropped. A state of a stale rule leaves the rule as it is;
+        `rule_is_stale` always stays as it is. Raises StoreError if the fitted reducer keeps a state
+        but this one lacks it, and for a rule or gate of other sizes; KeyError or ValueError for the
+        state of another reducer.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
@@ -878,8 +880,8 @@ class ModelPrediction(EngineModel):
     def exported(self, trace: TraceSpec | None) -> Exportable:
         """Return what an exporter starts from: this model and a trace contract.
 
-        That is `trace`, or where it is None the shape of the traces it was trained on. Raises
-        ExportError before the first training.
+        The contract is `trace`. If that is None, it has the shape of the traces that the model was
+        trained on. Raises ExportError before the first training.
         """
         if "trace_shape" not in vars(self):
             raise ExportError(NOT_TRAINED)

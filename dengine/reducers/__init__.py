@@ -84,8 +84,8 @@ def make_reducer(name: str, **params: Any) -> Any:
     name : str
         A name in `REDUCERS`, or `module:Class`.
     **params
-        Parameters of its class. Only for names in `REDUCERS` are types checked here, and that
-        integers have at most 32 bits; narrower ranges are checked when it is fitted.
+        Parameters of its class. For a name in `REDUCERS` this checks types, and whether integers
+        have at most 32 bits. Narrower ranges are checked when the reducer is fitted.
 
     Returns
     -------

@@ -128,10 +128,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     min_traces : int
         Number of labelled traces that an engine collects before the first training.
     default_radius : float
-        Radius of the neighbourhood whose labels count, where a recipe names none. Unless
-        `own_unit`, the embedding is first scaled to a root mean square radius of 1.
+        Radius of the neighbourhood whose labels count, if a recipe names none. Unless `own_unit`,
+        the embedding is first scaled to a root mean square radius of 1.
     default_retrain_every : int
-        New labels between two retrains, where a recipe names none.
+        New labels between two retrains, if a recipe names none.
     """
 
     uses_labels = False
@@ -143,7 +143,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit anew and forget earlier fits. Engines call `train`, which may go on from the last.
+        """Fit anew and forget earlier fits. Engines call `train`, which may continue the last fit.
 
         Parameters
         ----------
@@ -154,7 +154,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
 
     def transform(self, X: ArrayLike) -> Floats:
-        """Embed traces for pictures: the mean of all spaces. Decide by `embed` instead.
+        """Embed traces by the mean of all spaces, for pictures. For decisions use `embed`.
 
         A subclass defines this method or `embed`. Traces are embedded one by one, as a cell does,
         since in a batch the last bits of a result depend on the other traces.
@@ -194,8 +194,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     ) -> Floats:
         """Train for an engine, and return the embedding of the traces as references.
 
-        The default fits anew, and neither `stop` nor `numbers` has an effect. A reducer that can
-        goes on from the last training.
+        By default it fits anew, and neither `stop` nor `numbers` has an effect. A reducer may also
+        continue its last training.
 
         Parameters
         ----------
@@ -222,9 +222,9 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def untrained_module(self, X: Floats) -> Any:
         """Return a module like the one that `module` returns after training on X (n, C, T).
 
-        Its attribute `dim` is the number of coordinates. None, as by default: it is not known
-        before training. The engine compiles this module ahead of the first training, which then has
-        less to do. Kernels or weights may be drawn here.
+        Its attribute `dim` is the number of coordinates. By default it returns None: the module is
+        not known before training. The engine compiles this module ahead of the first training,
+        which then has less to do. Kernels or weights may be drawn here.
         """
 
     def warm_up(self) -> None:  # a default: nothing to load
@@ -234,10 +234,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
 
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
-        """Compute now, and keep, what the next `train` needs from traces X (n, C, T), labels aside.
+        """Compute and keep what the next `train` needs from traces X (n, C, T), without labels.
 
-        `numbers` are those of the labels, as in `train`, by which `train` finds the results again.
-        The default does nothing.
+        `numbers` are the numbers of the labels. By them `train` finds the results again. The
+        default does nothing.
         """
 
     def embed(self, X: Floats) -> Floats:
@@ -258,7 +258,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def module(self) -> "nn.Module | None":
         """Return the embedding as a module that TorchScript can compile, (B, C, T) -> (B, K, d).
 
-        None, as by default: the reducer has no module, so it embeds in Python and cannot be
+        By default it returns None: the reducer has no module, so it embeds in Python and cannot be
         exported.
         """
         return None
@@ -266,7 +266,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def get_state(self) -> State | None:
         """Return arrays from which `set_state` restores the reducer bit for bit.
 
-        None, as by default: it can only be restored by fitting it again.
+        By default it returns None: the reducer can only be restored by fitting it again.
         """
         return None
 
@@ -307,7 +307,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         array of float32, shape (n, C, T)
-            Writeable, and the caller's own memory where X already has that form.
+            Writeable. If X already has this form, the result shares the memory of X.
 
         Raises
         ------
@@ -317,9 +317,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             If a value is not finite or not a number, if a table has other columns than in `fit`,
             and with `reset` if there is no trace.
         TraceError
-            If the shape is none of traces, or another than in `fit`, and with `reset` if no sample
-            reaches 1e-12, whose square float32 hardly holds; a plain ValueError for a
-            single trace (T,) and for another number of columns of X (n, T).
+            If X does not have a shape of traces, or has another shape than in `fit`; and with
+            `reset` if the largest sample is below 1e-12 but not 0, since float32 hardly holds its
+            square. For a single trace (T,), and for another number of columns of X (n, T), it is a
+            plain ValueError.
         """
         if not reset:
             check_is_fitted(self)

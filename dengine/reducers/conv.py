@@ -177,7 +177,7 @@ class ConvReducer(TorchReducer):
 
     It is `TorchReducer` with `ConvNetwork`; the parameters are those of `TorchReducer`. The logit
     of success is the mean of two: that of the network, and that of a `RocketReducer`, which is
-    better with few labels. Nothing is fitted to mix them.
+    better with few labels. Both have the weight 1/2, which is not fitted.
 
     Attributes
     ----------
@@ -197,9 +197,9 @@ class ConvReducer(TorchReducer):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces (n, C, T) for `rocket_`, and cache them for `train`.
 
-        They are found again by `numbers`; without these they are not kept. The first call with
-        `min_traces` traces also builds the network and draws the kernels; with fewer nothing is
-        done. No label is read.
+        The cache finds them again by `numbers`, and keeps nothing without `numbers`. The first call
+        with at least `min_traces` traces also builds the network and draws the kernels. With fewer
+        traces it does nothing. No label is read.
         """
         if len(X) >= self.min_traces:
             traces = self._check_and_start(X)
@@ -240,7 +240,7 @@ class ConvReducer(TorchReducer):
         return average_logits(torch.from_numpy(points), torch.from_numpy(probabilities)).numpy()
 
     def embed(self, X: Floats) -> Floats:
-        """As `Reducer.embed`; the first coordinate has the mean of both logits."""
+        """Embed traces; the first coordinate is the sigmoid of the mean of both logits."""
         traces = self.check_traces(X)
         points = torch.from_numpy(super().embed(traces))
         return average_logits(points, torch.from_numpy(self.rocket_.embed(traces))).numpy()
@@ -254,9 +254,9 @@ class ConvReducer(TorchReducer):
         return super().get_state() | rocket
 
     def set_state(self, state: Arrays) -> Self:
-        """As `TorchReducer.set_state`, also for the inner reducer `rocket_`.
+        """Restore the state like `TorchReducer.set_state`, and also the inner reducer `rocket_`.
 
-        Raises StoreError for a state without one, as an older conv stored it.
+        Raises StoreError for a state without `rocket_`, like the states that an older conv stored.
         """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone

@@ -247,25 +247,27 @@ def weigh_towers(
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class RocketReducer(Reducer):
-    """Embed traces by drawn kernels and cross-fitted logistic heads.
+    """Embed traces by random kernels and cross-fitted logistic regressions, the heads.
 
-    The first axis of the embedding is the predicted probability of success. The second is there
-    for pictures.
+    The first axis of the embedding is the predicted probability of success. The second spreads the
+    points in pictures; it is small against the radius.
 
     Parameters
     ----------
     n_components : {1, 2}, default 2
         1 leaves the second axis out.
     folds : int, default 5
-        K, heads and spaces.
+        K, the number of folds, of heads and of spaces.
     kernels, dilations, regions : int, default 28, 5, 3
-        Sizes of the first tower, F, D and R.
+        Of the first tower (group of features): F kernels at each of D dilations, averaged over R
+        regions.
     groups : int, default 2
-        G, groups of competing kernels of the second tower; 0 leaves it out.
+        G, the number of groups of kernels in the second tower: it counts which kernel of a group
+        answers most. 0 leaves this tower out.
     width : int, default 128
         Principal components of each tower.
     l2 : float, default 0.5
-        Ridge of the heads, in units of one label each.
+        Ridge penalty of each weight of the heads; the loss of each label counts 1.
     max_iter : int, default 20
         Largest number of Newton steps of the heads in one fit.
     random_state : int, RandomState or None, default 0
@@ -352,11 +354,11 @@ class RocketReducer(Reducer):
 
         X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,)
         identify the traces from call to call, so that the features of traces in the last call come
-        from a cache. `stop` may end the Newton steps. Of more than 4000 traces the heads read 4000,
-        which a hash of the numbers draws. The module `net_`, and so what `module` returned before,
-        is changed in place. Returns the points of all traces, float32 (n, d), row i in space
-        ``folds[i]``. Raises SettingError for fewer than 20 traces, and if the traces outside a fold
-        have a single class.
+        from a cache. `stop` may end the Newton steps. If there are more than 4000 traces, the heads
+        read 4000 of them, chosen by a hash of the numbers. The module `net_` is changed in place,
+        and with it the module that `module()` returned before. Returns the points of all traces,
+        float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than 20 traces,
+        and if the traces outside a fold have a single class.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -403,9 +405,9 @@ class RocketReducer(Reducer):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Compute the features of traces (n, C, T), and cache them for the next `train`.
 
-        They are found again by `numbers`, those of the labels; without these nothing is cached. The
-        first call with enough traces draws the kernels. It does nothing with fewer than
-        `MIN_TRACES` traces.
+        The cache finds them again by `numbers`, the numbers of the labels. Without `numbers` it
+        keeps nothing. The first call with enough traces draws the kernels. It does nothing with
+        fewer than `MIN_TRACES` traces.
         """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_start(X), numbers)
@@ -538,7 +540,7 @@ class RocketReducer(Reducer):
         return [*features, pairwise_products(leading)]
 
     def training_masks(self, folds: Ints) -> NDArray[np.bool_]:
-        """Return which rows (n,) train head k, those outside fold k: (K, n)."""
+        """Return a mask (K, n): head k learns from the rows outside fold k."""
         return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compute_components(self, raw: Tensor) -> None:

@@ -133,14 +133,15 @@ class TorchReducer(Reducer):
     Parameters
     ----------
     network : callable
-        ``network(channels, samples)`` returns an `nn.Module` from preprocessed traces
-        (B, channels, samples) to features (B, features). Of each channel of a trace it sees two:
-        the averaged, standardised trace and its differences. A factory that also takes `members`
-        returns all members in one module, see `dengine.reducers.encoder.Members`.
+        ``network(channels, samples)`` returns an `nn.Module` from preprocessed traces (B, channels,
+        samples) to features (B, features). Each channel of a trace becomes two channels of its
+        input: the averaged, standardised trace and its differences. A factory that also takes
+        `members` returns all members in one module, see `dengine.reducers.encoder.Members`.
     n_components : {1, 2}, default 2
         1 leaves the second axis out.
     folds : int, default 5
-        K, members and spaces. Member k is trained without the labels of fold k.
+        K, the number of folds, of members (copies of the network) and of spaces. Member k is
+        trained without the labels of fold k.
     steps : int, default 12
         AdamW steps of a retrain; twice as many while training is behind (see `n_steps_left_`).
     fit_steps : int, default 400
@@ -166,11 +167,11 @@ class TorchReducer(Reducer):
     n_steps_ : int
         Steps of all trainings so far.
     n_steps_left_ : int
-        Steps that are missing to complete training: many after many labels came at once, some after
-        the first retrains and where `steps` are few for the labels between two retrains. While
-        there are any, an engine retrains after every part.
+        Steps that are missing to complete training. Many are missing after many labels came at
+        once. Some are missing after the first retrains, or if `steps` is small for the number of
+        labels between two retrains. While steps are missing, an engine retrains after every part.
     loss_ : float
-        Mean training loss of the last retrain, in nats; NaN where it took no step.
+        Mean training loss of the last retrain, in nats; NaN if it took no step.
     """
 
     uses_labels = True
@@ -429,8 +430,8 @@ class TorchReducer(Reducer):
     def average_weights(self) -> None:
         """Move the averaged members' parameters, in place, towards the trained ones.
 
-        They keep the share `weight_averaging`, in the first steps a smaller one. Statistics of
-        batch normalisation are not averaged.
+        Of their old values they keep the share `weight_averaging`; in the first steps this share is
+        smaller. Statistics of batch normalisation are not averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
         averages = self.averaged_members_.parameters()
@@ -441,10 +442,10 @@ class TorchReducer(Reducer):
     def estimate_statistics(self, x: Tensor) -> None:
         """Estimate the running statistics of batch normalisation anew, for the averaged weights.
 
-        As `torch.optim.swa_utils.update_bn`, from preprocessed traces x (n, C', L): at most 256 of
-        them, drawn at random but the same for the same n. No label is read, so each member may see
-        all folds. Other buffers are copied from the trained members. The averaged members are in
-        evaluation mode afterwards.
+        It works like `torch.optim.swa_utils.update_bn`, on at most 256 of the preprocessed traces x
+        (n, C', L). They are drawn at random, but the same n gives the same traces. No label is
+        read, so each member may see all folds. Other buffers are copied from the trained members.
+        The averaged members are in evaluation mode afterwards.
         """
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
@@ -508,9 +509,10 @@ class TorchReducer(Reducer):
     def untrained_module(self, X: Floats) -> nn.Module | None:
         """Return a module like the one that training on X (n, C, T) leads to, to compile ahead.
 
-        If there is an `encoder_`, as after a training, it is the present `module()`; else that of a
-        clone with initial weights. None, with a warning in the log, if TorchScript cannot compile
-        the network. Raises SettingError for a parameter or a network that cannot be used.
+        If there is an `encoder_`, for example after a training, it is the present `module()`.
+        Otherwise it is the module of a clone with initial weights. None, with a warning in the log,
+        if TorchScript cannot compile the network. Raises SettingError for a parameter or a network
+        that cannot be used.
         """
         if "encoder_" in vars(self):
             return self.module()

@@ -204,8 +204,8 @@ class UmapReducer(Reducer):
     n_epochs_ : int
         Epochs since the spectral start.
     n_steps_left_ : int
-        Epochs that are missing to the 200 that a layout needs from a spectral start. While some
-        are, an engine trains after every cycle.
+        Epochs that a layout still needs: from a spectral start it needs 200. While epochs are
+        missing, an engine trains after every cycle.
 
     References
     ----------
@@ -281,9 +281,9 @@ class UmapReducer(Reducer):
     def n_epochs_due(self, n_traces: int) -> int:
         """Return the number of epochs that the next training takes on `n_traces` traces.
 
-        That is `n_epochs` if it was given. Otherwise it is those that are missing to the first 200,
-        or, if none are, 240,000 / n_traces but at least 60; in both cases at most 200 and at most
-        400,000 / n_traces, but at least 1.
+        That is `n_epochs` if it was given. Otherwise it is the number that is missing to the first
+        200 or, if none is missing, 240,000 / n_traces but at least 60. In both cases it is at most
+        200 and at most 400,000 / n_traces, but at least 1.
         """
         if self.n_epochs is not None:
             return self.n_epochs
@@ -459,9 +459,9 @@ class UmapReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape, counters, and of the last training numbers, frames, neighbours, distances
-        and points, not all of them copies. Neighbours that `precompute` found are not among them.
-        Raises NotFittedError before a fit.
+        They are the shape, the counters and, from the last training, the numbers, frames,
+        neighbours, distances and points. Not all of them are copies. Neighbours that `precompute`
+        found are not among them. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]

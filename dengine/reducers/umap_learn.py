@@ -25,8 +25,9 @@ class UmapLearnReducer(Reducer):
     store, so an engine that is opened fits again. With a `random_state` the library uses one
     thread, and a run repeats exactly.
 
-    `transform` places the traces of a batch together: with those beside it, a trace moves by up to
-    a tenth of the embedding's radius. `embed` places each trace alone, as a cell decides.
+    `transform` places the traces of a batch together: the other traces of the batch move a trace by
+    up to a tenth of the embedding's radius. `embed` places each trace alone, because a cell decides
+    on one trace at a time.
 
     Parameters
     ----------

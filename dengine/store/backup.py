@@ -71,7 +71,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     ------
     StoreError
         If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), if a journal cannot
-        be read, and if one holds records while the cell's ledger has another key than the
+        be read, and if a journal holds records while the cell's ledger has another key than the
         environment names.
     OutputError
         If `out` exists, or cannot be written.
@@ -112,7 +112,8 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     """Copy a backup to the place of a store, on this or another machine, with a journal per cell.
 
     The journal names the newest ledger entry, so that the first engine knows that nothing is
-    missing. A journal that is there stays: that engine takes from it what the copy lacks.
+    missing. A journal that exists already stays: the first engine takes from it what the copy
+    lacks.
 
     Parameters
     ----------

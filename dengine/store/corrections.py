@@ -154,9 +154,9 @@ class CorrectionTable(CellTable):
     def stored_labels(self, connection: sa.Connection, ids: Sequence[str]) -> dict[str, Any]:
         """Return, by id, a row for each of the given decisions that the cell has stored.
 
-        A row has content_hash, quarantined and time of the decision, and of its label success,
-        source, seq and `corrected`: the label after corrections, 0, 1 or FORGOTTEN. These four are
-        None without a label. Ids that are not stored are left out.
+        Of the decision, a row has content_hash, quarantined and time. Of its label, it has success,
+        source, seq and `corrected`, which is the label after corrections: 0, 1 or FORGOTTEN. These
+        four are None without a label. Ids that are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
         return self._database.rows_by_id(

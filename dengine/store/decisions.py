@@ -191,16 +191,16 @@ class DecisionTable(CellTable):
         """Return the number of the newest decision that is old enough for its check to be overdue.
 
         A decision with this or a lower number that asked for a check and has no label is overdue.
-        The number is that of the newest decision minus `within`, or the one that a label recorded,
-        if that is larger; 0 if nothing can be overdue yet.
+        It is the number of the newest decision minus `within`. If a label recorded a larger such
+        number, it is the recorded one. It is 0 if nothing can be overdue yet.
 
         Parameters
         ----------
         within : int
             Number of later decisions after which a check is overdue.
         since_version : int, default 0
-            The first version since `within` is in force; if the newest decision is by an earlier
-            one, only what the labels recorded counts.
+            The first version after `within` came into force. If the newest decision is by an
+            earlier version, only the numbers that labels recorded count.
 
         Returns
         -------
@@ -278,9 +278,9 @@ class DecisionTable(CellTable):
         n : int
             Without effect on stretches of time and on batches.
         **by
-            For periods of time `seconds`, their length, and `start`, when one begins; for batches
-            `batch`, the length or the separators of a batch's name in the parts' numbers. As in
-            `stretches_query`.
+            For periods of time: `seconds`, the length of a period, and `start`, a time at which one
+            begins. For batches: `batch`, which says by its length or by separators where the name
+            of a batch ends in the parts' numbers. See `stretches_query`.
 
         Returns
         -------

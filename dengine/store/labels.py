@@ -126,9 +126,10 @@ class LabelTable(CellTable):
     def news_since(self, seq: int, limit: int) -> ProductNews:
         """Return what the cells of the product, this one included, stored after label number `seq`.
 
-        Only labels that train are returned, none that was forgotten or of a quarantined trace, with
-        the numbers of the newest version and correction. A trace that is not as it was stored is
-        left out, and an event is written to the store.
+        It returns labels that are used in training, so no forgotten label and no label of a
+        quarantined trace. It also returns the numbers of the newest version and of the newest
+        correction. A trace that is not as it was stored is left out, and an event is written to the
+        store.
 
         Parameters
         ----------
@@ -240,10 +241,10 @@ class LabelTable(CellTable):
     ) -> list[OutcomeRecord]:
         """Return the outcomes with which a rule is updated, as corrected, in the labels' order.
 
-        Left out are labels of rejected parts, since which of them come back is somebody's choice
-        (`Source.INSPECTION`), forgotten labels, and those of quarantined traces. Only this cell's
-        labels count, since those of other cells are no evidence for this one, and a detector of
-        drift that counts them would notice too late that this cell has changed.
+        Labels of rejected parts (`Source.INSPECTION`) are left out, because a person chooses which
+        rejected parts to inspect. Forgotten labels and labels of quarantined traces are left out,
+        too. Only this cell's labels count, since those of other cells are no evidence for this one,
+        and a detector of drift that counts them would notice too late that this cell has changed.
 
         Parameters
         ----------
@@ -252,10 +253,11 @@ class LabelTable(CellTable):
         since_version : int, default 0
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
-            Up to this decision number a check without a label is overdue, which counts as an error
-            until its label comes; 0: none is. An overdue check adds none, one or two outcomes
-            (`overdue_outcomes`), whatever `seq` is. They are inserted where the running engine
-            updated the rule with them; every later label stores that position.
+            Number of the newest decision whose check is overdue if it has no label; 0: no check is
+            overdue. An overdue check counts as an error until its label comes. It adds up to two
+            outcomes (`overdue_outcomes`), whatever `seq` is. They are inserted at the place at
+            which the running engine updated the rule with them; every later label stores this
+            place.
 
         Returns
         -------
@@ -310,8 +312,8 @@ class LabelTable(CellTable):
         Returns
         -------
         int
-            The sum of `silent`, the number of such parts that each of the cell's labels keeps since
-            the label before it; labels of quarantined traces are left out.
+            Each of the cell's labels keeps, as `silent`, the number of such parts since the label
+            before it. This is the sum of these numbers, without labels of quarantined traces.
         """
         return int(
             self._read(

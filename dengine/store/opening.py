@@ -46,7 +46,7 @@ def open_store(
         effect on None and on an open store.
     wait : float or None
         Seconds that an engine on this store waits for the disk or database at most, as `SqlStore`
-        takes it; pass `LONG_WAIT` where no cell waits for it. Not used for a store in memory or an
+        takes it; pass `LONG_WAIT` if no cell waits for it. Not used for a store in memory or an
         open one.
 
     Returns

@@ -69,8 +69,8 @@ class VersionTable(CellTable):
         Returns
         -------
         int
-            The version's number. It is the report's, unless this one is accepted and another cell
-            of the product stored a version meanwhile: then the next.
+            The version's number. It is the number in the report. But if the version is accepted and
+            another cell of the product stored a version meanwhile, it is the next number.
 
         Raises
         ------
@@ -133,13 +133,14 @@ class VersionTable(CellTable):
     def newest(self) -> ModelVersion | None:
         """Return the newest accepted version of the cell or its product, with its arrays.
 
-        For a damaged one an event is written to the store, and the one before it is returned.
+        If the newest version is damaged, an event is written to the store, and the version before
+        it is returned.
 
         Returns
         -------
         ModelVersion or None
-            None before the first, and if all that are kept are damaged. The version of another cell
-            is returned without the state of its rule.
+            None before the first version, and if all kept versions are damaged. The version of
+            another cell is returned without the state of its rule.
         """
         for i, row in enumerate(self._read(self._accepted_query())):
             if not row.kept and i > 0:
