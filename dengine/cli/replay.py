@@ -286,9 +286,9 @@ def compare(
     """Replay the same streams through several methods.
 
     Methods are reducers and baselines, under one policy or a grid of policies: a setting is given
-    as one value, such as --alpha, or as a list to try, such as --alphas, not both. Each is shown as
-    by `dengine replay`. umap-learn takes much longer than the others. Ctrl-C, or an error in a
-    replay, ends it and shows the replays that were finished.
+    as one value, such as --alpha, or as a list to try, such as --alphas, not both. For each method
+    the output is that of `dengine replay`. umap-learn takes much longer than the others. Ctrl-C, or
+    an error in a replay, ends it and shows the replays that were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -513,15 +513,15 @@ def costs(
     stream: Stream,
     out: Out | None,
 ) -> None:
-    """Find the policy that pays by three prices.
+    """Find out, by three prices, which policy pays.
 
-    Shows what a part of your recordings costs under the policies that pay most, and where
-    everything is verified; and says how certain that is, and how to set the policy. If none pays,
-    or may pay, the choice is to verify everything, and no policy to set is named. It tries levels
-    of LB, the --lower-bound, around break-even, where accepting costs as much as verifying, and the
-    guarantees pooled and cost. All costs are in one unit, such as seconds of production or money.
-    Ctrl-C, or an error in a replay, ends it and shows what was finished, if at least two shuffles
-    were.
+    Shows what a part of your recordings costs under the policies that pay most, and what it costs
+    if everything is verified. Says how certain these costs are, and how to set the policy. If no
+    policy pays or may pay, the choice is to verify everything, and the output names no policy. It
+    tries levels of LB, the --lower-bound, around break-even, where accepting costs as much as
+    verifying, and the guarantees pooled and cost. All costs are in one unit, such as seconds of
+    production or money. Ctrl-C, or an error in a replay, ends it and shows what was finished, if at
+    least two shuffles are finished.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of
