@@ -199,7 +199,7 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
             metavar="FOLDER",
             help=(
                 "Folder of finished replays, which are not played again: an interrupted run "
-                "continues, and other costs are computed at once."
+                "continues, and the costs at other prices take no new replays."
             ),
         ),
     }
@@ -209,17 +209,19 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
 
 
 GRID_LISTS = {
-    "alphas": click.option("--alphas", type=CommaList(ALPHA), help="To try, as in 0.5,0.1,0.05."),
+    "alphas": click.option(
+        "--alphas", type=CommaList(ALPHA), help="Values to try, like 0.5,0.1,0.05."
+    ),
     "lower_bounds": click.option(
-        "--lower-bounds", type=CommaList(LOWER_BOUND), help="To try, as in 0.8,0.9,0.95."
+        "--lower-bounds", type=CommaList(LOWER_BOUND), help="Values to try, like 0.8,0.9,0.95."
     ),
 }
 POLICY_LISTS = GRID_LISTS | {
     "intervals": click.option(
-        "--intervals", type=CommaList(NameChoice("interval")), help="To try."
+        "--intervals", type=CommaList(NameChoice("interval")), help="Names to try."
     ),
     "guarantees": click.option(
-        "--guarantees", type=CommaList(NameChoice("guarantee", OWN_RULE)), help="To try."
+        "--guarantees", type=CommaList(NameChoice("guarantee", OWN_RULE)), help="Names to try."
     ),
 }
 
@@ -267,8 +269,8 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     show_default=True,
     metavar="LIST",
     help=(
-        f"What the engine learns about accepted parts, of {','.join(CONFIRM_BY_FEEDBACK)}: only "
-        "their stops, or also which are good."
+        "What the engine learns about accepted parts. stops: only line stops. confirmed: also "
+        "which parts are good."
     ),
 )
 @stream_options(30, 1, 1, _SHUFFLES)
@@ -500,7 +502,10 @@ PRICES = {
 @options.recipe_options
 @options.bundle_options("lists", options.drop_none, GRID_LISTS)
 @stream_options(
-    4, 2, -1, "Number of shuffles that the last two policies play; earlier ones choose these."
+    4,
+    2,
+    -1,
+    "Number of shuffles that the last two policies play; earlier shuffles choose these policies.",
 )
 @explain_option
 @options.out_option

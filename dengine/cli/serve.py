@@ -45,7 +45,7 @@ DEMO_DEADLINE = 5.0
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address to listen on; any but this machine's own needs a token.",
+    help="Address to listen on; any other address than this machine's own needs a token.",
 )
 @click.option(
     "--port",
