@@ -1,13 +1,11 @@
-"""Access control of the HTTP server: `Guard` refuses a request by its token, host name, origin,
-size or time, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the
-application.
+"""Access control of the HTTP server: `Guard` refuses a request by its token, host name, origin or
+size, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the application.
 
 A server that only this machine can reach needs no token. But a browser on this machine may also
 send requests for web pages of other sites. `Guard` recognises these by the host name that they use
 and by the headers `Origin` and `Sec-Fetch-Site`, and refuses them.
 """
 
-import asyncio
 import base64
 import hmac
 import os
@@ -25,13 +23,12 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import SettingError, instead, log
+from ..errors import SettingError, instead
 from .api import Refusal, problem_response
 
 MIN_TOKEN_LENGTH = 16  # characters
 # A secret, a role and the owner's name.
 TOKEN_LINE = re.compile(rf"([!-~]{{{MIN_TOKEN_LENGTH},}})(?:\s+(viewer|operator)(?:\s+(.+))?)?")
-MAX_CLIENTS = 1000  # whose wrong tokens are logged
 SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing
 RPC = "/RPC2"  # a robot that cannot send headers may append its token to this path
 
@@ -66,14 +63,11 @@ class Access:
         Names by which the server may be called, beside localhost. IP addresses are always allowed.
     largest : int
         Most bytes of a request's body.
-    body_seconds : float
-        Seconds within which the body must arrive.
     """
 
     tokens: tuple[Token, ...] = ()
     hosts: tuple[str, ...] = ()
     largest: int = 2**20
-    body_seconds: float = 5.0
 
     def find_token(self, secret: str) -> Token | None:
         """Return the token with this secret, or None. All tokens are compared, in constant time."""
@@ -220,13 +214,12 @@ class Guard:
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self.app = app
         self.access = access
-        self._named: set[str] = set()  # clients whose wrong token was logged
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an allowed request on to the application, or answer it with the refusal.
 
-        What is no HTTP request, like the application's start and end, passes unchecked. The body of
-        an allowed request is limited while the application reads it, by `_limit_body`.
+        What is no HTTP request, like the application's start and end, passes unchecked. The size of
+        an allowed request's body is limited while the application reads it, by `_limit_body`.
         """
         if scope["type"] != "http":
             await self.app(scope, receive, send)
@@ -275,9 +268,8 @@ class Guard:
         """Check a request's token, and set `CURRENT_TOKEN`.
 
         A secret in the path is removed from it. Raises Refusal: 401 without a right token, 403 for
-        a viewer's token on a request that could change something. The first wrong token of a client
-        is logged. /healthz needs no right token; without one nothing is set. A server without
-        tokens takes every request.
+        a viewer's token on a request that could change something. /healthz needs no right token;
+        without one nothing is set. A server without tokens takes every request.
         """
         secret = take_token(scope, headers.get("authorization", ""))
         token = self.access.find_token(secret) if self.access.tokens else ANYBODY
@@ -288,8 +280,6 @@ class Guard:
                     HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's token."
                 )
         elif scope["path"] != "/healthz":
-            if secret or "authorization" in headers:
-                self._log_wrong_token((scope.get("client") or ("", 0))[0])
             challenge = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
             raise Refusal(
                 HTTPStatus.UNAUTHORIZED,
@@ -298,40 +288,15 @@ class Guard:
                 challenge,
             )
 
-    def _log_wrong_token(self, client: str) -> None:
-        """Log that a client sent a wrong token, once for each of at most `MAX_CLIENTS` clients."""
-        if client not in self._named and len(self._named) < MAX_CLIENTS:
-            self._named.add(client)
-            log.warning("a wrong token came from %s", client)
-
 
 def _limit_body(receive: Receive, access: Access) -> Receive:
-    """Return a `receive` that limits the body of a request in size and time.
-
-    It raises Refusal 413 beyond `access.largest` bytes, and 408 if the body is not complete after
-    `access.body_seconds` from now.
-    """
+    """Return a `receive` that raises Refusal 413 beyond `access.largest` bytes of a body."""
     bytes_left = access.largest
-    is_incomplete = True
-    deadline = asyncio.get_running_loop().time() + access.body_seconds
 
     async def receive_body() -> Message:
-        """Return the next message; count the body's bytes and raise Refusal for too many (413) or
-        too late ones (408).
-        """
-        nonlocal bytes_left, is_incomplete
-        if not is_incomplete:  # the next message says that the client disconnected, at any time
-            return await receive()
-        try:
-            async with asyncio.timeout_at(deadline):
-                message = await receive()
-        except TimeoutError:
-            raise Refusal(
-                HTTPStatus.REQUEST_TIMEOUT,
-                f"Expected the request's body within {access.body_seconds:g} s.",
-                CLOSE,
-            ) from None
-        is_incomplete = bool(message.get("more_body", False))
+        """Return the next message, and count the body's bytes; raise Refusal 413 for too many."""
+        nonlocal bytes_left
+        message = await receive()
         bytes_left -= len(message.get("body", b""))
         if bytes_left < 0:
             raise _too_large(access.largest)

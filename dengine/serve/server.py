@@ -27,7 +27,6 @@ from ..engine.engine import DataEngine
 from ..engine.garbage import frozen_objects
 from ..errors import SettingError, instead, log, without_password
 from .auth import Access, host_in_url, is_loopback, read_tokens
-from .connections import Connection
 from .http import Beside, create_app
 from .retraining import END_SIGNALS, RetrainingProcess
 from .robot_calls import Recorder
@@ -35,12 +34,14 @@ from .service import CellService
 
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
 GRACE = 5  # seconds for requests under way when the server ends
+MAX_CONNECTIONS = 500  # a process may usually have 1,024 open files
 # Seconds after which a thread gives Python's lock to a waiting one. A robot may wait for either of
 # the server's two threads.
 SWITCH_INTERVAL = 0.0005
 # uvicorn writes no log of its own, trusts no proxy's headers and serves no web sockets.
 UVICORN_OPTIONS: dict[str, Any] = {
-    "http": Connection,
+    "http": "h11",  # refuses a head of more than 16 KiB; httptools limits none
+    "limit_concurrency": MAX_CONNECTIONS,
     "timeout_keep_alive": KEEP_ALIVE,
     "timeout_graceful_shutdown": GRACE,
     "loop": "auto",  # uvloop if that is installed
