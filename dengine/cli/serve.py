@@ -65,13 +65,6 @@ DEMO_DEADLINE = 5.0
 @click.option("--cert", type=FILE, help="For TLS: the certificate with its chain, in PEM.")
 @click.option("--key", type=FILE, help="For TLS: the key, in PEM, without a password.")
 @click.option(
-    "--allow-host",
-    "allow_hosts",
-    multiple=True,
-    metavar="NAME",
-    help="A further name by which clients may call the server.",
-)
-@click.option(
     "--deadline",
     type=click.FloatRange(0.001, 60.0),
     default=0.5,

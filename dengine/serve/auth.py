@@ -2,8 +2,8 @@
 size, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the application.
 
 A server that only this machine can reach needs no token. But a browser on this machine may also
-send requests for web pages of other sites. `Guard` recognises these by the host name that they use
-and by the headers `Origin` and `Sec-Fetch-Site`, and refuses them.
+send requests for web pages of other sites. `Guard` recognises these by the headers `Origin` and
+`Sec-Fetch-Site`, and without a token by the host name that they use, and refuses them.
 """
 
 import base64
@@ -13,7 +13,6 @@ import re
 import stat
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import lru_cache
 from http import HTTPStatus
 from ipaddress import ip_address
 from itertools import compress
@@ -58,15 +57,13 @@ class Access:
     Attributes
     ----------
     tokens : tuple of Token
-        A request must have one of them. Empty: no token is needed.
-    hosts : tuple of str
-        Names by which the server may be called, beside localhost. IP addresses are always allowed.
+        A request must have one of them. Empty: no token is needed, and requests must call the
+        server localhost, or by a loopback address.
     largest : int
         Most bytes of a request's body.
     """
 
     tokens: tuple[Token, ...] = ()
-    hosts: tuple[str, ...] = ()
     largest: int = 2**20
 
     def find_token(self, secret: str) -> Token | None:
@@ -139,26 +136,16 @@ def host_in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-@lru_cache(64)
-def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
-    """Return whether a request's `Host` header names this server.
+def names_this_machine(host: str) -> bool:
+    """Return whether a request's `Host` header is localhost or a loopback address, with or without
+    a port.
 
-    It must be localhost, any IP address, or one of `names`, in upper or lower case, with or without
-    a port. A header that is missing or malformed does not name it. A web page whose own name was
-    made to resolve to this machine (DNS rebinding) sends another name.
+    A web page whose own name was made to resolve to this machine (DNS rebinding) sends that name.
     """
-    if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
-        return False
     try:
-        parts = urlsplit(f"//{host}")
-        name = parts.hostname
-        if name is None or parts.port == 0:
-            return False
-        if name != "localhost" and name not in {own_name.lower() for own_name in names}:
-            ip_address(name)
-    except ValueError:  # no port, or no address
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
+    except ValueError:  # brackets without an address
         return False
-    return True
 
 
 def take_token(scope: Scope, authorization: str) -> str:
@@ -239,22 +226,22 @@ class Guard:
         """Raise Refusal for a request that is not allowed; else set its token as `CURRENT_TOKEN`,
         for the handlers.
 
-        In this order it checks the host name (421), the token (`_check_token`), the site whose web
-        page sends a request that may change something (403), and the announced length of the body
-        (413). A token in the path is removed from the scope.
+        In this order it checks the host name of a server without tokens (421), the token
+        (`_check_token`), the site whose web page sends a request that may change something (403),
+        and the announced length of the body (413). A token in the path is removed from the scope.
         """
         headers = Headers(scope=scope)
-        host = headers.get("host")
-        if not is_own_host(host, self.access.hosts):
+        host = headers.get("host", "")
+        # A web page on another name has no token: browsers send Basic credentials by origin.
+        if not self.access.tokens and not names_this_machine(host):
             raise Refusal(
                 HTTPStatus.MISDIRECTED_REQUEST,
-                "Expected the server to be called by its IP address, localhost, or a name given by "
-                "dengine serve --allow-host NAME.",
+                "Expected the server to be called as localhost or 127.0.0.1, for it has no token.",
             )
         self._check_token(scope, headers)
         # Browsers say from which site a request comes. It must be this one, or no page at all.
         origin = headers.get("origin")
-        is_same_origin = origin is None or origin.partition("://")[2].lower() == str(host).lower()
+        is_same_origin = origin is None or origin.partition("://")[2].lower() == host.lower()
         is_same_site = headers.get("sec-fetch-site", "none") in ("same-origin", "none")
         if scope["method"] not in SAFE_METHODS and not (is_same_origin and is_same_site):
             raise Refusal(

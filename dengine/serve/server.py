@@ -109,8 +109,6 @@ class ServerOptions:
         None: no request needs a token, and only this machine reaches the server.
     cert, key : path or None
         PEM files for TLS, both or none.
-    allow_hosts : sequence of str
-        Further names by which clients may call the server.
     deadline : float
         Seconds that a decision may wait in the queue.
     check_seconds : float
@@ -130,7 +128,6 @@ class ServerOptions:
     token_file: Path | None
     cert: Path | None
     key: Path | None
-    allow_hosts: Sequence[str]
     deadline: float
     check_seconds: float
     largest: int
@@ -144,9 +141,6 @@ class ServerOptions:
     def access(self) -> Access:
         """What the server allows; each access reads the token file again.
 
-        Beside `allow_hosts`, the address and this machine's name may be used to call a server that
-        other machines reach.
-
         Raises SettingError for a token file that cannot be used, and for an address that other
         machines can reach without one.
         """
@@ -156,8 +150,7 @@ class ServerOptions:
                 "--host 127.0.0.1."
             )
         tokens = () if self.token_file is None else read_tokens(self.token_file)
-        own_names = () if is_loopback(self.host) else (self.host, socket.gethostname())
-        return Access(tokens, (*own_names, *self.allow_hosts), self.largest)
+        return Access(tokens, self.largest)
 
     def started_beside(self, access: Access) -> list[Beside]:
         """Return the OPC UA server, as `create_app` starts it, in a list; an empty one if it is
