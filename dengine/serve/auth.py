@@ -30,6 +30,7 @@ MIN_TOKEN_LENGTH = 16  # characters
 TOKEN_LINE = re.compile(rf"([!-~]{{{MIN_TOKEN_LENGTH},}})(?:\s+(viewer|operator)(?:\s+(.+))?)?")
 SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing
 RPC = "/RPC2"  # a robot that cannot send headers may append its token to this path
+MAX_BODY = 1 << 20  # bytes, 250,000 samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,29 +49,6 @@ class Token:
     secret: str = field(default="", repr=False)
     operates: bool = True
     name: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Access:
-    """What the server allows.
-
-    Attributes
-    ----------
-    tokens : tuple of Token
-        A request must have one of them. Empty: no token is needed, and requests must call the
-        server localhost, or by a loopback address.
-    largest : int
-        Most bytes of a request's body.
-    """
-
-    tokens: tuple[Token, ...] = ()
-    largest: int = 2**20
-
-    def find_token(self, secret: str) -> Token | None:
-        """Return the token with this secret, or None. All tokens are compared, in constant time."""
-        given = secret.encode("utf-8", "surrogatepass")
-        is_same = [hmac.compare_digest(token.secret.encode(), given) for token in self.tokens]
-        return next(compress(self.tokens, is_same), None)
 
 
 ANYBODY = Token()  # of requests to a server that needs no token
@@ -148,6 +126,13 @@ def names_this_machine(host: str) -> bool:
         return False
 
 
+def find_token(tokens: tuple[Token, ...], secret: str) -> Token | None:
+    """Return the token with this secret, or None. All tokens are compared, in constant time."""
+    given = secret.encode("utf-8", "surrogatepass")
+    is_same = [hmac.compare_digest(token.secret.encode(), given) for token in tokens]
+    return next(compress(tokens, is_same), None)
+
+
 def take_token(scope: Scope, authorization: str) -> str:
     """Return the secret that a request carries, or "" if it has none that can be read.
 
@@ -177,6 +162,7 @@ def take_token(scope: Scope, authorization: str) -> str:
 
 
 CLOSE = {"Connection": "close"}  # bytes of the body that were not read are no next request
+TOO_LARGE = 413, f"Expected a request of at most {MAX_BODY} bytes, got a larger one.", CLOSE
 HEADERS = [  # of every response
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
@@ -193,14 +179,22 @@ HEADERS = [  # of every response
 
 
 class Guard:
-    """ASGI middleware that refuses requests which `Access` does not allow.
+    """ASGI middleware that refuses requests that are not allowed.
 
     It also adds the security headers to every response.
+
+    Parameters
+    ----------
+    app : ASGIApp
+        Gets the allowed requests.
+    tokens : tuple of Token
+        A request must have one of them. Empty: no token is needed, and requests must call the
+        server localhost, or by a loopback address.
     """
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
+    def __init__(self, app: ASGIApp, tokens: tuple[Token, ...]) -> None:
         self.app = app
-        self.access = access
+        self.tokens = tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an allowed request on to the application, or answer it with the refusal.
@@ -220,7 +214,7 @@ class Guard:
                 response.headers.append("WWW-Authenticate", 'Bearer realm="dengine"')
             await response(scope, receive, _with_headers(send))
         else:
-            await self.app(scope, _limit_body(receive, self.access), _with_headers(send))
+            await self.app(scope, _limit_body(receive), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
         """Raise Refusal for a request that is not allowed; else set its token as `CURRENT_TOKEN`,
@@ -233,7 +227,7 @@ class Guard:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         # A web page on another name has no token: browsers send Basic credentials by origin.
-        if not self.access.tokens and not names_this_machine(host):
+        if not self.tokens and not names_this_machine(host):
             raise Refusal(
                 HTTPStatus.MISDIRECTED_REQUEST,
                 "Expected the server to be called as localhost or 127.0.0.1, for it has no token.",
@@ -248,8 +242,8 @@ class Guard:
                 HTTPStatus.FORBIDDEN,
                 "Expected a request of this server's own pages, got one of another site.",
             )
-        if int(headers.get("content-length", 0)) > self.access.largest:
-            raise _too_large(self.access.largest)
+        if int(headers.get("content-length", 0)) > MAX_BODY:
+            raise Refusal(*TOO_LARGE)
 
     def _check_token(self, scope: Scope, headers: Headers) -> None:
         """Check a request's token, and set `CURRENT_TOKEN`.
@@ -259,7 +253,7 @@ class Guard:
         without one nothing is set. A server without tokens takes every request.
         """
         secret = take_token(scope, headers.get("authorization", ""))
-        token = self.access.find_token(secret) if self.access.tokens else ANYBODY
+        token = find_token(self.tokens, secret) if self.tokens else ANYBODY
         if token is not None:
             CURRENT_TOKEN.set(token)
             if not token.operates and scope["method"] not in SAFE_METHODS:
@@ -276,9 +270,9 @@ class Guard:
             )
 
 
-def _limit_body(receive: Receive, access: Access) -> Receive:
-    """Return a `receive` that raises Refusal 413 beyond `access.largest` bytes of a body."""
-    bytes_left = access.largest
+def _limit_body(receive: Receive) -> Receive:
+    """Return a `receive` that raises Refusal 413 beyond `MAX_BODY` bytes of a body."""
+    bytes_left = MAX_BODY
 
     async def receive_body() -> Message:
         """Return the next message, and count the body's bytes; raise Refusal 413 for too many."""
@@ -286,20 +280,10 @@ def _limit_body(receive: Receive, access: Access) -> Receive:
         message = await receive()
         bytes_left -= len(message.get("body", b""))
         if bytes_left < 0:
-            raise _too_large(access.largest)
+            raise Refusal(*TOO_LARGE)
         return message
 
     return receive_body
-
-
-def _too_large(largest: int) -> Refusal:
-    """Return the refusal of a body of more than `largest` bytes."""
-    return Refusal(
-        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-        f"Expected a request of at most {largest} bytes (dengine serve --largest), "
-        "got a larger one.",
-        CLOSE,
-    )
 
 
 def _with_headers(send: Send) -> Send:

@@ -43,7 +43,7 @@ from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from . import api
 from .api import Json, Operation, Refusal, field_types, response_fields
-from .auth import CURRENT_TOKEN, Access, Guard
+from .auth import CURRENT_TOKEN, Guard, Token
 from .metrics import Metrics
 from .robot_calls import Recorder
 from .service import CellService
@@ -581,10 +581,8 @@ async def _index_page(request: Request) -> Response:
 
 def create_app(
     service: CellService,
-    access: Access | None = None,
+    tokens: tuple[Token, ...] = (),
     *,
-    xmlrpc: bool = True,
-    page: bool = True,
     beside: Sequence[Beside] = (),
     recorder: Recorder | None = None,
 ) -> Starlette:
@@ -595,10 +593,8 @@ def create_app(
     Parameters
     ----------
     service : CellService
-    access : Access, optional
-        None: without tokens; then serve it at a loopback address alone, which is not checked here.
-    xmlrpc, page : bool
-        Whether XML-RPC and the web page are served beside HTTP.
+    tokens : tuple of Token, optional
+        Empty: serve the application at a loopback address alone, which is not checked here.
     beside : sequence of callable
         Each is called with the service and returns an async context, which lasts as long as the
         application, in the same event loop: an OPC UA server, for example. One that fails to start
@@ -614,11 +610,9 @@ def create_app(
         Route(operation.path, operation.serve, methods=[operation.method])
         for operation in HttpApi(service).operations
     ]
-    routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))  # /docs needs it too
-    if xmlrpc:
-        routes += xmlrpc_routes(service, recorder)
-    if page:
-        routes += [Route(path, _index_page) for path in VIEWS]
+    routes += xmlrpc_routes(service, recorder)
+    routes += [Route(path, _index_page) for path in VIEWS]
+    routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -635,7 +629,7 @@ def create_app(
                 raise
             yield
 
-    guard = Middleware(Guard, access=access or Access())
+    guard = Middleware(Guard, tokens=tokens)
     app = Starlette(
         routes=routes, middleware=[guard], exception_handlers=api.HANDLERS, lifespan=lifespan
     )

@@ -14,7 +14,6 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ import uvicorn
 from ..engine.engine import DataEngine
 from ..engine.garbage import frozen_objects
 from ..errors import SettingError, instead, log, without_password
-from .auth import Access, host_in_url, is_loopback, read_tokens
+from .auth import host_in_url, is_loopback, read_tokens
 from .http import Beside, create_app
 from .retraining import END_SIGNALS, RetrainingProcess
 from .robot_calls import Recorder
@@ -95,93 +94,23 @@ def log_lines_to(stream: TextIO) -> Iterator[None]:
         log.setLevel(level)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServerOptions:
-    """The options of `dengine serve` that are not the engine's, under their names.
-
-    Attributes
-    ----------
-    host : str
-        Address to listen on.
-    port : int
-        0: any free one.
-    token_file : path or None
-        None: no request needs a token, and only this machine reaches the server.
-    cert, key : path or None
-        PEM files for TLS, both or none.
-    deadline : float
-        Seconds that a decision may wait in the queue.
-    check_seconds : float
-        Duration of a verification.
-    largest : int
-        Bytes of a request.
-    opcua : int or None
-        Port of OPC UA; None: off.
-    opcua_cert, opcua_key : path or None
-        None: `cert` and `key`.
-    xmlrpc, page : bool
-        Whether they are served beside HTTP.
-    """
-
-    host: str
-    port: int
-    token_file: Path | None
-    cert: Path | None
-    key: Path | None
-    deadline: float
-    check_seconds: float
-    largest: int
-    opcua: int | None
-    opcua_cert: Path | None
-    opcua_key: Path | None
-    xmlrpc: bool
-    page: bool
-
-    @property
-    def access(self) -> Access:
-        """What the server allows; each access reads the token file again.
-
-        Raises SettingError for a token file that cannot be used, and for an address that other
-        machines can reach without one.
-        """
-        if self.token_file is None and not is_loopback(self.host):
-            raise SettingError(
-                f"Expected --token-file FILE, for {self.host} is reached from other machines; or "
-                "--host 127.0.0.1."
-            )
-        tokens = () if self.token_file is None else read_tokens(self.token_file)
-        return Access(tokens, self.largest)
-
-    def started_beside(self, access: Access) -> list[Beside]:
-        """Return the OPC UA server, as `create_app` starts it, in a list; an empty one if it is
-        off.
-
-        The operators' tokens are its passwords; a viewer's token is none, since whoever may read
-        over OPC UA may also call.
-        """
-        if self.opcua is None:
-            return []
-        from .opcua import opcua_server
-
-        secrets = [token.secret for token in access.tokens if token.operates]
-        start = partial(
-            opcua_server,
-            port=self.opcua,
-            host=self.host,
-            tokens=secrets if access.tokens else None,
-            cert=self.opcua_cert or self.cert,
-            key=self.opcua_key or self.key,
-        )
-        return [start]
-
-
 def serve(
     make: Callable[[Executor], DataEngine],
     store: str | None,
     say: Callable[[str], object],
-    options: ServerOptions,
     beside: Sequence[Beside] = (),
     recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
+    *,
+    host: str,
+    port: int,
+    token_file: Path | None,
+    cert: Path | None,
+    key: Path | None,
+    deadline: float,
+    check_seconds: float,
+    opcua: int | None,
+    opcua_cert: Path | None,
+    opcua_key: Path | None,
 ) -> None:
     """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
@@ -195,12 +124,27 @@ def serve(
         The store's name, for a second connection that only reads; None: a store in memory.
     say : callable
         Called with a line that says where the server listens, once it does.
-    options : ServerOptions
     beside : sequence of callable
         Called with the service, each returns an async context that lasts as long as the server; one
         that fails to start ends it, and its error is raised.
     recorder : callable
         Opens the recorder of a robot's insertions, or gives None.
+    host : str
+        Address to listen on.
+    port : int
+        0: any free one.
+    token_file : path or None
+        None: no request needs a token, and only this machine may reach the server.
+    cert, key : path or None
+        PEM files for TLS, both or none.
+    deadline : float
+        Seconds that a decision may wait in the queue.
+    check_seconds : float
+        Duration of a verification.
+    opcua : int or None
+        Port of OPC UA; None: off.
+    opcua_cert, opcua_key : path or None
+        None: `cert` and `key`.
 
     Raises
     ------
@@ -210,31 +154,40 @@ def serve(
     DengineError
         What `make` or `recorder` raises.
     """
-    access = options.access
-    tls = _tls_options(options.cert, options.key)
-    beside = [*beside, *options.started_beside(access)]
+    if token_file is None and not is_loopback(host):
+        raise SettingError(
+            f"Expected --token-file FILE, for {host} is reached from other machines; or "
+            "--host 127.0.0.1."
+        )
+    tokens = () if token_file is None else read_tokens(token_file)
+    tls = _tls_options(cert, key)
+    if opcua is not None:
+        from .opcua import opcua_server
+
+        # A viewer's token is no password: whoever may read over OPC UA may also call.
+        secrets = [token.secret for token in tokens if token.operates]
+        start = partial(
+            opcua_server,
+            port=opcua,
+            host=host,
+            tokens=secrets if tokens else None,
+            cert=opcua_cert or cert,
+            key=opcua_key or key,
+        )
+        beside = [*beside, start]
     with (
-        listening_socket(options.host, options.port) as listening,
+        listening_socket(host, port) as listening,
         log_lines_to(sys.stderr),
         RetrainingProcess() as executor,
         recorder() as opened_recorder,
     ):
-        service = CellService(
-            lambda: make(executor), store, options.deadline, check_seconds=options.check_seconds
-        )
+        service = CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
         with closing(service):
-            app = create_app(
-                service,
-                access,
-                xmlrpc=options.xmlrpc,
-                page=options.page,
-                beside=beside,
-                recorder=opened_recorder,
-            )
+            app = create_app(service, tokens, beside=beside, recorder=opened_recorder)
             config = uvicorn.Config(app, **UVICORN_OPTIONS | tls)
             scheme = "https" if tls else "http"
-            address = f"{scheme}://{host_in_url(options.host)}:{listening.getsockname()[1]}"
-            audience = "" if access.tokens else ", to this machine alone"
+            address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
+            audience = "" if tokens else ", to this machine alone"
             line = f"{service.engine.store.cell_id} is served at {address}{audience}."
             server = CellServer(config, service, lambda: say(line))
             try:

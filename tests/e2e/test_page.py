@@ -40,7 +40,7 @@ try:
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import Browser, Error, Page, expect, sync_playwright
 
-    from dengine.serve.auth import Access, Token
+    from dengine.serve.auth import Token
     from dengine.serve.http import create_app
     from dengine.serve.service import CellService
 except ImportError as error:
@@ -324,8 +324,7 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
     tokens = Token("a-viewer-s-password", False, "Line display"), Token(TOKEN, True, "Kim")
     file = tmp_path / "cell.db"
     trace = TraceSpec(60, rate_hz=500.0)  # which limits in seconds need
-    access = Access(tokens)
-    with a_service(file, trace=trace) as service, served(create_app(service, access)) as port:
+    with a_service(file, trace=trace) as service, served(create_app(service, tokens)) as port:
         demo, part = DemoCell(f"http://127.0.0.1:{port}", file), played(service, stream).part
         with (
             pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"),

@@ -3,7 +3,6 @@ it remembers.
 """
 
 import asyncio
-import json
 import re
 import socket
 import ssl
@@ -32,8 +31,8 @@ from starlette.routing import Route
 from dengine import DataEngine, Dataset, TraceSpec
 from dengine.errors import BusyError
 from dengine.serve.api import as_samples
-from dengine.serve.auth import Access, Token
-from dengine.serve.http import create_app
+from dengine.serve.auth import MAX_BODY, RPC, Token
+from dengine.serve.http import VIEWS, create_app
 from dengine.serve.service import CellService
 from tests.support.command_line import dengine
 from tests.support.serving import (
@@ -56,12 +55,11 @@ Client = Any
 
 @contextmanager
 def running(
-    service: CellService, access: Access | None = None, all_: bool = False, **options: Any
+    service: CellService, tokens: tuple[Token, ...] = (), **options: Any
 ) -> Iterator[Client]:
-    """A client of a server in front of this service.  all_ : XML-RPC and the page too."""
-    app = create_app(service, access, xmlrpc=all_, page=all_)
+    """A client of a server in front of this service."""
     with (
-        served(app, **options) as port,
+        served(create_app(service, tokens), **options) as port,
         httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60, trust_env=False) as client,
     ):
         yield client
@@ -69,10 +67,13 @@ def running(
 
 @contextmanager
 def serving(
-    access: Access | None = None, file: Path | None = None, most: int = 32, **options: Any
+    tokens: tuple[Token, ...] = (), file: Path | None = None, most: int = 32, **options: Any
 ) -> Iterator[tuple[CellService, Client]]:
     """A service of its own, in memory or in a file, and a client of it."""
-    with a_service(file, max_waiting=most) as service, running(service, access, **options) as client:
+    with (
+        a_service(file, max_waiting=most) as service,
+        running(service, tokens, **options) as client,
+    ):
         yield service, client
 
 
@@ -342,17 +343,17 @@ def test_whoever_listens_is_told_of_changes_and_not_of_looks(stream: Dataset) ->
         assert list(events) == []
 
 
-def test_the_page_is_files_that_may_ask_nobody_else(whole: Client) -> None:
+def test_the_page_is_files_that_may_ask_nobody_else(client: Client) -> None:
     for view in ("", "overview", "map", "part?id=nobody", "history", "actions"):
-        answer = whole.get(f"/{view}")
+        answer = client.get(f"/{view}")
         assert answer.status_code == 200
         policy = answer.headers["content-security-policy"]
         assert "default-src 'none'; script-src 'self'; style-src 'self'" in policy
         assert "unsafe" not in policy
     for path in re.findall(r'(?:src|href)="(page/[^"]+)"', answer.text):
-        assert whole.get(f"/{path}").status_code == 200
+        assert client.get(f"/{path}").status_code == 200
     for unknown in ("/page/static/../__init__.py", "/page/static/%2e%2e/__init__.py", "/how"):
-        assert whole.get(unknown).status_code == 404
+        assert client.get(unknown).status_code == 404
 
 
 def test_the_document_names_every_route_and_every_example_is_served(
@@ -361,8 +362,8 @@ def test_the_document_names_every_route_and_every_example_is_served(
     document = client.get("/openapi.json").json()
     served_here = [
         route
-        for route in create_app(service, xmlrpc=False, page=False).routes
-        if isinstance(route, Route)
+        for route in create_app(service).routes
+        if isinstance(route, Route) and route.path not in (RPC, *VIEWS)
     ]
     routes = {
         (route.path.replace(":path", ""), m)
@@ -491,9 +492,10 @@ def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None
 
 
 def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dataset) -> None:
-    with serving(
-        Access((Token(TOKEN, name="Kim"), Token("a-viewer-s-password", operates=False)))
-    ) as (_, client):
+    with serving((Token(TOKEN, name="Kim"), Token("a-viewer-s-password", operates=False))) as (
+        _,
+        client,
+    ):
         for text in ("", "Bearer other", "Basic !", f"Bearer {TOKEN}x", TOKEN):
             refused = client.get("/status", headers={"authorization": text} if text else {})
             must_be_problem(refused, 401)
@@ -523,7 +525,7 @@ def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dat
         assert client.get("/healthz").status_code == 200
         named = client.get("/me", auth=("anybody", TOKEN), headers={"host": "cell.example"})
         assert named.status_code == 200  # who has the token may call it by any name
-        must_be_problem(client.get(f"/RPC2/{TOKEN}"), 404)  # let in; the interface is off here
+        must_be_problem(client.get(f"/RPC2/{TOKEN}"), 405)  # let in; but it takes POST alone
         must_be_problem(client.get(f"/RPC2/{TOKEN}/status"), 401)
 
 
@@ -548,12 +550,10 @@ def test_pages_of_other_sites_are_not_served(client: Client, stream: Dataset) ->
 
 
 def test_sizes_and_connections_are_limited() -> None:
-    with serving(Access(largest=4000), limit_concurrency=3) as (_, client), ExitStack() as others:
-        must_be_problem(client.post("/decide", **typed(b"0" * 4001, RAW)), 413)
-        must_be_problem(
-            client.post("/decide", content=iter([b"0" * 3000] * 2), headers={"content-type": RAW}),
-            413,
-        )
+    with serving(limit_concurrency=3) as (_, client), ExitStack() as others:
+        must_be_problem(client.post("/decide", **typed(b"0" * (MAX_BODY + 1), RAW)), 413)
+        pieces = iter([b"0" * (MAX_BODY // 2 + 1)] * 2)
+        must_be_problem(client.post("/decide", content=pieces, headers={"content-type": RAW}), 413)
         at = client.base_url.host, client.base_url.port
         for _ in range(2):
             others.enter_context(socket.create_connection(at, timeout=60))
@@ -572,7 +572,7 @@ def until(true: Callable[[], bool]) -> None:
 
 def test_a_hundred_idle_clients_keep_nobody_out(stream: Dataset) -> None:
     asked = b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n"
-    with serving(Access((Token(TOKEN),))) as (_, robot), ExitStack() as others:
+    with serving((Token(TOKEN),)) as (_, robot), ExitStack() as others:
         robot.headers["authorization"] = f"Bearer {TOKEN}"
         at = robot.base_url.host, robot.base_url.port
         for _ in range(150):
@@ -597,19 +597,12 @@ NO_HTTP = {
 }
 
 
-@pytest.fixture(scope="module")
-def whole(service: CellService) -> Iterator[Client]:
-    """A client of a server over every interface."""
-    with running(service, all_=True) as client:
-        yield client
-
-
 @pytest.mark.parametrize("name", NO_HTTP)
 def test_what_is_no_http_is_answered_before_its_connection_is_closed(
-    whole: Client, name: str
+    client: Client, name: str
 ) -> None:
     text = b""
-    with socket.create_connection((whole.base_url.host, whole.base_url.port), timeout=60) as raw:
+    with socket.create_connection((client.base_url.host, client.base_url.port), timeout=60) as raw:
         raw.sendall(NO_HTTP[name])
         while piece := raw.recv(65536):
             text += piece

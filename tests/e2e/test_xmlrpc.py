@@ -18,7 +18,7 @@ pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
 from dengine import Dataset
 from dengine.errors import BusyError
 from dengine.serve import xmlrpc as xml_rpc
-from dengine.serve.auth import Access
+from dengine.serve.auth import MAX_BODY
 from dengine.serve.http import create_app
 from dengine.serve.robot_calls import MAX_SAMPLES, RobotCalls
 from dengine.serve.service import CellService
@@ -52,7 +52,7 @@ class Cell:
 def cell(tmp_path_factory: pytest.TempPathFactory, stream: Dataset) -> Iterator[Cell]:
     recorder = PushedTraces()
     with a_service(tmp_path_factory.mktemp("cell") / "cell.db") as service:
-        app = create_app(service, Access(largest=200_000), page=False, recorder=recorder)
+        app = create_app(service, recorder=recorder)
         with served(app) as port:
             created = Cell(service, recorder, port)
             robot = created.robot()
@@ -216,7 +216,7 @@ def test_what_is_no_xml_rpc_at_all_is_refused_before_it_is_read(cell: Cell) -> N
     assert cell.post(body, "application/json")[0] == 415
     assert cell.post(body, method="GET")[0] == 405
     assert cell.post(body, **{"Content-Encoding": "gzip"})[0] == 415
-    assert cell.post(b"x" * 200_001)[0] == 413
+    assert cell.post(b"x" * (MAX_BODY + 1))[0] == 413
     assert cell.post(body, "text/xml; charset=utf-8")[0] == 200
 
 

@@ -243,17 +243,19 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     """
     file = tmp_path_factory.mktemp("cell") / "cell.db"
     learned(file)
-    with closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service:
-        with served(create_app(service)) as port:
-            created = Cell(service, port)
-            yield created
-            assert b'"ok"' in created.send(request(b"", "/healthz", JSON, "GET"))
-            assert created.probed("after") == created.probes
-            after = created.decisions()
-            assert {id_: after[id_] for id_ in created.before} == created.before
-            probes = 2 * len(created.probes)
-            assert len(after) - len(created.before) - probes <= created.found["taken"]
-            assert created.found["refused"] > created.found["taken"]
+    with (
+        closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service,
+        served(create_app(service)) as port,
+    ):
+        created = Cell(service, port)
+        yield created
+        assert b'"ok"' in created.send(request(b"", "/healthz", JSON, "GET"))
+        assert created.probed("after") == created.probes
+        after = created.decisions()
+        assert {id_: after[id_] for id_ in created.before} == created.before
+        probes = 2 * len(created.probes)
+        assert len(after) - len(created.before) - probes <= created.found["taken"]
+        assert created.found["refused"] > created.found["taken"]
 
 
 def learned(file: Path) -> None:
