@@ -14,11 +14,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO
+from typing import Any
 
 import uvicorn
 
@@ -55,43 +54,27 @@ UVICORN_OPTIONS: dict[str, Any] = {
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as one line for machines: time, level, logger, and the message as JSON.
+    """Formats a record as one line for machines: time, level, logger, and as JSON the message.
 
-    Passwords of database URLs are masked.
+    A traceback follows the message in the same text. Passwords of database URLs are masked.
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return a record as one line: time in UTC, level, logger, and as JSON texts the message
-        and an exception's traceback, with passwords masked.
-        """
-        utc = datetime.fromtimestamp(record.created, UTC)
-        time = utc.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        message = f"message={json.dumps(without_password(record.getMessage()))}"
-        if record.exc_info:
-            traceback = without_password(self.formatException(record.exc_info))
-            message += f" raised={json.dumps(traceback)}"
-        return f"{time} level={record.levelname.lower()} logger={record.name} {message}"
+        """Return a record as one line."""
+        text = json.dumps(without_password(super().format(record)))
+        time = self.formatTime(record)
+        return f"{time} level={record.levelname.lower()} logger={record.name} message={text}"
 
 
-@contextmanager
-def log_lines_to(stream: TextIO) -> Iterator[None]:
-    """Write the logs of all libraries to a stream, a line each, until the block ends.
+def log_lines() -> None:
+    """Write the logs of all libraries to stderr, a line each, in place of all earlier handlers.
 
-    dengine's own are written from INFO on, others from their level on. The root logger's handlers
-    get none meanwhile, and are put back.
+    dengine's own are written from INFO on, others from their level on.
     """
-    handler = logging.StreamHandler(stream)
+    handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter())
-    root = logging.getLogger()
-    handlers = root.handlers[:]
-    level = log.level
-    root.handlers[:] = [handler]
+    logging.basicConfig(handlers=[handler], force=True)
     log.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        root.handlers[:] = handlers
-        log.setLevel(level)
 
 
 def serve(
@@ -114,7 +97,8 @@ def serve(
 ) -> None:
     """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
-    Then the requests in the queue are answered, and the engine is closed. Logs go to stderr.
+    Then the requests in the queue are answered, and the engine is closed. Logs go to stderr, a line
+    each, also after the end.
 
     Parameters
     ----------
@@ -175,9 +159,9 @@ def serve(
             key=opcua_key or key,
         )
         beside = [*beside, start]
+    log_lines()
     with (
         listening_socket(host, port) as listening,
-        log_lines_to(sys.stderr),
         RetrainingProcess() as executor,
         recorder() as opened_recorder,
     ):

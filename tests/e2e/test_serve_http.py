@@ -3,6 +3,7 @@ it remembers.
 """
 
 import asyncio
+import logging
 import re
 import socket
 import ssl
@@ -29,7 +30,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.routing import Route
 
 from dengine import DataEngine, Dataset, TraceSpec
-from dengine.errors import BusyError
+from dengine.errors import BusyError, log
 from dengine.serve.api import as_samples
 from dengine.serve.auth import MAX_BODY, RPC, Token
 from dengine.serve.http import VIEWS, create_app
@@ -643,7 +644,12 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
 
 
 def refused_in_a_line(text: str, *words: object) -> None:
-    done = dengine("serve", *words)
+    root, handlers, level = logging.getLogger(), logging.getLogger().handlers[:], log.level
+    try:
+        done = dengine("serve", *words)
+    finally:  # a server leaves its own, as the process ends with it
+        root.handlers[:] = handlers
+        log.setLevel(level)
     assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
     assert text in done.output
 
