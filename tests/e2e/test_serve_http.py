@@ -25,7 +25,6 @@ jsonschema = pytest.importorskip("jsonschema")
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from msgspec import msgpack
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.routing import Route
 
@@ -48,7 +47,7 @@ from tests.support.serving import (
 
 TOKEN = "correct-horse-battery-staple"
 JSON, PROBLEM = "application/json", "application/problem+json"
-RAW, MSGPACK = "application/octet-stream", "application/msgpack"
+RAW = "application/octet-stream"
 SAMPLES = 60
 COUNTED = "action", "n_success", "n_failure", "lower", "upper"
 Client = Any
@@ -130,10 +129,6 @@ def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset
 def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:
     """The same trace as each form has it."""
     raw, text = trace.astype("<f4").tobytes(), {"request": request, "part": "P1"}
-    packed, headers = (
-        [msgpack.encode({"trace": item, **text}) for item in (trace.tolist(), raw)],
-        {"content-type": MSGPACK},
-    )
     return {
         "JSON": {"json": {"trace": trace.tolist(), **text}},
         "float32": {
@@ -141,8 +136,6 @@ def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:
             "params": text | {"channels": 1},
             "headers": {"content-type": RAW},
         },
-        "MessagePack": {"content": packed[0], "headers": headers},
-        "MessagePack of float32": {"content": packed[1], "headers": headers},
     }
 
 
@@ -190,10 +183,6 @@ def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Da
         decision["id"] for decision in client.get("/decisions?open=true").json()["decisions"]
     ]
     assert client.get("/decisions/label-0").json()["source"] == "verification"
-    packed = msgpack.encode({"id": "label-0", "success": True})
-    assert client.post("/report", content=packed, headers={"content-type": MSGPACK}).json()[
-        "repeated"
-    ]
 
 
 def test_what_can_be_looked_at_is_as_the_document_says(client: Client, stream: Dataset) -> None:
@@ -441,8 +430,6 @@ REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
     "no channels": (422, typed(b"1234", RAW, channels="0")),
     "an unknown query": (422, typed(b"1234", RAW, path="/etc")),
     "a query twice": (422, typed(b"1234", RAW, part=["1", "2"])),
-    "a name twice in MessagePack": (400, typed(b"\x82\xa5trace\x91\x01\xa5trace\x91\x02", MSGPACK)),
-    "half of MessagePack": (400, typed(b"\x81\xa5tra", MSGPACK)),
 }
 
 

@@ -20,8 +20,6 @@ from hypothesis import strategies as st
 
 pytest.importorskip("uvicorn", reason="the server needs the extra `serve`")
 
-from msgspec.msgpack import encode
-
 from dengine import DataEngine, TraceSpec
 from dengine.serve.http import create_app
 from dengine.serve.service import CellService
@@ -31,12 +29,7 @@ from tests.support.serving import served
 
 from .damage import SAMPLES, nested, spoilt, tries
 
-JSON, RAW, PACK, XML = (
-    "application/json",
-    "application/octet-stream",
-    "application/msgpack",
-    "text/xml",
-)
+JSON, RAW, XML = "application/json", "application/octet-stream", "text/xml"
 GOOD = [float(i % 7) for i in range(SAMPLES)]
 PATHS = """/decide /report /status /decisions /decisions/x /metrics /healthz /docs /RPC2 /RPC2/wrong /me / /explanations/
 /explanations/known-0 /course /embedding /versions /events?limit= /status?last= /correct /forget /rollback /policy /retrain
@@ -145,16 +138,6 @@ KINDS = {
                 "part=%0a",
             ]
         ),
-    ),
-    "MessagePack": only(
-        asked.map(lambda result: encode(json.loads(json.dumps(result), parse_int=float))), PACK
-    )
-    | only(sound.map(encode).flatmap(spoilt) | st.binary(max_size=50), PACK)
-    | only(
-        st.sampled_from(
-            [b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 5000, b"\xc1"]
-        ),
-        PACK,
     ),
     "XML-RPC": only(st.builds(call, names, st.lists(simple, max_size=4)), XML, "/RPC2")
     | only(st.sampled_from(ODD_XML).map(str.encode), XML, "/RPC2")
