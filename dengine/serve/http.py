@@ -8,16 +8,12 @@ app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell
 
 from __future__ import annotations
 
-import asyncio
-import copy
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from shutil import make_archive
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -37,7 +33,6 @@ from ..errors import expect
 from ..history.explain import explain, find_decision_id
 from ..history.map import part_map
 from ..history.status import NEWEST, iterate_decisions, read_course
-from ..model.base import Exportable
 from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
@@ -142,7 +137,6 @@ class HttpApi:
             Operation("POST", "/release", self.release, "Changed"),
             Operation("POST", "/policy", self.policy, "Changed", policy),
             Operation("POST", "/retrain", self.retrain, "Changed"),
-            Operation("POST", "/export", self.export, "application/zip"),
             Operation("GET", "/status", self.status, "Status"),
             Operation("GET", "/decisions", self.decisions, "Decisions", filter_),
             Operation("GET", "/decisions/{id:path}", self.decision, "Decision"),
@@ -305,33 +299,6 @@ class HttpApi:
             return Changed("retrain", "The retrain has begun.", event, engine.version)
 
         return await self._change(author, begin)
-
-    async def export(self, author: Author = "") -> Response:
-        """Download the model that decides now: a TorchScript file and its checksum, in a zip.
-
-        The download is an event. An accepted part that waits for its confirmation is not part of
-        the model. Before the first retrain there is nothing to download: 422.
-        """
-
-        def copy_model(engine: DataEngine) -> Exportable:
-            """Return the exportable model as a copy, which later learning does not change."""
-            from ..export.bundle import exportable
-
-            exported = exportable(engine)
-            # The engine goes on learning while the copy is exported.
-            return replace(exported, model=copy.deepcopy(exported.model))
-
-        by = _checked_author(author)
-        source = await self.service.call(copy_model)
-        content = await asyncio.to_thread(_zip_export, source)
-        await self.service.call(
-            lambda engine: engine.store.events.put(
-                "export", f"version {source.model_version} was downloaded", author=by
-            )
-        )
-        name = f"model_{source.model_version}.zip"
-        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-        return Response(content, media_type="application/zip", headers=headers)
 
     async def status(
         self,
@@ -559,20 +526,6 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     return response_fields(
         "Explanation", explanation, trace=trace, bads=bads, corrections=corrections, **band
     )
-
-
-def _zip_export(source: Exportable) -> bytes:
-    """Export a model to TorchScript, and return it with its checksum as a zip archive in bytes.
-
-    The engine records the export as an event. Raises ExportError for a model that cannot be
-    exported.
-    """
-    from ..export import export_torchscript
-
-    with TemporaryDirectory(prefix="dengine-export-") as folder:
-        (Path(folder) / "model").mkdir()
-        export_torchscript(source, Path(folder) / "model" / "model.ts")
-        return Path(make_archive(f"{folder}/packed", "zip", f"{folder}/model")).read_bytes()
 
 
 async def _index_page(request: Request) -> Response:

@@ -301,7 +301,6 @@ NOT_PUT_RIGHT = [
     # Nothing is imported since a request names it.
     (422, "policy", {"guarantee": "os:system", "author": "Kim"}),
     (422, "policy", {"force_limits": ["0.1:0.2:high"], "author": "Kim"}),
-    (422, "export", {"author": "Kim"}),  # there is no model yet
 ]
 
 

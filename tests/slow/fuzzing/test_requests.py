@@ -144,7 +144,7 @@ KINDS = {
     | only(ids.map(lambda id_: call("decide", (GOOD, id_))).flatmap(spoilt), XML, "/RPC2"),
     "an action": st.builds(
         lambda path, body: request(body, path, JSON, "POST", "Origin: http://localhost"),
-        st.sampled_from(["/correct", "/forget", "/rollback", "/policy", "/retrain", "/export"]),
+        st.sampled_from(["/correct", "/forget", "/rollback", "/policy", "/retrain"]),
         st.dictionaries(
             st.sampled_from(["id", "ids", "success", "version", "alpha", "guarantee"]),
             nested,
