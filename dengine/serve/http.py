@@ -40,11 +40,11 @@ from . import api
 from .api import Json, Operation, Refusal, field_types, response_fields
 from .auth import CURRENT_TOKEN, Guard, Token
 from .metrics import Metrics
-from .robot_calls import Recorder
 from .service import CellService
 from .xmlrpc import routes as xmlrpc_routes
 
 if TYPE_CHECKING:
+    from ..cells.ur.recorder import RtdeRecorder
     from ..store.sql import SqlStore
 
 MAX_SILENT = 60.0  # seconds without a sign of the engine's thread, after which the server is down
@@ -537,7 +537,7 @@ def create_app(
     tokens: tuple[Token, ...] = (),
     *,
     beside: Sequence[Beside] = (),
-    recorder: Recorder | None = None,
+    recorder: RtdeRecorder | None = None,
 ) -> Starlette:
     """Create the application. The caller closes the service after it has ended.
 
@@ -552,7 +552,7 @@ def create_app(
         Each is called with the service and returns an async context, which lasts as long as the
         application, in the same event loop: an OPC UA server, for example. One that fails to start
         ends the application; its error is `app.state.failure`.
-    recorder : Recorder, optional
+    recorder : RtdeRecorder, optional
         Of the traces for `decide_recorded`; the caller closes it.
 
     Returns

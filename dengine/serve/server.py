@@ -4,6 +4,8 @@ engine, signals and log, and its orderly end.
 It puts the engine's service, the HTTP application and uvicorn together.
 """
 
+from __future__ import annotations
+
 import json
 import logging
 import signal
@@ -17,7 +19,7 @@ from contextlib import AbstractContextManager, closing, contextmanager, nullcont
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import uvicorn
 
@@ -27,8 +29,10 @@ from ..errors import SettingError, instead, log, without_password
 from .auth import host_in_url, is_loopback, read_tokens
 from .http import Beside, create_app
 from .retraining import END_SIGNALS, RetrainingProcess
-from .robot_calls import Recorder
 from .service import CellService
+
+if TYPE_CHECKING:
+    from ..cells.ur.recorder import RtdeRecorder
 
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
 GRACE = 5  # seconds for requests under way when the server ends
@@ -82,7 +86,7 @@ def serve(
     store: str | None,
     say: Callable[[str], object],
     beside: Sequence[Beside] = (),
-    recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
+    recorder: Callable[[], AbstractContextManager[RtdeRecorder | None]] = nullcontext,
     *,
     host: str,
     port: int,

@@ -6,10 +6,12 @@ code and one line of text; only what is not XML-RPC at all gets 405 or 415. defu
 XML: no document type, no entity, nothing from outside.
 """
 
+from __future__ import annotations
+
 import asyncio
 import xmlrpc.client
 from inspect import signature
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from defusedxml.xmlrpc import DefusedExpatParser  # type: ignore[import-untyped]
 from starlette.requests import Request
@@ -19,8 +21,11 @@ from starlette.routing import Route
 from ..errors import DengineError, ReportError, as_options, log
 from .api import media_type
 from .auth import RPC
-from .robot_calls import Call, Recorder, RobotCalls, one_line
+from .robot_calls import Call, RobotCalls, one_line
 from .service import CellService
+
+if TYPE_CHECKING:
+    from ..cells.ur.recorder import RtdeRecorder
 
 SMALL_BODY = 1 << 16  # bytes; a larger call is parsed in a thread
 TAGS = (
@@ -67,13 +72,13 @@ def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
     return name, arguments
 
 
-def routes(service: CellService, recorder: Recorder | None = None) -> list[Route]:
+def routes(service: CellService, recorder: RtdeRecorder | None = None) -> list[Route]:
     """Return a list with the route of POST /RPC2, which calls the methods of `RobotCalls`.
 
     Parameters
     ----------
     service : CellService
-    recorder : Recorder, optional
+    recorder : RtdeRecorder, optional
         Of the traces for `decide_recorded`; the caller closes it.
 
     Returns
