@@ -288,18 +288,14 @@ def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
         return {}
     if cert is None or key is None:
         raise SettingError("Expected --cert and --key together, got one of them.")
-
-    def refuse_password() -> str:
-        """Raise SettingError when OpenSSL asks for the key's password."""
-        raise SettingError(
-            f"Expected a key without a password, {key} has one; protect the file instead: "
-            f"chmod 600 {key}"
-        )
-
-    # OSError includes ssl.SSLError.
-    with instead(SettingError, f"Cannot use {cert} and {key} for TLS", OSError):
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.load_cert_chain(cert, key, refuse_password)
+    # OSError includes ssl.SSLError. Without a password OpenSSL would ask the terminal for one.
+    with instead(
+        SettingError,
+        f"Cannot use {cert} and {key} for TLS",
+        OSError,
+        do="use PEM files, and a key without a password",
+    ):
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, password="none")
     return {"ssl_certfile": str(cert), "ssl_keyfile": str(key)}
 
 

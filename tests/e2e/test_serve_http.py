@@ -659,7 +659,7 @@ def test_a_server_that_other_machines_reach_wants_a_token_of_its_owner_alone(
         (token, "at least 16 ASCII characters", 0o600),
         (("--token-file", tmp_path / "none"), "Cannot read the token file", 0o600),
         ((*locked[:2], "--host", "localhost"), "--cert and --key together", 0o600),
-        ((*locked, "--host", "localhost"), "Expected a key without a password", 0o600),
+        ((*locked, "--host", "localhost"), "use PEM files, and a key without a password", 0o600),
     ):
         make_token(tmp_path, "short", mode)
         refused_in_a_line(
