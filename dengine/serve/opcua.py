@@ -224,6 +224,7 @@ class AddressSpace:
             self._nodes[name] = node_of(f"Cell.{name}")
         for name in STATUS_NAMES:
             self._types[name] = await self._nodes[name].read_data_type_as_variant_type()
+        await self._nodes["LastRefused"].write_value("")  # the file's empty text is read as null
         for name, call in (("Decide", self.decide), ("Report", self.report)):
             node = node_of(f"Cell.{name}")
             arguments, results = [
