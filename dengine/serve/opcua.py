@@ -214,7 +214,7 @@ class AddressSpace:
         """Create the nodes of cell.xml, link the methods Decide and Report, and make the generator
         of alarm events; call it once, before the server starts.
         """
-        await self._server.import_xml(Path(__file__).with_name("cell.xml"))
+        await self._server.import_xml(str(Path(__file__).with_name("cell.xml")))
         index = await self._server.get_namespace_index(NAMESPACE)
 
         def node_of(name: str) -> Node:
