@@ -65,13 +65,6 @@ DEMO_DEADLINE = 5.0
 @click.option("--cert", type=FILE, help="For TLS: the certificate with its chain, in PEM.")
 @click.option("--key", type=FILE, help="For TLS: the key, in PEM, without a password.")
 @click.option(
-    "--allow-host",
-    "allow_hosts",
-    multiple=True,
-    metavar="NAME",
-    help="A further name by which clients may call the server.",
-)
-@click.option(
     "--deadline",
     type=click.FloatRange(0.001, 60.0),
     default=0.5,
@@ -81,21 +74,7 @@ DEMO_DEADLINE = 5.0
 )
 @options.check_option
 @options.bundle_options("trace_options", options.drop_none, TRACE)
-@click.option(
-    "--largest",
-    type=click.IntRange(1024),
-    default=2**20,
-    show_default=True,
-    help="Largest request body, in bytes.",
-)
 @options.verify_all_option
-@click.option(
-    "--xmlrpc/--no-xmlrpc",
-    default=True,
-    show_default=True,
-    help="XML-RPC at /RPC2, for robot programs.",
-)
-@click.option("--page/--no-page", default=True, show_default=True, help="The live page, at /.")
 @click.option(
     "--opcua",
     type=click.IntRange(1, 65535),
@@ -168,7 +147,6 @@ def serve(
     from ..datasets import load_dataset
     from ..recipe import Recipe
     from ..serve.demo import POLICY, playing
-    from ..serve.server import ServerOptions
     from ..serve.server import serve as serve_cell
 
     recipe = choice.load_if_given()
@@ -207,7 +185,7 @@ def serve(
             trace=trace or options.trace_spec_from(trace_options),
             allow_import=allow_import,
         )
-        serve_cell(make_engine, store, click.echo, ServerOptions(**settings), beside, recorder)
+        serve_cell(make_engine, store, click.echo, beside, recorder, **settings)
 
 
 def _open_engine(

@@ -53,16 +53,11 @@ T = TypeVar("T")
 Json = dict[str, Any]
 JSON = "application/json"
 RAW = "application/octet-stream"
-MSGPACK = "application/msgpack"
 PROBLEM = "application/problem+json"
 RETRY_SECONDS = 1
 NO_ROUTE = {
     404: "Expected one of the paths in /openapi.json, got another.",
     405: "Expected another method on this path.",
-}
-DECODERS: Mapping[str, Callable[..., Any]] = {
-    JSON: msgspec.json.decode,
-    MSGPACK: msgspec.msgpack.decode,
 }
 STRINGS = re.compile(rb'"(?:[^"\\]|\\.)*+"(\s*:)?')  # in JSON; a key is followed by a colon
 REF = "#/components/schemas/{name}"
@@ -139,14 +134,14 @@ def media_type(request: Request) -> str:
 
 
 async def read_body(request: Request, struct_type: type[T], *other_types: str) -> T:
-    """Decode a request's JSON or MessagePack body into a struct.
+    """Decode a request's JSON body, an object whose values are no objects, into a struct.
 
     Raises Refusal: 415 for another media type, whose text also names `other_types`; 400 for a body
     that cannot be decoded, or has a name twice; 422 for wrong fields.
     """
     media = media_type(request)
-    if media not in DECODERS:
-        accepted = ", ".join((*DECODERS, *other_types))
+    if media != JSON:
+        accepted = ", ".join((JSON, *other_types))
         raise Refusal(
             415,
             f"Expected a body of {accepted}, got {shortened(media)}.",
@@ -154,30 +149,19 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
         )
     body = await request.body()
     try:
-        decoded: T = DECODERS[media](body, type=struct_type)
+        decoded = msgspec.json.decode(body, type=struct_type)
     except msgspec.ValidationError as error:
         # msgspec takes a text for bytes in base64; whoever sends one knows nothing of that.
         wanted = "Expected lists of numbers, or raw float32 in base64, got a text"
         text = str(error).replace("Invalid base64 encoded string", wanted)
         raise Refusal(422, f"{text}.") from error
     except (ValueError, RecursionError) as error:
-        raise Refusal(400, f"Expected {media}: {error}.") from error
+        raise Refusal(400, f"Expected {JSON}: {error}.") from error
     # msgspec takes the last of two equal keys.
-    if _count_keys(media, body) != len(DECODERS[media](body, type=dict[str, msgspec.Raw])):
+    n_keys = sum(map(bool, STRINGS.findall(body)))
+    if n_keys != len(msgspec.json.decode(body, type=dict[str, msgspec.Raw])):
         raise Refusal(400, "Expected each name once, got one twice.")
     return decoded
-
-
-def _count_keys(media: str, body: bytes) -> int:
-    """Return how many keys an encoded object has, repeated ones included.
-
-    `media` is JSON or MessagePack; the object's values must not be objects.
-    """
-    if media == JSON:
-        return sum(map(bool, STRINGS.findall(body)))
-    if body[0] < 0xDE:  # a fixmap: its size stands in the first byte
-        return body[0] & 0x0F
-    return int.from_bytes(body[1 : 3 if body[0] == 0xDE else 5])
 
 
 def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
@@ -583,7 +567,7 @@ class Operation:
             return description
         body: Json = {"schema": {"$ref": REF.format(name=self.request_type.__name__)}}
         examples = {str(i): {"value": value} for i, value in enumerate(self.examples)}
-        content = {JSON: body | {"examples": examples}, MSGPACK: body}
+        content = {JSON: body | {"examples": examples}}
         if self.raw_parameter:
             text = "float32, little-endian."
             content[RAW] = {"schema": {"type": "string", "format": "binary", "description": text}}

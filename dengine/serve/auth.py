@@ -1,13 +1,11 @@
-"""Access control of the HTTP server: `Guard` refuses a request by its token, host name, origin,
-size or time, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the
-application.
+"""Access control of the HTTP server: `Guard` refuses a request by its token, host name, origin or
+size, and `read_tokens` reads the tokens. `create_app` puts the `Guard` before the application.
 
 A server that only this machine can reach needs no token. But a browser on this machine may also
-send requests for web pages of other sites. `Guard` recognises these by the host name that they use
-and by the headers `Origin` and `Sec-Fetch-Site`, and refuses them.
+send requests for web pages of other sites. `Guard` recognises these by the headers `Origin` and
+`Sec-Fetch-Site`, and without a token by the host name that they use, and refuses them.
 """
 
-import asyncio
 import base64
 import hmac
 import os
@@ -15,7 +13,6 @@ import re
 import stat
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import lru_cache
 from http import HTTPStatus
 from ipaddress import ip_address
 from itertools import compress
@@ -25,15 +22,15 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from ..errors import SettingError, instead, log
+from ..errors import SettingError, instead
 from .api import Refusal, problem_response
 
 MIN_TOKEN_LENGTH = 16  # characters
 # A secret, a role and the owner's name.
 TOKEN_LINE = re.compile(rf"([!-~]{{{MIN_TOKEN_LENGTH},}})(?:\s+(viewer|operator)(?:\s+(.+))?)?")
-MAX_CLIENTS = 1000  # whose wrong tokens are logged
 SAFE_METHODS = "GET", "HEAD", "OPTIONS"  # they change nothing
 RPC = "/RPC2"  # a robot that cannot send headers may append its token to this path
+MAX_BODY = 1 << 20  # bytes, 250,000 samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,34 +49,6 @@ class Token:
     secret: str = field(default="", repr=False)
     operates: bool = True
     name: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Access:
-    """What the server allows.
-
-    Attributes
-    ----------
-    tokens : tuple of Token
-        A request must have one of them. Empty: no token is needed.
-    hosts : tuple of str
-        Names by which the server may be called, beside localhost. IP addresses are always allowed.
-    largest : int
-        Most bytes of a request's body.
-    body_seconds : float
-        Seconds within which the body must arrive.
-    """
-
-    tokens: tuple[Token, ...] = ()
-    hosts: tuple[str, ...] = ()
-    largest: int = 2**20
-    body_seconds: float = 5.0
-
-    def find_token(self, secret: str) -> Token | None:
-        """Return the token with this secret, or None. All tokens are compared, in constant time."""
-        given = secret.encode("utf-8", "surrogatepass")
-        is_same = [hmac.compare_digest(token.secret.encode(), given) for token in self.tokens]
-        return next(compress(self.tokens, is_same), None)
 
 
 ANYBODY = Token()  # of requests to a server that needs no token
@@ -145,26 +114,23 @@ def host_in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-@lru_cache(64)
-def is_own_host(host: str | None, names: tuple[str, ...]) -> bool:
-    """Return whether a request's `Host` header names this server.
+def names_this_machine(host: str) -> bool:
+    """Return whether a request's `Host` header is localhost or a loopback address, with or without
+    a port.
 
-    It must be localhost, any IP address, or one of `names`, in upper or lower case, with or without
-    a port. A header that is missing or malformed does not name it. A web page whose own name was
-    made to resolve to this machine (DNS rebinding) sends another name.
+    A web page whose own name was made to resolve to this machine (DNS rebinding) sends that name.
     """
-    if not host or not host.isascii() or any(c in "/@?#\\ \t" for c in host):
-        return False
     try:
-        parts = urlsplit(f"//{host}")
-        name = parts.hostname
-        if name is None or parts.port == 0:
-            return False
-        if name != "localhost" and name not in {own_name.lower() for own_name in names}:
-            ip_address(name)
-    except ValueError:  # no port, or no address
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
+    except ValueError:  # brackets without an address
         return False
-    return True
+
+
+def find_token(tokens: tuple[Token, ...], secret: str) -> Token | None:
+    """Return the token with this secret, or None. All tokens are compared, in constant time."""
+    given = secret.encode("utf-8", "surrogatepass")
+    is_same = [hmac.compare_digest(token.secret.encode(), given) for token in tokens]
+    return next(compress(tokens, is_same), None)
 
 
 def take_token(scope: Scope, authorization: str) -> str:
@@ -196,6 +162,7 @@ def take_token(scope: Scope, authorization: str) -> str:
 
 
 CLOSE = {"Connection": "close"}  # bytes of the body that were not read are no next request
+TOO_LARGE = 413, f"Expected a request of at most {MAX_BODY} bytes, got a larger one.", CLOSE
 HEADERS = [  # of every response
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
@@ -212,21 +179,28 @@ HEADERS = [  # of every response
 
 
 class Guard:
-    """ASGI middleware that refuses requests which `Access` does not allow.
+    """ASGI middleware that refuses requests that are not allowed.
 
     It also adds the security headers to every response.
+
+    Parameters
+    ----------
+    app : ASGIApp
+        Gets the allowed requests.
+    tokens : tuple of Token
+        A request must have one of them. Empty: no token is needed, and requests must call the
+        server localhost, or by a loopback address.
     """
 
-    def __init__(self, app: ASGIApp, access: Access) -> None:
+    def __init__(self, app: ASGIApp, tokens: tuple[Token, ...]) -> None:
         self.app = app
-        self.access = access
-        self._named: set[str] = set()  # clients whose wrong token was logged
+        self.tokens = tokens
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass an allowed request on to the application, or answer it with the refusal.
 
-        What is no HTTP request, like the application's start and end, passes unchecked. The body of
-        an allowed request is limited while the application reads it, by `_limit_body`.
+        What is no HTTP request, like the application's start and end, passes unchecked. The size of
+        an allowed request's body is limited while the application reads it, by `_limit_body`.
         """
         if scope["type"] != "http":
             await self.app(scope, receive, send)
@@ -240,47 +214,46 @@ class Guard:
                 response.headers.append("WWW-Authenticate", 'Bearer realm="dengine"')
             await response(scope, receive, _with_headers(send))
         else:
-            await self.app(scope, _limit_body(receive, self.access), _with_headers(send))
+            await self.app(scope, _limit_body(receive), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
         """Raise Refusal for a request that is not allowed; else set its token as `CURRENT_TOKEN`,
         for the handlers.
 
-        In this order it checks the host name (421), the token (`_check_token`), the site whose web
-        page sends a request that may change something (403), and the announced length of the body
-        (413). A token in the path is removed from the scope.
+        In this order it checks the host name of a server without tokens (421), the token
+        (`_check_token`), the site whose web page sends a request that may change something (403),
+        and the announced length of the body (413). A token in the path is removed from the scope.
         """
         headers = Headers(scope=scope)
-        host = headers.get("host")
-        if not is_own_host(host, self.access.hosts):
+        host = headers.get("host", "")
+        # A web page on another name has no token: browsers send Basic credentials by origin.
+        if not self.tokens and not names_this_machine(host):
             raise Refusal(
                 HTTPStatus.MISDIRECTED_REQUEST,
-                "Expected the server to be called by its IP address, localhost, or a name given by "
-                "dengine serve --allow-host NAME.",
+                "Expected the server to be called as localhost or 127.0.0.1, for it has no token.",
             )
         self._check_token(scope, headers)
         # Browsers say from which site a request comes. It must be this one, or no page at all.
         origin = headers.get("origin")
-        is_same_origin = origin is None or origin.partition("://")[2].lower() == str(host).lower()
+        is_same_origin = origin is None or origin.partition("://")[2].lower() == host.lower()
         is_same_site = headers.get("sec-fetch-site", "none") in ("same-origin", "none")
         if scope["method"] not in SAFE_METHODS and not (is_same_origin and is_same_site):
             raise Refusal(
                 HTTPStatus.FORBIDDEN,
                 "Expected a request of this server's own pages, got one of another site.",
             )
-        if int(headers.get("content-length", 0)) > self.access.largest:
-            raise _too_large(self.access.largest)
+        if int(headers.get("content-length", 0)) > MAX_BODY:
+            raise Refusal(*TOO_LARGE)
 
     def _check_token(self, scope: Scope, headers: Headers) -> None:
         """Check a request's token, and set `CURRENT_TOKEN`.
 
         A secret in the path is removed from it. Raises Refusal: 401 without a right token, 403 for
-        a viewer's token on a request that could change something. The first wrong token of a client
-        is logged. /healthz needs no right token; without one nothing is set. A server without
-        tokens takes every request.
+        a viewer's token on a request that could change something. /healthz needs no right token;
+        without one nothing is set. A server without tokens takes every request.
         """
         secret = take_token(scope, headers.get("authorization", ""))
-        token = self.access.find_token(secret) if self.access.tokens else ANYBODY
+        token = find_token(self.tokens, secret) if self.tokens else ANYBODY
         if token is not None:
             CURRENT_TOKEN.set(token)
             if not token.operates and scope["method"] not in SAFE_METHODS:
@@ -288,8 +261,6 @@ class Guard:
                     HTTPStatus.FORBIDDEN, "Expected an operator's token, got a viewer's token."
                 )
         elif scope["path"] != "/healthz":
-            if secret or "authorization" in headers:
-                self._log_wrong_token((scope.get("client") or ("", 0))[0])
             challenge = {"WWW-Authenticate": 'Basic realm="dengine", charset="UTF-8"'}
             raise Refusal(
                 HTTPStatus.UNAUTHORIZED,
@@ -298,56 +269,21 @@ class Guard:
                 challenge,
             )
 
-    def _log_wrong_token(self, client: str) -> None:
-        """Log that a client sent a wrong token, once for each of at most `MAX_CLIENTS` clients."""
-        if client not in self._named and len(self._named) < MAX_CLIENTS:
-            self._named.add(client)
-            log.warning("a wrong token came from %s", client)
 
-
-def _limit_body(receive: Receive, access: Access) -> Receive:
-    """Return a `receive` that limits the body of a request in size and time.
-
-    It raises Refusal 413 beyond `access.largest` bytes, and 408 if the body is not complete after
-    `access.body_seconds` from now.
-    """
-    bytes_left = access.largest
-    is_incomplete = True
-    deadline = asyncio.get_running_loop().time() + access.body_seconds
+def _limit_body(receive: Receive) -> Receive:
+    """Return a `receive` that raises Refusal 413 beyond `MAX_BODY` bytes of a body."""
+    bytes_left = MAX_BODY
 
     async def receive_body() -> Message:
-        """Return the next message; count the body's bytes and raise Refusal for too many (413) or
-        too late ones (408).
-        """
-        nonlocal bytes_left, is_incomplete
-        if not is_incomplete:  # the next message says that the client disconnected, at any time
-            return await receive()
-        try:
-            async with asyncio.timeout_at(deadline):
-                message = await receive()
-        except TimeoutError:
-            raise Refusal(
-                HTTPStatus.REQUEST_TIMEOUT,
-                f"Expected the request's body within {access.body_seconds:g} s.",
-                CLOSE,
-            ) from None
-        is_incomplete = bool(message.get("more_body", False))
+        """Return the next message, and count the body's bytes; raise Refusal 413 for too many."""
+        nonlocal bytes_left
+        message = await receive()
         bytes_left -= len(message.get("body", b""))
         if bytes_left < 0:
-            raise _too_large(access.largest)
+            raise Refusal(*TOO_LARGE)
         return message
 
     return receive_body
-
-
-def _too_large(largest: int) -> Refusal:
-    """Return the refusal of a body of more than `largest` bytes."""
-    return Refusal(
-        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-        f"Expected a request of at most {largest} bytes (dengine serve --largest), "
-        "got a larger one.",
-        CLOSE,
-    )
 
 
 def _with_headers(send: Send) -> Send:

@@ -8,16 +8,12 @@ app = create_app(CellService(lambda: DataEngine.open_or_create("cell.db"), "cell
 
 from __future__ import annotations
 
-import asyncio
-import copy
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from shutil import make_archive
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
@@ -37,19 +33,18 @@ from ..errors import expect
 from ..history.explain import explain, find_decision_id
 from ..history.map import part_map
 from ..history.status import NEWEST, iterate_decisions, read_course
-from ..model.base import Exportable
 from ..records import Action, is_name
 from ..store.records import StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from . import api
 from .api import Json, Operation, Refusal, field_types, response_fields
-from .auth import CURRENT_TOKEN, Access, Guard
+from .auth import CURRENT_TOKEN, Guard, Token
 from .metrics import Metrics
-from .robot_calls import Recorder
 from .service import CellService
 from .xmlrpc import routes as xmlrpc_routes
 
 if TYPE_CHECKING:
+    from ..cells.ur.recorder import RtdeRecorder
     from ..store.sql import SqlStore
 
 MAX_SILENT = 60.0  # seconds without a sign of the engine's thread, after which the server is down
@@ -142,7 +137,6 @@ class HttpApi:
             Operation("POST", "/release", self.release, "Changed"),
             Operation("POST", "/policy", self.policy, "Changed", policy),
             Operation("POST", "/retrain", self.retrain, "Changed"),
-            Operation("POST", "/export", self.export, "application/zip"),
             Operation("GET", "/status", self.status, "Status"),
             Operation("GET", "/decisions", self.decisions, "Decisions", filter_),
             Operation("GET", "/decisions/{id:path}", self.decision, "Decision"),
@@ -305,33 +299,6 @@ class HttpApi:
             return Changed("retrain", "The retrain has begun.", event, engine.version)
 
         return await self._change(author, begin)
-
-    async def export(self, author: Author = "") -> Response:
-        """Download the model that decides now: a TorchScript file and its checksum, in a zip.
-
-        The download is an event. An accepted part that waits for its confirmation is not part of
-        the model. Before the first retrain there is nothing to download: 422.
-        """
-
-        def copy_model(engine: DataEngine) -> Exportable:
-            """Return the exportable model as a copy, which later learning does not change."""
-            from ..export.bundle import exportable
-
-            exported = exportable(engine)
-            # The engine goes on learning while the copy is exported.
-            return replace(exported, model=copy.deepcopy(exported.model))
-
-        by = _checked_author(author)
-        source = await self.service.call(copy_model)
-        content = await asyncio.to_thread(_zip_export, source)
-        await self.service.call(
-            lambda engine: engine.store.events.put(
-                "export", f"version {source.model_version} was downloaded", author=by
-            )
-        )
-        name = f"model_{source.model_version}.zip"
-        headers = {"Content-Disposition": f'attachment; filename="{name}"'}
-        return Response(content, media_type="application/zip", headers=headers)
 
     async def status(
         self,
@@ -561,32 +528,16 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     )
 
 
-def _zip_export(source: Exportable) -> bytes:
-    """Export a model to TorchScript, and return it with its checksum as a zip archive in bytes.
-
-    The engine records the export as an event. Raises ExportError for a model that cannot be
-    exported.
-    """
-    from ..export import export_torchscript
-
-    with TemporaryDirectory(prefix="dengine-export-") as folder:
-        (Path(folder) / "model").mkdir()
-        export_torchscript(source, Path(folder) / "model" / "model.ts")
-        return Path(make_archive(f"{folder}/packed", "zip", f"{folder}/model")).read_bytes()
-
-
 async def _index_page(request: Request) -> Response:
     return FileResponse(STATIC / "index.html")
 
 
 def create_app(
     service: CellService,
-    access: Access | None = None,
+    tokens: tuple[Token, ...] = (),
     *,
-    xmlrpc: bool = True,
-    page: bool = True,
     beside: Sequence[Beside] = (),
-    recorder: Recorder | None = None,
+    recorder: RtdeRecorder | None = None,
 ) -> Starlette:
     """Create the application. The caller closes the service after it has ended.
 
@@ -595,15 +546,13 @@ def create_app(
     Parameters
     ----------
     service : CellService
-    access : Access, optional
-        None: without tokens; then serve it at a loopback address alone, which is not checked here.
-    xmlrpc, page : bool
-        Whether XML-RPC and the web page are served beside HTTP.
+    tokens : tuple of Token, optional
+        Empty: serve the application at a loopback address alone, which is not checked here.
     beside : sequence of callable
         Each is called with the service and returns an async context, which lasts as long as the
         application, in the same event loop: an OPC UA server, for example. One that fails to start
         ends the application; its error is `app.state.failure`.
-    recorder : Recorder, optional
+    recorder : RtdeRecorder, optional
         Of the traces for `decide_recorded`; the caller closes it.
 
     Returns
@@ -614,11 +563,9 @@ def create_app(
         Route(operation.path, operation.serve, methods=[operation.method])
         for operation in HttpApi(service).operations
     ]
-    routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))  # /docs needs it too
-    if xmlrpc:
-        routes += xmlrpc_routes(service, recorder)
-    if page:
-        routes += [Route(path, _index_page) for path in VIEWS]
+    routes += xmlrpc_routes(service, recorder)
+    routes += [Route(path, _index_page) for path in VIEWS]
+    routes.append(Mount("/page/static", StaticFiles(directory=STATIC)))
 
     @asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
@@ -635,7 +582,7 @@ def create_app(
                 raise
             yield
 
-    guard = Middleware(Guard, access=access or Access())
+    guard = Middleware(Guard, tokens=tokens)
     app = Starlette(
         routes=routes, middleware=[guard], exception_handlers=api.HANDLERS, lifespan=lifespan
     )

@@ -5,9 +5,9 @@ system to read. `dengine serve --opcua` starts it.
         ...
 
 The namespace `urn:dengine:cell` has one object, Cell, with the methods Decide and Report and
-read-only variables (`VARIABLES`). The text NodeIds do not change between versions. The variables
-follow the store, at most twice a second. The begin and the end of an alarm are events of the Server
-object.
+read-only variables. The file cell.xml, an OPC UA NodeSet, describes them; a PLC's engineering tool
+can import it. The text NodeIds do not change between versions. The variables follow the store, at
+most twice a second. The begin and the end of an alarm are events of the Server object.
 """
 
 import asyncio
@@ -17,7 +17,8 @@ import os
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
 from contextlib import asynccontextmanager, suppress
 from functools import wraps
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from asyncua import ua
@@ -28,7 +29,6 @@ from asyncua.server.internal_server import InternalServer
 from asyncua.server.server import Server
 from asyncua.server.user_managers import UserManager
 from asyncua.ua import VariantType
-from asyncua.ua.attribute_ids import AttributeIds
 from asyncua.ua.status_codes import StatusCodes
 
 from ..errors import DengineError, SettingError, as_options, log
@@ -45,89 +45,27 @@ MAX_SUBSCRIPTIONS = 100
 MAX_CHANNELS = 1000
 USER = "dengine"
 NAMESPACE = "urn:dengine:cell"
-CELL = "Cell"
 MIN_REFRESH = 0.5  # seconds between two readings of the store
 MAX_REFRESH = 5.0
 ALARM = 700  # severity, of 1 to 1000
 ALARM_ENDED = 100
-
-
-class Variable(NamedTuple):
-    """A read-only variable; `key` is its name in `RobotCalls.status`, "" if it is not there."""
-
-    type: VariantType
-    key: str
-    description: str
-
-
-class Argument(NamedTuple):
-    """An argument or a result of a method."""
-
-    name: str
-    type: VariantType
-    description: str
-    is_array: bool = False
-
-
-VARIABLES: Mapping[str, Variable] = {
-    "Decisions": Variable(VariantType.UInt32, "decisions", "decisions so far"),
-    "VerifiedShare": Variable(
-        VariantType.Double, "verified_share", "verified share of the newest 500 decisions, 0 to 1"
-    ),
-    "Accepted": Variable(VariantType.UInt32, "accepted", "parts accepted without a check"),
-    "Rejected": Variable(VariantType.UInt32, "rejected", "parts that the model rejected"),
-    "Bad": Variable(VariantType.UInt32, "bad", "accepted parts that are known to be bad"),
-    "ModelVersion": Variable(
-        VariantType.UInt32, "version", "of the model that decides; 0 before the first retrain"
-    ),
-    "SafeMode": Variable(
-        VariantType.Boolean, "safe_mode", "every part is verified, by the engine's own choice"
-    ),
-    "SafeModeReason": Variable(VariantType.String, "safe_mode", "why; empty outside the safe mode"),
-    "Shadow": Variable(
-        VariantType.Boolean, "shadow", "every part is verified, the model only predicts"
-    ),
-    "Alarm": Variable(VariantType.Boolean, "alarm", "somebody should look"),
-    "AlarmText": Variable(VariantType.String, "alarm", "at what; empty without an alarm"),
-    "Waiting": Variable(VariantType.UInt32, "waiting", "requests in the queue"),
-    "Late": Variable(
-        VariantType.UInt32, "late", "decisions past the deadline since the server's start"
-    ),
-    "Busy": Variable(
-        VariantType.UInt32, "busy", "requests refused because the queue was full, since the start"
-    ),
-    # For the engineer who configures a PLC.
-    "LastRefused": Variable(VariantType.String, "", "why the newest refused call was refused"),
+# Each variable with the status but LastRefused, and the status's name in `RobotCalls.status`.
+STATUS_NAMES = {
+    "Decisions": "decisions",
+    "VerifiedShare": "verified_share",
+    "Accepted": "accepted",
+    "Rejected": "rejected",
+    "Bad": "bad",
+    "ModelVersion": "version",
+    "SafeMode": "safe_mode",
+    "SafeModeReason": "safe_mode",
+    "Shadow": "shadow",
+    "Alarm": "alarm",
+    "AlarmText": "alarm",
+    "Waiting": "waiting",
+    "Late": "late",
+    "Busy": "busy",
 }
-DECIDE_ARGUMENTS = [
-    Argument("Trace", VariantType.Float, "samples, channel by channel", is_array=True),
-    Argument("Channels", VariantType.UInt32, "1, or how many channels the trace has"),
-    Argument(
-        "Request",
-        VariantType.String,
-        "an id of the caller's, a different one for each part; empty: a new one",
-    ),
-    Argument("Part", VariantType.String, "the part's number; empty: none"),
-]
-DECIDE_RESULTS = [
-    Argument("Action", VariantType.Int32, "0 verify, 1 accept, 2 reject"),
-    Argument("Id", VariantType.String, "for Report; empty: nothing was recorded, verify"),
-    Argument("Reason", VariantType.String, "why, as in Reason; busy: the queue is full"),
-    Argument("Lower", VariantType.Double, "lower bound of the success probability"),
-    Argument("Upper", VariantType.Double, "upper bound of it"),
-    Argument("ModelVersion", VariantType.UInt32, "of the model that decided"),
-]
-REPORT_ARGUMENTS = [
-    Argument("Id", VariantType.String, "as Decide returned it"),
-    Argument("Success", VariantType.Boolean, "True: good"),
-]
-REPORT_RESULTS = [
-    Argument(
-        "Kept",
-        VariantType.Boolean,
-        "False: nothing under this id was recorded, or the server is busy",
-    )
-]
 
 
 class TokenUsers(UserManager):
@@ -269,39 +207,34 @@ class AddressSpace:
         self._service = service
         self._calls = RobotCalls(service)
         self._nodes: dict[str, Node] = {}
+        self._types: dict[str, VariantType] = {}
         self._alarm = ""
 
     async def build(self) -> None:
-        """Create the object Cell, its `VARIABLES`, the methods Decide and Report, and the generator
+        """Create the nodes of cell.xml, link the methods Decide and Report, and make the generator
         of alarm events; call it once, before the server starts.
         """
-        self._index = await self._server.register_namespace(NAMESPACE)
-        objects = self._server.nodes.objects
-        cell = await objects.add_object(self._node_id(CELL), self._browse_name(CELL))
-        for name, variable in VARIABLES.items():
-            first = ""
-            if variable.type is not VariantType.String:
-                first = ua.get_default_value(variable.type)
-            node = await cell.add_variable(
-                self._node_id(f"{CELL}.{name}"), self._browse_name(name), first, variable.type
-            )
-            text = ua.Variant(ua.LocalizedText(variable.description))
-            await node.write_attribute(AttributeIds.Description, ua.DataValue(text))
-            self._nodes[name] = node
-        for name, call, arguments, results in (
-            ("Decide", self.decide, DECIDE_ARGUMENTS, DECIDE_RESULTS),
-            ("Report", self.report, REPORT_ARGUMENTS, REPORT_RESULTS),
-        ):
-            await cell.add_method(
-                self._node_id(f"{CELL}.{name}"),
-                self._browse_name(name),
-                self._as_method(call, arguments, results),
-                [_as_ua_argument(argument) for argument in arguments],
-                [_as_ua_argument(result) for result in results],
-            )
+        await self._server.import_xml(str(Path(__file__).with_name("cell.xml")))
+        index = await self._server.get_namespace_index(NAMESPACE)
+
+        def node_of(name: str) -> Node:
+            return self._server.get_node(ua.NodeId(ua.String(name), ua.Int16(index)))
+
+        for name in (*STATUS_NAMES, "LastRefused"):
+            self._nodes[name] = node_of(f"Cell.{name}")
+        for name in STATUS_NAMES:
+            self._types[name] = await self._nodes[name].read_data_type_as_variant_type()
+        await self._nodes["LastRefused"].write_value("")  # the file's empty text is read as null
+        for name, call in (("Decide", self.decide), ("Report", self.report)):
+            node = node_of(f"Cell.{name}")
+            arguments, results = [
+                await (await node.get_child(f"0:{kind}Arguments")).read_value()
+                for kind in ("Input", "Output")
+            ]
+            self._server.link_method(node, self._as_method(call, arguments, results))
         self._events: EventGenerator = await self._server.get_event_generator()
-        self._events.event.SourceNode = cell.nodeid
-        self._events.event.SourceName = CELL
+        self._events.event.SourceNode = node_of("Cell").nodeid
+        self._events.event.SourceName = "Cell"
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
         """Decide on a flat trace, channel after channel.
@@ -353,11 +286,10 @@ class AddressSpace:
         except Exception as error:  # the store is unavailable, or the queue full
             log.warning("the OPC UA variables could not be brought up to date: %s", error)
             status = _status_code(StatusCodes.UncertainLastUsableValue)
-            for name, variable in VARIABLES.items():
-                if variable.key:
-                    node = self._nodes[name]
-                    old = await node.read_data_value(raise_on_bad_status=False)
-                    await node.write_value(ua.DataValue(old.Value, status))
+            for name in STATUS_NAMES:
+                node = self._nodes[name]
+                old = await node.read_data_value(raise_on_bad_status=False)
+                await node.write_value(ua.DataValue(old.Value, status))
 
     async def write_status(self, status: Mapping[str, Any]) -> None:
         """Write a status, as `RobotCalls.status` returns it, into the variables.
@@ -365,13 +297,12 @@ class AddressSpace:
         If the text of the alarm has changed since the last call, send an event; an empty text sends
         the event that the alarm has ended.
         """
-        for name, variable in VARIABLES.items():
-            if variable.key:
-                value = status[variable.key]
-                if variable.type is VariantType.Boolean:
-                    value = bool(value)
-                data = ua.DataValue(ua.Variant(value, variable.type))
-                await self._nodes[name].write_value(data)
+        for name, key in STATUS_NAMES.items():
+            value = status[key]
+            if self._types[name] is VariantType.Boolean:
+                value = bool(value)
+            data = ua.DataValue(ua.Variant(value, self._types[name]))
+            await self._nodes[name].write_value(data)
         alarm = status["alarm"]
         if alarm != self._alarm:
             self._events.event.Severity = ALARM if alarm else ALARM_ENDED
@@ -381,33 +312,35 @@ class AddressSpace:
     def _as_method(
         self,
         call: Callable[..., Awaitable[list[Any]]],
-        arguments: list[Argument],
-        results: list[Argument],
+        arguments: list[ua.Argument],
+        results: list[ua.Argument],
     ) -> Callable[..., Awaitable[Any]]:
         """Return a method for asyncua that checks its arguments and calls `call` with their values.
 
         The method raises nothing. It returns the results as variants; for wrong arguments and for
         an error of `call` it returns a status code, and writes a line that says why to LastRefused.
         """
+        forms = [_form(_type_of(item), item.ValueRank > 0) for item in arguments]
         listed = ", ".join(
-            f"{argument.name} ({argument.type.name}{' array' if argument.is_array else ''})"
-            for argument in arguments
+            f"{item.Name} ({form})" for item, form in zip(arguments, forms, strict=True)
         )
 
         @wraps(call)
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
             """Check the arguments, call, and return the results or a status code."""
-            code, detail = _argument_error(variants, arguments)
-            line = f"Expected {listed}{detail}."
-            if code is None:
+            # Controllers send an empty text as null.
+            texts = [ua.Variant("") if item.Value is None else item for item in variants]
+            given = [_form(item.VariantType, isinstance(item.Value, list)) for item in texts]
+            code = StatusCodes.BadInvalidArgument
+            line = f"Expected {listed}, got {', '.join(given) or 'none'}."
+            if given == forms:
                 try:
-                    values = await call(*map(_argument_value, variants, arguments))
+                    values = await call(*(item.Value for item in texts))
                     return [
-                        ua.Variant(value, result.type)
+                        ua.Variant(value, _type_of(result))
                         for value, result in zip(values, results, strict=True)
                     ]
                 except DengineError as error:
-                    code = StatusCodes.BadInvalidArgument
                     line = as_options(str(error))
                 except Exception:
                     log.exception("a call over OPC UA failed")
@@ -419,57 +352,15 @@ class AddressSpace:
 
         return method
 
-    def _node_id(self, text: str) -> ua.NodeId:
-        return ua.NodeId(ua.String(text), ua.Int16(self._index))
 
-    def _browse_name(self, text: str) -> ua.QualifiedName:
-        return ua.QualifiedName(text, self._index)
+def _type_of(argument: ua.Argument) -> VariantType:
+    return VariantType(argument.DataType.Identifier)
 
 
-def _argument_error(
-    variants: tuple[ua.Variant, ...], arguments: list[Argument]
-) -> tuple[int | None, str]:
-    """Return a status code and a text for wrong arguments of a call; None and "" for right ones.
-
-    Number, types and arrays are checked; only a text may be null.
-    """
-    n = len(variants)
-    if n < len(arguments):
-        return StatusCodes.BadArgumentsMissing, f", got {n} of {len(arguments)} arguments"
-    if n > len(arguments):
-        return StatusCodes.BadTooManyArguments, f", got {n} arguments"
-    for variant, argument in zip(variants, arguments, strict=True):
-        is_null = variant.Value is None
-        is_list = isinstance(variant.Value, list)
-        # Controllers send an empty text as null.
-        may_be_null = variant.VariantType in (VariantType.String, VariantType.Null)
-        if is_null and argument.type is VariantType.String and may_be_null:
-            continue
-        if is_null or variant.VariantType is not argument.type or is_list is not argument.is_array:
-            form = "null" if is_null else f"{variant.VariantType.name}{' array' * is_list}"
-            return StatusCodes.BadInvalidArgument, f", got {argument.name} as {form}"
-    return None, ""
-
-
-def _argument_value(variant: ua.Variant, argument: Argument) -> Any:
-    """Return an argument's value; a null String is an empty one."""
-    if variant.Value is None and argument.type is VariantType.String:
-        return ""
-    return variant.Value
+def _form(variant_type: VariantType, is_array: bool) -> str:
+    """Return a type of arguments, as messages name it."""
+    return f"{variant_type.name}{' array' * is_array}"
 
 
 def _status_code(code: int) -> ua.StatusCode:
     return ua.StatusCode(ua.UInt32(code))
-
-
-def _as_ua_argument(argument: Argument) -> ua.Argument:
-    """Return an argument with its type, array rank and description, as clients see it."""
-    rank = ua.ValueRank.OneDimension if argument.is_array else ua.ValueRank.Scalar
-    dimensions = [0] if argument.is_array else []
-    return ua.Argument(
-        argument.name,
-        ua.NodeId(ua.Int32(argument.type.value)),
-        rank,
-        dimensions,
-        ua.LocalizedText(argument.description),
-    )

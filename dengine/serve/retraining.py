@@ -16,19 +16,14 @@ import os
 import pickle
 import signal
 import threading
-import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from contextlib import contextmanager
-from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-
-from ..errors import log
 
 # Signals that ask a process to end; SIGBREAK is Ctrl-Break on Windows.
 END_SIGNALS = [
@@ -58,14 +53,12 @@ class RetrainingProcess(Executor):
 
     def _start(self) -> None:
         """Start a process, and let it import what a retrain needs; set `ready` to the future of
-        that, and do not wait. The log says when it is ready.
+        that, and do not wait.
         """
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _prepare_process)
         other_processes = set(multiprocessing.active_children())
-        with _signals_blocked():
-            self.ready = self._pool.submit(_warm_up)
-        self.ready.add_done_callback(partial(_log_start, time.monotonic()))
+        self.ready = self._pool.submit(_warm_up)
         (self._process,) = set(multiprocessing.active_children()) - other_processes
 
     def restart(self) -> None:
@@ -95,23 +88,6 @@ class RetrainingProcess(Executor):
         """
         self._process.kill()
         self._pool.shutdown(wait, cancel_futures=cancel_futures)
-
-
-@contextmanager
-def _signals_blocked() -> Iterator[None]:
-    """Block SIGINT and SIGTERM in this thread, so that a process started inside inherits the block.
-
-    Ctrl-C signals all processes of a terminal. The retraining process must outlive the signal,
-    since the server ends it in order. On Windows it does nothing.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # on Windows `_prepare_process` ignores them
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class _SharedPickle:
@@ -169,14 +145,14 @@ def _prepare_process() -> None:
     """Prepare the retraining process, in which this runs first: it ends with its parent.
 
     The process ends even during a call into C++, and at once if the parent has ended already. Where
-    that can be set, it leaves one of several cores to decisions and has a lower priority. On
-    Windows it ignores the ending signals.
+    that can be set, it leaves one of several cores to decisions and has a lower priority. It
+    ignores the ending signals: Ctrl-C signals all processes of a terminal, and the server ends this
+    process in order.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned
-    if not hasattr(signal, "pthread_sigmask"):  # Windows, where `_signals_blocked` blocks nothing
-        for number in END_SIGNALS:
-            signal.signal(number, signal.SIG_IGN)
+    for number in END_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     if hasattr(os, "sched_setaffinity"):  # Linux
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent.pid:  # the parent ended before that
@@ -188,17 +164,6 @@ def _prepare_process() -> None:
         threading.Thread(target=lambda: (wait([parent.sentinel]), os._exit(1)), daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(NICENESS)
-
-
-def _log_start(began: float, started: Future[None]) -> None:
-    """Log how many seconds the process took to start, unless it failed; called when it is ready.
-
-    `began` is the monotonic time of the start.
-    """
-    if not started.cancelled() and started.exception() is None:
-        log.info(
-            "ready to retrain, in a process of its own, after %.1f s", time.monotonic() - began
-        )
 
 
 def _warm_up() -> None:

@@ -13,11 +13,13 @@ or an unavailable store is "verify" or False. Only the caller's errors (a wrong 
 under a used id) are faults.
 """
 
+from __future__ import annotations
+
 import asyncio
 import uuid
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +38,9 @@ from ..errors import (
 from ..records import ACTIONS, Action, Decision, TraceArray, as_id
 from .api import as_samples
 from .service import CellService
+
+if TYPE_CHECKING:
+    from ..cells.ur.recorder import RtdeRecorder
 
 RECORD_SECONDS = 1.0  # for a recording to be complete after the insertion
 MAX_PARTS = 8  # parts whose pieces of a trace are kept; the oldest is given up for one more
@@ -59,37 +64,21 @@ Struct = dict[str, Any]
 Call = Callable[..., Awaitable[Any]]
 
 
-class Recorder(Protocol):
-    """Cuts insertions out of the signals that a robot sends, as `RtdeRecorder` does. Its methods
-    may block.
-    """
-
-    def arm(self) -> None:
-        """Wait for an insertion from now on; a recording that was not fetched is dropped."""
-
-    def record(self, timeout: float) -> Any:
-        """Return the next insertion; raise an error after `timeout` seconds.
-
-        Its `trace` has shape (T,) or (C, T), with NaN for missing samples.
-        """
-
-
 class RobotCalls:
     """The methods that a robot's program can call, on one service.
 
     Parameters
     ----------
     service : CellService
-    recorder : Recorder, optional
+    recorder : RtdeRecorder, optional
         Records the traces for `decide_recorded`, which needs it.
     """
 
-    def __init__(self, service: CellService, recorder: Recorder | None = None) -> None:
+    def __init__(self, service: CellService, recorder: RtdeRecorder | None = None) -> None:
         self._service = service
         self._recorder = recorder
         self._pieces: OrderedDict[str, list[TraceArray]] = OrderedDict()
         self._armed: str | None = None  # id of the part that is recorded
-        self._recording: Any = None  # of that part, if its decision could not be recorded
         self._recorder_lock = asyncio.Lock()
 
     def table(self) -> dict[str, Call]:
@@ -128,7 +117,6 @@ class RobotCalls:
         if self._recorder is not None:
             async with self._recorder_lock:
                 self._armed = None
-                self._recording = None
                 try:
                     await asyncio.to_thread(self._recorder.arm)
                     self._armed = id_
@@ -229,10 +217,10 @@ class RobotCalls:
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
         """Decide on the insertion since `begin`, as recorded.
 
-        It waits up to `RECORD_SECONDS` for the recording. One call uses the recording up; but after
-        the result "busy" the call can be repeated. A part that has a decision gets it again. Only
-        the part of the newest `begin` has a recording. Without a recording the result is verify,
-        with an id "" and the reason "not_recorded"; nothing is stored then.
+        It waits up to `RECORD_SECONDS` for the recording, which one call uses up. A part that has a
+        decision gets it again. Only the part of the newest `begin` has a recording. Without a
+        recording the result is verify, with an id "" and the reason "not_recorded"; nothing is
+        stored then.
 
         Parameters
         ----------
@@ -265,20 +253,13 @@ class RobotCalls:
             # Another part was begun, or the server was restarted meanwhile.
             if id_ is None or id_ != self._armed:
                 return _unrecorded_verify(NOT_RECORDED)
-            recording = self._recording
-            self._recording = None
             self._armed = None
-            if recording is None:
-                try:
-                    recording = await asyncio.to_thread(self._recorder.record, RECORD_SECONDS)
-                except (DengineError, OSError) as error:
-                    log.warning("no recording of %s: %s", shortened(id_), error)
-                    return _unrecorded_verify(NOT_RECORDED)
-            result = await self.decide_array(recording.trace, id_, part)
-            if not result["id"]:  # the call can be repeated
-                self._armed = id_
-                self._recording = recording
-            return result
+            try:
+                recording = await asyncio.to_thread(self._recorder.record, RECORD_SECONDS)
+            except (DengineError, OSError) as error:
+                log.warning("no recording of %s: %s", shortened(id_), error)
+                return _unrecorded_verify(NOT_RECORDED)
+            return await self.decide_array(recording.trace, id_, part)
 
     async def action(self, trace: Any, request: Any, part: Any = "") -> int:
         """Return only the action of `decide` (0 verify, 1 accept, 2 reject), for a controller

@@ -4,6 +4,8 @@ engine, signals and log, and its orderly end.
 It puts the engine's service, the HTTP application and uvicorn together.
 """
 
+from __future__ import annotations
+
 import json
 import logging
 import signal
@@ -14,33 +16,34 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
-from dataclasses import dataclass
-from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 import uvicorn
 
 from ..engine.engine import DataEngine
 from ..engine.garbage import frozen_objects
 from ..errors import SettingError, instead, log, without_password
-from .auth import Access, host_in_url, is_loopback, read_tokens
-from .connections import Connection
+from .auth import host_in_url, is_loopback, read_tokens
 from .http import Beside, create_app
 from .retraining import END_SIGNALS, RetrainingProcess
-from .robot_calls import Recorder
 from .service import CellService
+
+if TYPE_CHECKING:
+    from ..cells.ur.recorder import RtdeRecorder
 
 KEEP_ALIVE = 75  # seconds that a connection may be idle: a robot's next part comes in this time
 GRACE = 5  # seconds for requests under way when the server ends
+MAX_CONNECTIONS = 500  # a process may usually have 1,024 open files
 # Seconds after which a thread gives Python's lock to a waiting one. A robot may wait for either of
 # the server's two threads.
 SWITCH_INTERVAL = 0.0005
 # uvicorn writes no log of its own, trusts no proxy's headers and serves no web sockets.
 UVICORN_OPTIONS: dict[str, Any] = {
-    "http": Connection,
+    "http": "h11",  # refuses a head of more than 16 KiB; httptools limits none
+    "limit_concurrency": MAX_CONNECTIONS,
     "timeout_keep_alive": KEEP_ALIVE,
     "timeout_graceful_shutdown": GRACE,
     "loop": "auto",  # uvloop if that is installed
@@ -55,143 +58,51 @@ UVICORN_OPTIONS: dict[str, Any] = {
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as one line for machines: time, level, logger, and the message as JSON.
+    """Formats a record as one line for machines: time, level, logger, and as JSON the message.
 
-    Passwords of database URLs are masked.
+    A traceback follows the message in the same text. Passwords of database URLs are masked.
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return a record as one line: time in UTC, level, logger, and as JSON texts the message
-        and an exception's traceback, with passwords masked.
-        """
-        utc = datetime.fromtimestamp(record.created, UTC)
-        time = utc.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        message = f"message={json.dumps(without_password(record.getMessage()))}"
-        if record.exc_info:
-            traceback = without_password(self.formatException(record.exc_info))
-            message += f" raised={json.dumps(traceback)}"
-        return f"{time} level={record.levelname.lower()} logger={record.name} {message}"
+        """Return a record as one line."""
+        text = json.dumps(without_password(super().format(record)))
+        time = self.formatTime(record)
+        return f"{time} level={record.levelname.lower()} logger={record.name} message={text}"
 
 
-@contextmanager
-def log_lines_to(stream: TextIO) -> Iterator[None]:
-    """Write the logs of all libraries to a stream, a line each, until the block ends.
+def log_lines() -> None:
+    """Write the logs of all libraries to stderr, a line each, in place of all earlier handlers.
 
-    dengine's own are written from INFO on, others from their level on. The root logger's handlers
-    get none meanwhile, and are put back.
+    dengine's own are written from INFO on, others from their level on.
     """
-    handler = logging.StreamHandler(stream)
+    handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter())
-    root = logging.getLogger()
-    handlers = root.handlers[:]
-    level = log.level
-    root.handlers[:] = [handler]
+    logging.basicConfig(handlers=[handler], force=True)
     log.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        root.handlers[:] = handlers
-        log.setLevel(level)
-
-
-@dataclass(frozen=True, kw_only=True)
-class ServerOptions:
-    """The options of `dengine serve` that are not the engine's, under their names.
-
-    Attributes
-    ----------
-    host : str
-        Address to listen on.
-    port : int
-        0: any free one.
-    token_file : path or None
-        None: no request needs a token, and only this machine reaches the server.
-    cert, key : path or None
-        PEM files for TLS, both or none.
-    allow_hosts : sequence of str
-        Further names by which clients may call the server.
-    deadline : float
-        Seconds that a decision may wait in the queue.
-    check_seconds : float
-        Duration of a verification.
-    largest : int
-        Bytes of a request.
-    opcua : int or None
-        Port of OPC UA; None: off.
-    opcua_cert, opcua_key : path or None
-        None: `cert` and `key`.
-    xmlrpc, page : bool
-        Whether they are served beside HTTP.
-    """
-
-    host: str
-    port: int
-    token_file: Path | None
-    cert: Path | None
-    key: Path | None
-    allow_hosts: Sequence[str]
-    deadline: float
-    check_seconds: float
-    largest: int
-    opcua: int | None
-    opcua_cert: Path | None
-    opcua_key: Path | None
-    xmlrpc: bool
-    page: bool
-
-    @property
-    def access(self) -> Access:
-        """What the server allows; each access reads the token file again.
-
-        Beside `allow_hosts`, the address and this machine's name may be used to call a server that
-        other machines reach.
-
-        Raises SettingError for a token file that cannot be used, and for an address that other
-        machines can reach without one.
-        """
-        if self.token_file is None and not is_loopback(self.host):
-            raise SettingError(
-                f"Expected --token-file FILE, for {self.host} is reached from other machines; or "
-                "--host 127.0.0.1."
-            )
-        tokens = () if self.token_file is None else read_tokens(self.token_file)
-        own_names = () if is_loopback(self.host) else (self.host, socket.gethostname())
-        return Access(tokens, (*own_names, *self.allow_hosts), self.largest)
-
-    def started_beside(self, access: Access) -> list[Beside]:
-        """Return the OPC UA server, as `create_app` starts it, in a list; an empty one if it is
-        off.
-
-        The operators' tokens are its passwords; a viewer's token is none, since whoever may read
-        over OPC UA may also call.
-        """
-        if self.opcua is None:
-            return []
-        from .opcua import opcua_server
-
-        secrets = [token.secret for token in access.tokens if token.operates]
-        start = partial(
-            opcua_server,
-            port=self.opcua,
-            host=self.host,
-            tokens=secrets if access.tokens else None,
-            cert=self.opcua_cert or self.cert,
-            key=self.opcua_key or self.key,
-        )
-        return [start]
 
 
 def serve(
     make: Callable[[Executor], DataEngine],
     store: str | None,
     say: Callable[[str], object],
-    options: ServerOptions,
     beside: Sequence[Beside] = (),
-    recorder: Callable[[], AbstractContextManager[Recorder | None]] = nullcontext,
+    recorder: Callable[[], AbstractContextManager[RtdeRecorder | None]] = nullcontext,
+    *,
+    host: str,
+    port: int,
+    token_file: Path | None,
+    cert: Path | None,
+    key: Path | None,
+    deadline: float,
+    check_seconds: float,
+    opcua: int | None,
+    opcua_cert: Path | None,
+    opcua_key: Path | None,
 ) -> None:
     """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
-    Then the requests in the queue are answered, and the engine is closed. Logs go to stderr.
+    Then the requests in the queue are answered, and the engine is closed. Logs go to stderr, a line
+    each, also after the end.
 
     Parameters
     ----------
@@ -201,12 +112,27 @@ def serve(
         The store's name, for a second connection that only reads; None: a store in memory.
     say : callable
         Called with a line that says where the server listens, once it does.
-    options : ServerOptions
     beside : sequence of callable
         Called with the service, each returns an async context that lasts as long as the server; one
         that fails to start ends it, and its error is raised.
     recorder : callable
         Opens the recorder of a robot's insertions, or gives None.
+    host : str
+        Address to listen on.
+    port : int
+        0: any free one.
+    token_file : path or None
+        None: no request needs a token, and only this machine may reach the server.
+    cert, key : path or None
+        PEM files for TLS, both or none.
+    deadline : float
+        Seconds that a decision may wait in the queue.
+    check_seconds : float
+        Duration of a verification.
+    opcua : int or None
+        Port of OPC UA; None: off.
+    opcua_cert, opcua_key : path or None
+        None: `cert` and `key`.
 
     Raises
     ------
@@ -216,31 +142,40 @@ def serve(
     DengineError
         What `make` or `recorder` raises.
     """
-    access = options.access
-    tls = _tls_options(options.cert, options.key)
-    beside = [*beside, *options.started_beside(access)]
+    if token_file is None and not is_loopback(host):
+        raise SettingError(
+            f"Expected --token-file FILE, for {host} is reached from other machines; or "
+            "--host 127.0.0.1."
+        )
+    tokens = () if token_file is None else read_tokens(token_file)
+    tls = _tls_options(cert, key)
+    if opcua is not None:
+        from .opcua import opcua_server
+
+        # A viewer's token is no password: whoever may read over OPC UA may also call.
+        secrets = [token.secret for token in tokens if token.operates]
+        start = partial(
+            opcua_server,
+            port=opcua,
+            host=host,
+            tokens=secrets if tokens else None,
+            cert=opcua_cert or cert,
+            key=opcua_key or key,
+        )
+        beside = [*beside, start]
+    log_lines()
     with (
-        listening_socket(options.host, options.port) as listening,
-        log_lines_to(sys.stderr),
+        listening_socket(host, port) as listening,
         RetrainingProcess() as executor,
         recorder() as opened_recorder,
     ):
-        service = CellService(
-            lambda: make(executor), store, options.deadline, check_seconds=options.check_seconds
-        )
+        service = CellService(lambda: make(executor), store, deadline, check_seconds=check_seconds)
         with closing(service):
-            app = create_app(
-                service,
-                access,
-                xmlrpc=options.xmlrpc,
-                page=options.page,
-                beside=beside,
-                recorder=opened_recorder,
-            )
+            app = create_app(service, tokens, beside=beside, recorder=opened_recorder)
             config = uvicorn.Config(app, **UVICORN_OPTIONS | tls)
             scheme = "https" if tls else "http"
-            address = f"{scheme}://{host_in_url(options.host)}:{listening.getsockname()[1]}"
-            audience = "" if access.tokens else ", to this machine alone"
+            address = f"{scheme}://{host_in_url(host)}:{listening.getsockname()[1]}"
+            audience = "" if tokens else ", to this machine alone"
             line = f"{service.engine.store.cell_id} is served at {address}{audience}."
             server = CellServer(config, service, lambda: say(line))
             try:
@@ -353,18 +288,14 @@ def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
         return {}
     if cert is None or key is None:
         raise SettingError("Expected --cert and --key together, got one of them.")
-
-    def refuse_password() -> str:
-        """Raise SettingError when OpenSSL asks for the key's password."""
-        raise SettingError(
-            f"Expected a key without a password, {key} has one; protect the file instead: "
-            f"chmod 600 {key}"
-        )
-
-    # OSError includes ssl.SSLError.
-    with instead(SettingError, f"Cannot use {cert} and {key} for TLS", OSError):
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.load_cert_chain(cert, key, refuse_password)
+    # OSError includes ssl.SSLError. Without a password OpenSSL would ask the terminal for one.
+    with instead(
+        SettingError,
+        f"Cannot use {cert} and {key} for TLS",
+        OSError,
+        do="use PEM files, and a key without a password",
+    ):
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(cert, key, password="none")
     return {"ssl_certfile": str(cert), "ssl_keyfile": str(key)}
 
 

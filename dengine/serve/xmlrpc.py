@@ -6,10 +6,12 @@ code and one line of text; only what is not XML-RPC at all gets 405 or 415. defu
 XML: no document type, no entity, nothing from outside.
 """
 
+from __future__ import annotations
+
 import asyncio
 import xmlrpc.client
 from inspect import signature
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from defusedxml.xmlrpc import DefusedExpatParser  # type: ignore[import-untyped]
 from starlette.requests import Request
@@ -19,22 +21,11 @@ from starlette.routing import Route
 from ..errors import DengineError, ReportError, as_options, log
 from .api import media_type
 from .auth import RPC
-from .robot_calls import Call, Recorder, RobotCalls, one_line
+from .robot_calls import Call, RobotCalls, one_line
 from .service import CellService
 
-SMALL_BODY = 1 << 16  # bytes; a larger call is parsed in a thread
-TAGS = (
-    "int",
-    "i4",
-    "double",
-    "boolean",
-    "string",
-    "base64",
-    "array",
-    "value",
-    "params",
-    "methodName",
-)
+if TYPE_CHECKING:
+    from ..cells.ur.recorder import RtdeRecorder
 
 # Codes of faults. Negative ones are those that XML-RPC servers agreed on.
 NOT_XML = -32700
@@ -48,11 +39,10 @@ NO_REPORT = 2  # a report that does
 def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
     """Return the method's name and the arguments of an XML-RPC call.
 
-    Arguments are numbers, booleans, texts, bytes and lists. Raises ValueError for anything else,
-    and for XML that is malformed or has a document type.
+    The arguments are of any type that XML-RPC has. Raises ValueError for XML that is no call, is
+    malformed, or has a document type.
     """
     values: Any = xmlrpc.client.Unmarshaller(use_builtin_types=True)
-    values.dispatch = {name: values.dispatch[name] for name in TAGS}
     parser = DefusedExpatParser(values, forbid_dtd=True)
     try:
         parser.feed(body)
@@ -67,13 +57,13 @@ def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
     return name, arguments
 
 
-def routes(service: CellService, recorder: Recorder | None = None) -> list[Route]:
+def routes(service: CellService, recorder: RtdeRecorder | None = None) -> list[Route]:
     """Return a list with the route of POST /RPC2, which calls the methods of `RobotCalls`.
 
     Parameters
     ----------
     service : CellService
-    recorder : Recorder, optional
+    recorder : RtdeRecorder, optional
         Of the traces for `decide_recorded`; the caller closes it.
 
     Returns
@@ -83,14 +73,9 @@ def routes(service: CellService, recorder: Recorder | None = None) -> list[Route
     calls = RobotCalls(service, recorder).table()
 
     async def rpc(request: Request) -> Response:
-        """Respond to an XML-RPC call with a value or a fault as XML.
-
-        Another media type or a compressed body gets 415.
-        """
+        """Respond to a call with a value or a fault as XML; another media type gets 415."""
         if media_type(request) not in ("text/xml", "application/xml"):
             return PlainTextResponse("Expected an XML-RPC call, Content-Type: text/xml.\n", 415)
-        if request.headers.get("content-encoding", "identity") != "identity":
-            return PlainTextResponse("Expected a call that is not compressed.\n", 415)
         xml = await call_method(calls, await request.body())
         return Response(xml, media_type="text/xml")
 
@@ -104,10 +89,7 @@ async def call_method(calls: dict[str, Call], body: bytes) -> bytes:
     of the method become faults. An unexpected error is logged.
     """
     try:
-        if len(body) <= SMALL_BODY:
-            name, arguments = parse_call(body)
-        else:
-            name, arguments = await asyncio.to_thread(parse_call, body)
+        name, arguments = await asyncio.to_thread(parse_call, body)
     except ValueError as error:
         return fault(NOT_XML, str(error))
     if name not in calls:

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
 
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Decision, TraceSpec, load_exported
+from dengine import Action, DataEngine, Dataset, Decision, TraceSpec
 from dengine.store.records import KEEP
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
@@ -40,7 +39,7 @@ try:
     from axe_playwright_python.sync_playwright import Axe
     from playwright.sync_api import Browser, Error, Page, expect, sync_playwright
 
-    from dengine.serve.auth import Access, Token
+    from dengine.serve.auth import Token
     from dengine.serve.http import create_app
     from dengine.serve.service import CellService
 except ImportError as error:
@@ -221,7 +220,7 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(
 
 
 @pytest.mark.slow
-def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path: Path) -> None:
+def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell) -> None:
     with_a_model(page, demo)
     opened(page, demo, "actions")
     begun = "The retrain has begun."
@@ -233,17 +232,9 @@ def test_every_action_is_done_and_recorded(page: Page, demo: DemoCell, tmp_path:
     expect(page.locator("#result")).to_have_text(begun)
     confirmed(page, "Roll back")
     confirmed(page, "Release the version")
-    page.get_by_role("button", name="Export").click()
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Do it").click()
-    download.value.save_as(tmp_path / "model.zip")
-    with ZipFile(tmp_path / "model.zip") as archive:
-        archive.extractall(tmp_path)
     with demo.store() as store:
         done = {event.kind for event in store.events.newest(20) if event.author == "Robin"}
-        trace = store.decisions.get(store.decisions.select(HistoryFilter(), 1)[0].decision.id).trace
-    assert done == {"retrain", "rollback", "release", "export"}
-    assert load_exported(tmp_path / "model.ts").decide(trace).action in Action
+    assert done == {"retrain", "rollback", "release"}
 
 
 @pytest.mark.slow
@@ -324,8 +315,7 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
     tokens = Token("a-viewer-s-password", False, "Line display"), Token(TOKEN, True, "Kim")
     file = tmp_path / "cell.db"
     trace = TraceSpec(60, rate_hz=500.0)  # which limits in seconds need
-    access = Access(tokens)
-    with a_service(file, trace=trace) as service, served(create_app(service, access)) as port:
+    with a_service(file, trace=trace) as service, served(create_app(service, tokens)) as port:
         demo, part = DemoCell(f"http://127.0.0.1:{port}", file), played(service, stream).part
         with (
             pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"),

@@ -99,7 +99,7 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
         "conv", radius=0.05, retrain_every=20, budget=3.0
     )  # seconds: so that a retrain is met
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with started(tmp_path, "--no-page", "--recipe", "recipe.toml") as process:
+    with started(tmp_path, "--recipe", "recipe.toml") as process:
         robots = Robots(process.ask, parts)
         threads = robots.start()
         until(lambda: process.ask("/status")["retraining"])
@@ -129,7 +129,7 @@ def test_a_server_that_is_killed_leaves_no_retraining_process_behind(
 ) -> None:
     recipe = Recipe("conv", retrain_every=20, budget=300.0, max_steps=10**6)
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with started(tmp_path, "--no-page", "--recipe", "recipe.toml", wait=at_work) as process:
+    with started(tmp_path, "--recipe", "recipe.toml", wait=at_work) as process:
         if at_work:
             threads = Robots(process.ask, parts).start(1)
             until(lambda: process.ask("/status")["retraining"])
@@ -193,7 +193,7 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
     program = Insertions()
     with FakeController(program) as fake:
         robot_at = ("--robot", f"127.0.0.1:{fake.port}", "--samples", str(SAMPLES))
-        with started(tmp_path, "--no-page", "--reducer", "pca", *robot_at) as process:
+        with started(tmp_path, "--reducer", "pca", *robot_at) as process:
             robot = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{process.port}/RPC2")
             for i in range(2):
                 answer = inserted(robot, program, parts.X[i])

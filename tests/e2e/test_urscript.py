@@ -20,7 +20,6 @@ import pytest
 pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
 
 from dengine import Action, Dataset
-from dengine.serve.auth import Access
 from dengine.serve.http import create_app
 from dengine.store.views import HistoryFilter
 from tests.support.serving import PushedTraces, a_service, busy_engine, served
@@ -106,10 +105,10 @@ class Handle(xmlrpc.client.ServerProxy):
 @pytest.fixture
 def cell(tmp_path: Path) -> Iterator[SimpleNamespace]:
     """A server at a port of its own, its service, and its recorder."""
-    recorder, access = PushedTraces(), Access()
+    recorder = PushedTraces()
     with (
         a_service(tmp_path / "cell.db") as service,
-        served(create_app(service, access, recorder=recorder)) as port,
+        served(create_app(service, recorder=recorder)) as port,
     ):
         yield SimpleNamespace(service=service, recorder=recorder, port=port)
 

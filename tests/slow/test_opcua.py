@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -111,35 +112,56 @@ async def test_a_plc_decides_and_reports_and_a_scada_sees_it(plant: Plant, strea
     assert (match.decision.part, np.array_equal(match.trace[0], stream.X[7])) == ("P7", True)
 
 
-async def test_the_variables_and_methods_are_as_they_are_described_and_read_only(
-    plant: Plant,
+UA = "{http://opcfoundation.org/UA/2011/03/UANodeSet.xsd}"
+ARGUMENTS = {  # of each method in the file's order: its arguments, then its results
+    "Decide": [
+        [("Trace", FLOAT, 1), ("Channels", COUNT, -1), ("Request", TEXT, -1), ("Part", TEXT, -1)],
+        [
+            ("Action", ua.VariantType.Int32, -1),
+            ("Id", TEXT, -1),
+            ("Reason", TEXT, -1),
+            ("Lower", ua.VariantType.Double, -1),
+            ("Upper", ua.VariantType.Double, -1),
+            ("ModelVersion", COUNT, -1),
+        ],
+    ],
+    "Report": [
+        [("Id", TEXT, -1), ("Success", ua.VariantType.Boolean, -1)],
+        [("Kept", ua.VariantType.Boolean, -1)],
+    ],
+}
+
+
+async def test_the_variables_and_methods_are_as_the_file_and_the_page_describe_them_and_read_only(
+    plant: Plant, repo: Path
 ) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "howto" / "plc_and_robot.md").read_text(
-        encoding="utf-8"
-    )
-    for name, (type_, _, text) in opcua.VARIABLES.items():
-        node = plant.node(f"Cell.{name}")
+    page = (repo / "docs" / "howto" / "plc_and_robot.md").read_text(encoding="utf-8")
+    file = ElementTree.parse(Path(opcua.__file__).with_name("cell.xml"))
+    variables = {
+        item.get("NodeId").removeprefix("ns=1;s=Cell."): item
+        for item in file.iter(f"{UA}UAVariable")
+        if item.get("DataType") != "Argument"
+    }
+    assert set(variables) == {*opcua.STATUS_NAMES, "LastRefused"}
+    for name, item in variables.items():
+        node, text = plant.node(f"Cell.{name}"), item.findtext(f"{UA}Description")
+        type_ = ua.VariantType[item.get("DataType")]
         assert await node.read_data_type_as_variant_type() is type_, name
         assert (await node.read_data_value()).Value.VariantType is type_, name
         assert (await node.read_description()).Text == text
-        assert f"| `Cell.{name}` | {type_.name} | {text} |" in page
+        assert f"| `Cell.{name}` | {type_.name} | " in page
         with pytest.raises(ua.UaStatusCodeError):
             await node.write_value(await node.read_value())
     with pytest.raises(ua.UaStatusCodeError):
         await plant.client.nodes.objects.add_folder(plant.index, "mine")
-    for method, taken, given in (
-        ("Decide", opcua.DECIDE_ARGUMENTS, opcua.DECIDE_RESULTS),
-        ("Report", opcua.REPORT_ARGUMENTS, opcua.REPORT_RESULTS),
-    ):
+    for method, (taken, given) in ARGUMENTS.items():
         for name, arguments in (("InputArguments", taken), ("OutputArguments", given)):
             node = await plant.node(f"Cell.{method}").get_child(f"0:{name}")
-            texts = [
-                (item.Name, item.DataType.Identifier, item.ValueRank)
-                for item in await node.read_value()
+            items = await node.read_value()
+            assert [(item.Name, item.DataType.Identifier, item.ValueRank) for item in items] == [
+                (name, type_.value, rank) for name, type_, rank in arguments
             ]
-            assert texts == [
-                (name, type_.value, 1 if array else -1) for name, type_, array, _ in arguments
-            ]
+            assert all(item.Description.Text for item in items)
 
 
 @pytest.mark.parametrize("empty", [None, ""])
@@ -187,18 +209,18 @@ SOUND = {
     "Part": ua.Variant("", TEXT),
 }
 WRONG = [  # an argument, its value and type, and the end of what is said of it
-    ("Trace", [1.0] * 60, "Double", "got Trace as Double array."),
-    ("Trace", 1.0, "Float", "got Trace as Float."),
-    ("Trace", None, "Null", "got Trace as null."),
+    ("Trace", [1.0] * 60, "Double", "got Double array, UInt32, String, String."),
+    ("Trace", 1.0, "Float", "got Float, UInt32, String, String."),
+    ("Trace", None, "Null", "got String, UInt32, String, String."),
     ("Trace", [1.0] * 10, "Float", ""),
-    ("Channels", 1, "Int32", "got Channels as Int32."),
-    ("Channels", [1], "UInt32", "got Channels as UInt32 array."),
-    ("Channels", None, "Null", "got Channels as null."),
+    ("Channels", 1, "Int32", "got Float array, Int32, String, String."),
+    ("Channels", [1], "UInt32", "got Float array, UInt32 array, String, String."),
+    ("Channels", None, "Null", "got Float array, String, String, String."),
     ("Channels", 2, "UInt32", ""),  # two channels of a cell of one
-    ("Request", ["a"], "String", "got Request as String array."),
-    ("Request", b"a", "ByteString", "got Request as ByteString."),
+    ("Request", ["a"], "String", "got Float array, UInt32, String array, String."),
+    ("Request", b"a", "ByteString", "got Float array, UInt32, ByteString, String."),
     ("Request", "a\nb", "String", ""),
-    ("Part", True, "Boolean", "got Part as Boolean."),
+    ("Part", True, "Boolean", "got Float array, UInt32, String, Boolean."),
 ]
 
 
@@ -219,8 +241,9 @@ async def test_a_wrong_argument_is_a_bad_status_and_named(
 async def test_a_call_with_too_few_arguments_or_no_bool_for_a_label_is_a_bad_status(
     plant: Plant,
 ) -> None:
-    with pytest.raises(ua.uaerrors.BadArgumentsMissing):
+    with pytest.raises(ua.uaerrors.BadInvalidArgument):
         await plant.call("Decide")
+    assert (await plant.value("LastRefused")).endswith("Part (String), got none.")
     with pytest.raises(ua.uaerrors.BadInvalidArgument):
         await plant.call("Report", ua.Variant("order-1", TEXT), ua.Variant(1, ua.VariantType.Int32))
 

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -50,18 +49,17 @@ def a_service(
 
 
 @contextmanager
-def served(app: Any, port: int = 0, **limits: Any) -> Iterator[int]:
+def served(app: Any, port: int = 0, **options: Any) -> Iterator[int]:
     """An application in a thread of this process, as `dengine serve` has it; gives its port.
 
-    limits : of `Connection`.
+    options : of uvicorn, in place of those of `dengine serve`.
     """
     import uvicorn
 
-    from dengine.serve.connections import Connection
     from dengine.serve.server import UVICORN_OPTIONS, listening_socket
 
-    options = {"http": partial(Connection, **limits), "timeout_graceful_shutdown": 1}
-    server = uvicorn.Server(uvicorn.Config(app, **UVICORN_OPTIONS | options))
+    own = UVICORN_OPTIONS | {"timeout_graceful_shutdown": 1}
+    server = uvicorn.Server(uvicorn.Config(app, **own | options))
     with listening_socket("127.0.0.1", port) as listening:
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()

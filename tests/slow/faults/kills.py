@@ -125,7 +125,7 @@ def serving(place: Place, told: str, seed: int) -> None:
         service = CellService(
             lambda: DataEngine.open_or_create(place.store(), recipe=SOON, executor=pool)
         )
-        with closing(service), served(create_app(service, page=False)) as port:
+        with closing(service), served(create_app(service)) as port:
             _acknowledge(
                 told,
                 "began",

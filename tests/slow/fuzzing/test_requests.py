@@ -20,10 +20,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("uvicorn", reason="the server needs the extra `serve`")
 
-from msgspec.msgpack import encode
-
 from dengine import DataEngine, TraceSpec
-from dengine.serve.auth import Access
 from dengine.serve.http import create_app
 from dengine.serve.service import CellService
 from dengine.store.views import HistoryFilter
@@ -32,12 +29,7 @@ from tests.support.serving import served
 
 from .damage import SAMPLES, nested, spoilt, tries
 
-JSON, RAW, PACK, XML = (
-    "application/json",
-    "application/octet-stream",
-    "application/msgpack",
-    "text/xml",
-)
+JSON, RAW, XML = "application/json", "application/octet-stream", "text/xml"
 GOOD = [float(i % 7) for i in range(SAMPLES)]
 PATHS = """/decide /report /status /decisions /decisions/x /metrics /healthz /docs /RPC2 /RPC2/wrong /me / /explanations/
 /explanations/known-0 /course /embedding /versions /events?limit= /status?last= /correct /forget /rollback /policy /retrain
@@ -84,6 +76,7 @@ def request(
         "Host: localhost",
         f"Content-Type: {content}",
         f"Content-Length: {len(body)}",
+        "Connection: close",
     )
     return "\r\n".join([*lines, *heads, "", ""]).encode("utf-8", "replace") + body
 
@@ -146,22 +139,12 @@ KINDS = {
             ]
         ),
     ),
-    "MessagePack": only(
-        asked.map(lambda result: encode(json.loads(json.dumps(result), parse_int=float))), PACK
-    )
-    | only(sound.map(encode).flatmap(spoilt) | st.binary(max_size=50), PACK)
-    | only(
-        st.sampled_from(
-            [b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\x91" * 5000, b"\xc1"]
-        ),
-        PACK,
-    ),
     "XML-RPC": only(st.builds(call, names, st.lists(simple, max_size=4)), XML, "/RPC2")
     | only(st.sampled_from(ODD_XML).map(str.encode), XML, "/RPC2")
     | only(ids.map(lambda id_: call("decide", (GOOD, id_))).flatmap(spoilt), XML, "/RPC2"),
     "an action": st.builds(
         lambda path, body: request(body, path, JSON, "POST", "Origin: http://localhost"),
-        st.sampled_from(["/correct", "/forget", "/rollback", "/policy", "/retrain", "/export"]),
+        st.sampled_from(["/correct", "/forget", "/rollback", "/policy", "/retrain"]),
         st.dictionaries(
             st.sampled_from(["id", "ids", "success", "version", "alpha", "guarantee"]),
             nested,
@@ -179,7 +162,7 @@ KINDS = {
         st.sampled_from(METHODS),
     )
     | st.sampled_from(HEADS.split("|")).map(
-        lambda head: request(b"{}", "/decide", JSON, "POST", head)
+        lambda head: request(b"{}\r\n", "/decide", JSON, "POST", head)
     ),
     "no HTTP": st.binary(min_size=1, max_size=3000)
     | st.integers(1, len(framed) - 1).map(lambda n: framed[:n])
@@ -197,13 +180,14 @@ class Cell:
         self.before = self.decisions()
         self.probes = self.probed("before")
 
-    def send(self, sent: bytes) -> bytes:
-        """What it answers until it closes; who sends no more is waited for by nobody."""
+    def send(self, sent: bytes, ended: bool = False) -> bytes:
+        """What it answers until it closes.  ended : no more is sent, so that it waits for no rest."""
         with socket.create_connection(("127.0.0.1", self.port), timeout=60) as connection:
             text = b""
             try:
                 connection.sendall(sent)
-                connection.shutdown(socket.SHUT_WR)
+                if ended:
+                    connection.shutdown(socket.SHUT_WR)
                 while piece := connection.recv(65536):
                     text += piece
             except ConnectionError:  # it was refused before all was sent
@@ -242,18 +226,19 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
     """
     file = tmp_path_factory.mktemp("cell") / "cell.db"
     learned(file)
-    with closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service:
-        app = create_app(service, Access(body_seconds=0.2))
-        with served(app, head_seconds=0.3) as port:
-            created = Cell(service, port)
-            yield created
-            assert b'"ok"' in created.send(request(b"", "/healthz", JSON, "GET"))
-            assert created.probed("after") == created.probes
-            after = created.decisions()
-            assert {id_: after[id_] for id_ in created.before} == created.before
-            probes = 2 * len(created.probes)
-            assert len(after) - len(created.before) - probes <= created.found["taken"]
-            assert created.found["refused"] > created.found["taken"]
+    with (
+        closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service,
+        served(create_app(service)) as port,
+    ):
+        created = Cell(service, port)
+        yield created
+        assert b'"ok"' in created.send(request(b"", "/healthz", JSON, "GET"))
+        assert created.probed("after") == created.probes
+        after = created.decisions()
+        assert {id_: after[id_] for id_ in created.before} == created.before
+        probes = 2 * len(created.probes)
+        assert len(after) - len(created.before) - probes <= created.found["taken"]
+        assert created.found["refused"] > created.found["taken"]
 
 
 def learned(file: Path) -> None:
@@ -274,7 +259,9 @@ def test_a_malformed_request_is_answered_and_changes_nothing(
     cell: Cell, kind: str, data: st.DataObject
 ) -> None:
     sent = data.draw(KINDS[kind])
-    text = cell.send(sent)
+    text = cell.send(sent, ended=kind == "no HTTP")
+    if kind == "no HTTP" and not text:  # it ended in the midst of a request
+        return
     status = re.match(rb"HTTP/1\.1 (\d{3}) ", text)
     assert status is not None, "the connection was closed without an answer"
     assert status[1][:1] in b"24", text

@@ -67,13 +67,8 @@ async function submit(event) {
   }
 }
 
-// Return the text about a response; a file is downloaded.
+// Return the text about a response.
 async function resultText(response) {
-  const file = response.headers.get("content-disposition");
-  if (file) {
-    download(await response.blob(), file.match(/filename="([\w.]+)"/)[1]);
-    return "The file was downloaded.";
-  }
   const data = await response.json();
   return current.resultText ? current.resultText(data) : data.text;
 }
@@ -128,7 +123,6 @@ export const rollback = (versions) => ({
 export const release = { title: "Release the version", explanation: "The next retrain may replace the model that was rolled back to.", path: "release" };
 
 export const retrain = { title: "Retrain now", explanation: "The model is trained on all labels so far.", path: "retrain" };
-export const exported = { title: "Export", explanation: "The model that decides now, as a TorchScript file for a controller, with its checksum.", path: "export" };
 
 export const correct = (id, success) => ({
   title: "Correct the label", path: "correct", body: { id, success }, quiet: true,

@@ -321,8 +321,7 @@ async function actions(get, _, status) {
     block("shadow", act.shadow(!status.shadow)), block("report", act.reportPart),
     block("rollback", act.rollback(choices), !back.length, "There is no earlier version."),
     status.pinned > 0 && block("release", act.release),
-    block("policy", act.policy(status.recipe.policy)), block("retrain", act.retrain),
-    block("export", act.exported, status.version === 0, "There is no model yet."));
+    block("policy", act.policy(status.recipe.policy)), block("retrain", act.retrain));
   return { title: "Actions", elements: [el("h1", {}, "Actions"), small("Each asks for confirmation and your name, which goes into the event log. Labels are corrected on the page of the part."), blocks] };
 }
 
