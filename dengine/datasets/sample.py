@@ -8,6 +8,7 @@ import pandas as pd
 from ..files import FilePath, new_folder
 from .loading import load_dataset
 
+RATE_HZ = 500.0
 CYCLE_SECONDS = 12.0  # from one recording to the next
 BROKEN = 44  # the file that is cut off in its last line; the last, if there are fewer
 
@@ -36,7 +37,7 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     with new_folder(folder) as target:
         for i, row in enumerate(rng.permutation(len(data))[:n], 1):
             force = data.X[row, : int(rng.integers(960, 1001))]
-            times = np.arange(len(force)) / data.rate_hz + 1000.0 + CYCLE_SECONDS * i
+            times = np.arange(len(force)) / RATE_HZ + 1000.0 + CYCLE_SECONDS * i
             height = rng.normal(0.0, 2e-5, len(force))  # the noise of a robot that stands still
             frame = pd.DataFrame({"Timestamp": times, "FZ_Base": force, "TCP_Z": height})
             text = frame.to_csv(index=False, float_format="%.7g")
