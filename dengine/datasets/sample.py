@@ -4,6 +4,7 @@ robot cell, one of them broken, for `dengine data --sample`.
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from ..files import FilePath, new_folder
 from .loading import load_dataset
@@ -36,10 +37,20 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     data = load_dataset("insertion")
     with new_folder(folder) as target:
         for i, row in enumerate(rng.permutation(len(data))[:n], 1):
-            force = data.X[row, : int(rng.integers(960, 1001))]
-            times = np.arange(len(force)) / RATE_HZ + 1000.0 + CYCLE_SECONDS * i
-            height = rng.normal(0.0, 2e-5, len(force))  # the noise of a robot that stands still
-            frame = pd.DataFrame({"Timestamp": times, "FZ_Base": force, "TCP_Z": height})
+            frame = record(data.X[row], rng)
+            frame["Timestamp"] += 1000.0 + CYCLE_SECONDS * i
             text = frame.to_csv(index=False, float_format="%.7g")
             path = target / f"insertion_{i:04d}_{bool(data.y[row])}.csv"
             path.write_text(text[:-16] if i == min(BROKEN, n) else text, encoding="utf-8")
+
+
+def record(force: NDArray[np.float32], rng: np.random.Generator) -> pd.DataFrame:
+    """Return the first 960 to 1000 samples of a force (T,) as the cell records them.
+
+    The times begin at 0 s. The random numbers come from `rng`.
+    """
+    n = int(rng.integers(960, 1001))
+    height = rng.normal(0.0, 2e-5, n)  # the noise of a robot that stands still
+    return pd.DataFrame(
+        {"Timestamp": np.arange(n) / RATE_HZ, "FZ_Base": force[:n], "TCP_Z": height}
+    )

@@ -124,17 +124,14 @@ def _rows_of(
                     events[topic].append((logged, message.data))
                 if topic in topics:
                     values = [field(message) for field in fields]
-                    rows.append((logged, _stamp_of(message), *values))
+                    # in nanoseconds; 0 without a header
+                    stamp = getattr(getattr(message, "header", None), "stamp", None)
+                    stamped = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
+                    rows.append((logged, stamped, *values))
     if not rows:
         why = f" {faults[0]}." if faults else ""
         raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
     return rows
-
-
-def _stamp_of(message: Any) -> int:
-    """Return the time in the header of a message, in nanoseconds; 0 if it has none."""
-    stamp = message.header.stamp if hasattr(message, "header") else None
-    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
