@@ -670,15 +670,19 @@ def test_a_clock_that_no_header_names_is_asked_for(tmp_path: Path) -> None:
     assert "of c0, c1: " in proposal.notes["time.column"]
 
 
-def test_one_number_with_another_decimal_mark_is_a_fault_and_not_a_question(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("digits", "is_open"), [(2, False), (3, True)])
+def test_one_number_with_another_decimal_mark_is_a_fault_or_asked_for_if_it_may_be_a_thousand(
+    tmp_path: Path, digits: int, is_open: bool
+) -> None:
     for i in range(10):
-        rows = [f"{j / 100:.2f};{i + j / 7:.3f}" for j in range(60)]
+        rows = [f"{j / 100:.2f};{1 + i + j / 7:.{digits}f}" for j in range(60)]
         rows[30] = rows[30].replace(".", "," if i == 3 else ".")
-        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text(
-            "\n".join(["t;F", *rows]) + "\n", encoding="utf-8"
-        )
-    data = load_dataset(tmp_path, describe(tmp_path))
-    assert [(fault.source, fault.line) for fault in data.faults] == [(f"3_{WORDS[1]}.csv", 32)]
+        text = "\n".join(["s;F", *rows]) + "\n"
+        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text(text, encoding="utf-8")
+    proposal = describe(tmp_path, {"channels.F": "N"})
+    assert ("text.thousands" in proposal.open_keys) == is_open
+    data = load_dataset(tmp_path, proposal.with_values({"text.thousands": ""}))
+    assert [(fault.source, fault.line) for fault in data.faults] == [("3_OK.csv", 32)]
 
 
 @pytest.mark.parametrize(("name", "is_open"), [("part_no", False), ("charge", True)])

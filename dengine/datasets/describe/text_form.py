@@ -199,8 +199,10 @@ def _column_names(usual: Look) -> Sequence[str]:
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     """Set in `p` the decimal mark and that of groups with which most numbers are read.
 
-    `1.043,5` is read with a decimal comma alone. The decimal mark is `?`, with a note, if as many
-    are read with the other one, since `1.043` is read with both, or if more than 5 % with neither.
+    `1.043,5` is read with a decimal comma and a point between groups alone. The decimal mark is
+    `?`, with a note, if as many are read with the other one, since `1.043` is read with both, or if
+    more than 5 % with neither. The mark between groups is `?` if few numbers need it, and
+    none has both marks: `7,286` among numbers with a decimal point may be damaged.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
     n_read = dict[tuple[str, str], int]()
@@ -213,6 +215,10 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     marks, groups = zip(*(key for key, n in n_read.items() if n == most), strict=True)
     p.put("text.decimal", marks[0])
     p.put("text.thousands", groups[0])
+    is_both = any({*".,"} <= {*cell} for cell in cells)
+    n_needed = most - n_read[marks[0], ""]
+    if groups[0] in (".", ",") and not is_both and n_needed < (1 - LIKELY) * len(cells):
+        p.put("text.thousands", UNKNOWN, f"'.' or ',', or '' if there is none: {n_needed} need it")
     marked = [cell for cell in cells if {*cell}.intersection(".,")]
     if marked and (len({*marks}) > 1 or most < LIKELY * len(cells)):
         note = f"'.' or ','; {min(marked)} may be a fraction or a thousand"
