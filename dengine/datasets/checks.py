@@ -84,23 +84,19 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
     hashes = content_hash(np.stack(traces)).tolist() if traces else []
     groups = defaultdict[int, list[Recording]](list)
     for hash_, recording in zip(hashes, recordings, strict=True):
-        groups[hash_].append(recording)
-    kept, faults = list[Recording](), list[Fault]()
-    for hash_, recording in zip(hashes, recordings, strict=True):
-        first, *others = groups[hash_]
         samples = recording.trace[np.isfinite(recording.trace)]
-        if (samples == samples[:1]).all() or not others:
-            kept.append(recording)
-        elif any(other.label != first.label for other in others):
+        if not (samples == samples[:1]).all():
+            groups[hash_].append(recording)
+    faults = dict[int, Fault]()  # by the recording: two may have one source
+    for first, *others in groups.values():
+        message = f"Expected other samples than those of {first.source}, it repeats them"
+        repeats = others
+        if any(other.label != first.label for other in others):
             message = f"Expected one label for the samples of {first.source}, got two"
-            faults.append(Fault(recording.source, 0, message))
-        elif recording is first:
-            kept.append(recording)
-        else:
-            part = f" of part {first.part}" if first.part != recording.part else ""
-            message = f"Expected other samples than those of {first.source}{part}, it repeats them"
-            faults.append(Fault(recording.source, 0, message))
-    return kept, faults
+            repeats = [first, *others]
+        faults |= {id(item): Fault(item.source, 0, message) for item in repeats}
+    kept = [recording for recording in recordings if id(recording) not in faults]
+    return kept, [*faults.values()]
 
 
 def lost_note(recordings: Sequence[Recording]) -> str:

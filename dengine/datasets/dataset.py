@@ -123,14 +123,11 @@ class Dataset:
         return len(self.y)
 
     def __repr__(self) -> str:
-        good = int(self.y.sum())
         shape = " x ".join(map(str, self.X.shape[1:]))
-        names = f" of {', '.join(self.channels)}" if self.channels else ""
-        rate = f"{self.rate_hz:g} Hz" if self.rate_hz else "an unknown rate"
+        good = int(self.y.sum())
         return (
-            f"<Dataset {self.name}: {len(self)} traces, {shape} samples{names} at {rate}, {good} "
-            f"good, {len(self) - good} bad, {self.unlabelled} unlabelled, {len(self.faults)} left "
-            f"out>"
+            f"<Dataset {self.name}: {len(self)} traces, {shape} samples, {good} good, "
+            f"{len(self.faults)} left out>"
         )
 
     @property

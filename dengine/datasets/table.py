@@ -119,7 +119,7 @@ class Table:
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
-            pattern = _pattern(form)
+            pattern = pattern_of(form.decimal, form.thousands)
             cells = np.array([_number(cell, form, pattern) for cell in cells.tolist()])
         values = cells.astype(np.float64)
         groups = f" and groups by {form.thousands!r}" if form.thousands else ""
@@ -193,11 +193,11 @@ def as_word(cell: Any) -> str:
 
 
 @lru_cache
-def _pattern(form: TextForm) -> re.Pattern[str]:
-    """Return the pattern of a number with the marks of a form."""
-    mark, decimal = re.escape(form.thousands), re.escape(form.decimal)
-    groups = rf"\d{{1,3}}(?:{mark}\d{{3}})+|" if mark else ""
-    digits = rf"(?:(?:{groups}\d+)(?:{decimal}\d*)?|{decimal}\d+)"
+def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
+    """Return the pattern of a number with these marks."""
+    mark, point = re.escape(thousands), re.escape(decimal)
+    groups = rf"[1-9]\d{{0,2}}(?:{mark}\d{{3}})+|" if mark else ""
+    digits = rf"(?:(?:{groups}\d+)(?:{point}\d*)?|{point}\d+)"
     return re.compile(rf"[-+{MINUS}]?{digits}(?:[eE][-+]?\d+)?", re.ASCII)
 
 

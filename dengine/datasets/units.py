@@ -10,18 +10,10 @@ from importlib.resources import files
 from ..errors import DataError
 
 TABLE = tomllib.loads((files("dengine") / "data" / "units.toml").read_text("utf-8"))
-PREFIXES = TABLE.pop("prefixes")
-PREFIXED = TABLE.pop("prefixed")["units"]
 OTHERS = TABLE.pop("others")["units"]
-# Each unit, with a prefix or without, with its quantity and the factor to that quantity's first.
+# Each unit with its quantity and the factor to that quantity's first.
 UNITS: dict[str, tuple[str, float]] = {
     unit: (name, factor) for name, units in TABLE.items() for unit, factor in units.items()
-}
-UNITS |= {
-    prefix + unit: (UNITS[unit][0], factor * UNITS[unit][1])
-    for unit in PREFIXED
-    for prefix, factor in PREFIXES.items()
-    if prefix + unit not in UNITS
 }
 MARKS = "[](){} "
 

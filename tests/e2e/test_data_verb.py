@@ -32,7 +32,7 @@ def shown(*words: object) -> str:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """24 recordings as UR cells make them, three of them broken."""
+    """24 recordings as UR cells make them, one of them broken."""
     path = tmp_path_factory.mktemp("recorded")
     write_sample(path, 24)
     return path

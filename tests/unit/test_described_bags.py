@@ -182,24 +182,41 @@ def test_a_lost_message_and_a_missing_label_are_faults_and_nothing_is_filled_in(
     assert "got 0.004 s before row 11" in texts[0]
 
 
-def test_a_file_that_was_not_closed_is_read_up_to_its_end_and_a_damaged_one_is_refused(
+def test_a_file_that_was_not_closed_or_is_damaged_is_a_fault_and_read_up_to_there(
     bag: Bag, tmp_path: Path
 ) -> None:
     path = bag.write(tmp_path / "cell.mcap", chunk_bytes=4096)
     description = describe(path, STATED)
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * 0.6)])
-    data = load_dataset(path, description)
-    assert 3 <= len(data) < 8
-    np.testing.assert_array_equal(data.X, bag.fz[: len(data)])
-    assert "was not closed" in data.notes[0]
-    middle = len(content) // 2
-    path.write_bytes(content[:middle] + b"\xff" * 2000 + content[middle + 2000 :])
-    with pytest.raises(DataError, match=r"Expected a whole MCAP file.*mcap recover"):
-        load_dataset(path, description)
+    cut = int(len(content) * 0.6)
+    for damaged in (content[:cut], content[:cut] + b"\xff" * 2000 + content[cut + 2000 :]):
+        path.write_bytes(damaged)
+        assert describe(path, STATED).time == description.time
+        data = load_dataset(path, description)
+        assert 3 <= len(data) < 8
+        np.testing.assert_array_equal(data.X, bag.fz[: len(data)])
+        assert data.y.tolist() == bag.good[: len(data)].tolist()
+        assert data.faults[0].source == "cell.mcap"
+        assert "messages are read" in str(data.faults[0])
     path.write_bytes(b"")
     with pytest.raises(DataError, match="Expected a whole MCAP file"):
         load_dataset(path, description)
+    with pytest.raises(DataError, match="Expected a whole MCAP file"):
+        describe(path)
+
+
+def test_a_damaged_file_before_others_is_refused_where_a_trigger_cuts(
+    bag: Bag, tmp_path: Path
+) -> None:
+    half = bag.starts[4] + 20
+    path = bag.write(tmp_path / "bag" / "bag_0.mcap", slice(0, half), chunk_bytes=4096)
+    bag.write(tmp_path / "bag" / "bag_1.mcap", slice(half, None))
+    description = describe(tmp_path / "bag", STATED)
+    content = path.read_bytes()
+    for size in range(len(content) // 2, len(content) - 1, 97):
+        path.write_bytes(content[:size])
+        with pytest.raises(DataError, match=r"whole files before bag_1\.mcap"):
+            load_dataset(tmp_path / "bag", description)
 
 
 def test_files_of_another_storage_are_refused_with_how_to_convert_them(tmp_path: Path) -> None:

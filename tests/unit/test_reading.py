@@ -667,4 +667,46 @@ def test_a_clock_that_no_header_names_is_asked_for(tmp_path: Path) -> None:
         np.savetxt(tmp_path / f"{i}_{WORDS[i % 2]}.csv", table, delimiter=",")
     proposal = describe(tmp_path)
     assert "time.column" in proposal.open_keys
-    assert "of c0, c1, or time.column=[]" in proposal.notes["time.column"]
+    assert "of c0, c1: " in proposal.notes["time.column"]
+
+
+@pytest.mark.parametrize(("digits", "is_open"), [(2, False), (3, True)])
+def test_one_number_with_another_decimal_mark_is_a_fault_or_asked_for_if_it_may_be_a_thousand(
+    tmp_path: Path, digits: int, is_open: bool
+) -> None:
+    for i in range(10):
+        rows = [f"{j / 100:.2f};{1 + i + j / 7:.{digits}f}" for j in range(60)]
+        rows[30] = rows[30].replace(".", "," if i == 3 else ".")
+        text = "\n".join(["s;F", *rows]) + "\n"
+        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text(text, encoding="utf-8")
+    proposal = describe(tmp_path, {"channels.F": "N"})
+    assert ("text.thousands" in proposal.open_keys) == is_open
+    data = load_dataset(tmp_path, proposal.with_values({"text.thousands": ""}))
+    assert [(fault.source, fault.line) for fault in data.faults] == [("3_OK.csv", 32)]
+
+
+@pytest.mark.parametrize(("name", "is_open"), [("part_no", False), ("charge", True)])
+def test_a_column_with_a_run_for_each_part_is_asked_for_unless_it_is_named_like_one(
+    tmp_path: Path, name: str, is_open: bool
+) -> None:
+    for word in WORDS.values():
+        rows = [f"{word}{i // 20},{i % 7}" for i in range(200)]
+        (tmp_path / f"{word}.csv").write_text("\n".join([f"{name},F", *rows]) + "\n")
+    proposal = describe(tmp_path)
+    assert proposal.layout == "long"
+    assert ("part.column" in proposal.open_keys) == is_open
+    assert name in proposal.notes.get("part.column", name)
+
+
+@pytest.mark.parametrize("name", ["failed", "not_ok", "result"])
+def test_true_and_false_are_asked_for_in_a_column_whose_name_does_not_say_good(
+    tmp_path: Path, name: str
+) -> None:
+    for i in range(8):
+        rows = "".join(f"{j / 100},{i + j % 5},{i % 2 == 0}\n" for j in range(30))
+        (tmp_path / f"{i}.csv").write_text(f"t,F,{name}\n{rows}", encoding="utf-8")
+    proposal = describe(tmp_path)
+    open_labels = [key for key in proposal.open_keys if key.startswith("label.")]
+    assert open_labels
+    notes = [proposal.notes[key] for key in open_labels]
+    assert all("False: 4" in note and "True: 4" in note for note in notes), notes

@@ -4,6 +4,7 @@ A value is written only if a rule proves it, with its evidence as a comment; els
 the candidates. `load_dataset` then reads exactly what the description says.
 """
 
+import math
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -48,7 +49,6 @@ BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_BYTES = 2_000_000  # of all files that are read, and of one
 MOST_ROWS = 50_000
-NUMBERS = re.compile(r"\d+")
 Names = Sequence[str]
 
 
@@ -151,21 +151,16 @@ def globs(names: Names) -> list[str]:
 
 
 def contents_of(p: Proposal) -> dict[str, bytes]:
-    """Return the contents of some files, by their names, in the order of all.
+    """Return the contents of some files, by their names: of 60, evenly spread, until 2 MB are read.
 
-    These are the 60 whose names, but for numbers, are like the fewest others, and more, evenly
-    spread, until 2 MB are read. Files that cannot be read are left out.
+    Files that cannot be read are left out.
     """
-    shapes = {name: NUMBERS.sub("0", name) for name in p.names}
-    counts = Counter(shapes.values())
-    rare = sorted(p.names, key=lambda name: counts[shapes[name]])[:MOST_FILES]
-    spread = p.names[:: max(1, len(p.names) // MOST_FILES)]
     contents = dict[str, bytes]()
-    for name in dict.fromkeys([*rare, *spread]):
+    for name in p.names[:: math.ceil(len(p.names) / MOST_FILES)]:
         if sum(map(len, contents.values())) < MOST_BYTES:
             with suppress(UnreadableError):
                 contents[name] = read_file(p.base / name)
-    return {name: contents[name] for name in p.names if name in contents}
+    return contents
 
 
 def read_tables(p: Proposal) -> list[Table]:

@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import DataError
+from ..dataset import Fault
 from ..description import UNKNOWN, LabelSource
 from ..read.bags import LOG_TIME, STAMP, read_messages
+from ..read.files import caught
 from ..table import Table
 from .clock import propose_rate
 from .columns import Proposal, counts_of
@@ -30,14 +33,18 @@ def propose_bag(p: Proposal) -> None:
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()
     is_stamped = True
-    messages = read_messages(p.base / p.names[0], None, [])
-    for topic, _, logged, message in islice(messages, MOST_MESSAGES):
-        times[topic].append(logged)
-        if hasattr(message, "data"):
-            words[topic].append(str(message.data))
-        elif len(times[topic]) == 1:
-            units |= dict(_fields(message, topic))
-            is_stamped &= hasattr(message, "header") and message.header.stamp.sec > 0
+    faults = list[Fault]()
+    with caught(faults, p.names[0]):
+        messages = read_messages(p.base / p.names[0], None)
+        for topic, logged, message in islice(messages, MOST_MESSAGES):
+            times[topic].append(logged)
+            if hasattr(message, "data"):
+                words[topic].append(str(message.data))
+            elif len(times[topic]) == 1:
+                units |= dict(_fields(message, topic))
+                is_stamped &= hasattr(message, "header") and message.header.stamp.sec > 0
+    if faults and not times:
+        raise DataError(f"Expected a bag: {faults[0]}")
     propose_channels(p, units)
     channels = [*p.description.channels]
     p.put("ignored", {name: unit for name, unit in units.items() if name not in channels})

@@ -103,16 +103,12 @@ class Column:
         if not cells or not all(map(LIKE_A_TIME.match, cells)):
             return []
         table = Table(self.name, {self.name: np.array(sorted(cells), dtype=object)}, [])
-        forms = [form for form in FORMS if _fits(table, form)]
+        forms = list[str]()
+        for form in FORMS:
+            with suppress(DataError):
+                times_of(table, Clock((self.name,), (form,)), TextForm())
+                forms.append(form)
         return forms[:1] if forms[:1] in ([DAY], [ISO]) else forms
-
-
-def _fits(table: Table, form: str) -> bool:
-    """Return whether a column, named like its table, holds dates or times of a form."""
-    with suppress(DataError):
-        times_of(table, Clock((table.source,), (form,)), TextForm())
-        return True
-    return False
 
 
 def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:

@@ -33,19 +33,7 @@ NAME = re.compile(
     r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
     r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)([^a-z]|$)"
 )
-BAD_WORDS = r"(^|[^a-z])(fail(ed|ure)?|defect\w*|nok|nio|bad|anomaly|scrap|reject(ed)?)([^a-z]|$)"
-GOOD_WORDS = r"(^|[^a-z])(success|ok|io|pass(ed)?|accept(ed)?|good)([^a-z]|$)"
-BAD_NAME = re.compile(f"(?i){BAD_WORDS}")
-GOOD_NAME = re.compile(rf"(?i){GOOD_WORDS}|(^|\.)(label|y)$")
-BOTH_OR_NOT = re.compile(rf"(?i)(?=.*{BAD_WORDS}).*{GOOD_WORDS}|(^|[^a-z])(not?|nicht)([^a-z]|$)")
-# The words for good and for bad in a column of only YES and NO, by its name.
-MEANINGS = (
-    (BOTH_OR_NOT, (), ()),
-    (BAD_NAME, NO, YES),
-    (GOOD_NAME, YES, NO),
-    (re.compile(r"(?i)(^|\.)(result|verdict|ergebnis|outcome|quality)$"), GOOD, BAD),
-    (re.compile(""), (), ()),
-)
+GOOD_NAME = re.compile(r"(?i)(.*[./])?(label|y|success|ok|io|pass(ed)?|accept(ed)?|good)")
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
 NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
@@ -70,29 +58,21 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     Words of known meaning, whatever their case, fill the others. `good` and `bad` are `?` where
     they would be empty if the meaning of any word is not known, and in a path if either is empty:
     `pass_1.csv` alone may be anything. In a column of only true, yes or 1 and their opposites (and
-    words for unchecked) they mean what its name says: good for `success`, bad for `failed`.
+    words for unchecked) they are known only if its name is one like `success`, not for `failed`.
     """
     words = sorted({*words})
-    verdicts = (*_verdicts(source, {word.lower() for word in words}), UNCHECKED)
+    name = source.column or source.line or source.topic
+    verdicts: Sequence[Sequence[str]] = (GOOD, BAD)
+    if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
+        verdicts = (YES, NO) if GOOD_NAME.fullmatch(name) else ((), ())
     about: dict[str, Any] = {
         key: getattr(source, key) or tuple(word for word in words if word.lower() in group)
-        for key, group in zip(("good", "bad", "unchecked"), verdicts, strict=True)
+        for key, group in zip(("good", "bad", "unchecked"), (*verdicts, UNCHECKED), strict=True)
     }
     is_one_sided = source.path and not (about["good"] and about["bad"])
     if is_one_sided or {*words}.difference(*about.values()):
         about |= {key: about[key] or (UNKNOWN,) for key in ("good", "bad")}
     return replace(source, **about)
-
-
-def _verdicts(source: LabelSource, words: set[str]) -> Sequence[Sequence[str]]:
-    """Return the words for good and for bad in a source; none if its name leaves that open.
-
-    words : those in the source, in small letters.
-    """
-    name = source.column or source.line or source.topic
-    if not name or not words <= {*YES, *NO, *UNCHECKED}:
-        return GOOD, BAD
-    return next(pair for pattern, *pair in MEANINGS if pattern.search(name))
 
 
 def is_plain(source: LabelSource) -> bool:
@@ -118,9 +98,8 @@ def is_verdict(name: str, words: Names) -> bool:
     If it has only one word, that must be a verdict whose meaning is known.
     """
     words = {*words}
-    is_named = NAME.search(name) or BAD_NAME.search(name)
     is_label = len(words) > 1 or is_plain(with_meanings(LabelSource(column=name), words))
-    return bool(is_named) and is_label and len(words) <= MOST_WORDS
+    return NAME.search(name) is not None and is_label and len(words) <= MOST_WORDS
 
 
 def row_of(column: Column) -> Literal["", "same", "last"]:

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -26,10 +26,10 @@ MOST_PARTS = 240
 def layout_of(p: Proposal, files: Tables) -> str:
     """Return how parts are laid out, as `Description.layout` has it; `?` if nothing tells.
 
-    It is `long` if a column has runs of equal words, which `part.column` then becomes in `p` (`?`
-    if there are several), or if the stated column has several words. Nothing tells for a single
-    table without such a column; `p.notes` then says what to state. Raises DataError for a table
-    with one row for each verdict and no samples.
+    It is `long` if a column may tell the parts apart, or if the stated one has several words. Then
+    `part.column` in `p` is the only such column that is named like a part, or `?`. Nothing tells
+    for a single table without such a column; `p.notes` then says what to state. Raises DataError
+    for a table with one row for each verdict and no samples.
     """
     kind = p.description.format
     first = files[0]
@@ -38,8 +38,13 @@ def layout_of(p: Proposal, files: Tables) -> str:
     if numbered_columns(first) or has_lists(first):
         return "npz" if kind == "npz" else "wide"
     columns = columns_of(files, TextForm())
-    stated = [columns[name] for name in p.description.part.column if name in columns]
-    if _propose_part(p, columns.values()) or any(len(c.counts) > 1 for c in stated):
+    runs = [name for name, column in columns.items() if may_tell_parts(column)]
+    stated = p.description.part.column
+    if runs or any(len(columns[name].counts) > 1 for name in stated if name in columns):
+        named = [*filter(PART_NAME.search, columns)]
+        likely = [name for name in runs if name in named]
+        note = f"one of {listed(dict.fromkeys([*named, *runs]))}"
+        p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
     if len(files) > 1:
         return "files"
@@ -48,21 +53,17 @@ def layout_of(p: Proposal, files: Tables) -> str:
     return UNKNOWN
 
 
-def _propose_part(p: Proposal, columns: Collection[Column]) -> bool:
-    """Propose `part.column`, and return whether any column has runs, see `_has_runs`.
+def may_tell_parts(column: Column) -> bool:
+    """Return whether the words of a column come in one run each, of 8 rows or more in the mean.
 
-    It is the first column with runs that is named like a part, or else the only column that has
-    runs or such a name; `?` if there are several. Without runs nothing is proposed.
+    A column that is fixed in each table, or is a clock, tells no parts.
     """
-    runs = [column.name for column in columns if _has_runs(column)]
-    named = [column.name for column in columns if PART_NAME.search(column.name)]
-    certain = [name for name in runs if name in named]
-    best = certain or [*named, *runs]
-    if runs:
-        is_clear = certain or len(best) == 1
-        note = f"one of {listed(best)}" if len(best) > 1 else ""
-        p.put("part.column", best[0] if is_clear else UNKNOWN, note)
-    return bool(runs)
+    n_runs = sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
+    is_long = column.counts.total() >= LEAST_RUN * n_runs
+    if column.fixed or not is_long or len(column.counts) < n_runs or "" in column.counts:
+        return False
+    is_clock = CLOCK_NAME.search(column.name) is not None or bool(column.forms)
+    return not is_clock or PART_NAME.search(column.name) is not None
 
 
 def numbered_columns(table: Table) -> list[str]:
@@ -75,27 +76,6 @@ def has_lists(table: Table) -> bool:
     """Return whether the first cell of any column is a list of several items."""
     cells = [column[0] for column in table.columns.values() if len(column)]
     return any(isinstance(cell, list | np.ndarray) and len(cell) > 1 for cell in cells)
-
-
-def _n_runs(column: Column) -> list[int]:
-    """Return how many runs of equal words each table has."""
-    return [int((words[1:] != words[:-1]).sum()) + 1 for words in column.words]
-
-
-def _has_runs(column: Column) -> bool:
-    """Return whether a column has one word for each of several runs of rows, as parts have.
-
-    No word may come in two runs, the mean run has at least 8 rows, most tables have several, and
-    the column is neither a clock nor one of fractions.
-    """
-    n_runs = _n_runs(column)
-    is_unique = len(column.counts) == sum(n_runs) and "" not in column.counts
-    is_long = column.counts.total() >= LEAST_RUN * sum(n_runs)
-    if not is_unique or not is_long or sum(n > 1 for n in n_runs) <= len(n_runs) / 2:
-        return False
-    is_clock = CLOCK_NAME.search(column.name) and not PART_NAME.search(column.name)
-    is_fraction = any(re.search(r"\d[.,]\d", word) for word in [*column.counts][:3])
-    return not (is_clock or is_fraction or column.forms)
 
 
 def _refuse_results(columns: Iterable[Column]) -> None:

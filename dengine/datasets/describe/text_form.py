@@ -9,6 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,12 +17,15 @@ import numpy as np
 from ...errors import DataError, listed
 from ..description import UNKNOWN, TextForm
 from ..read.text import BLANK, COMMENT, header_names, split_line
+from ..table import pattern_of
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
 
 DELIMITERS = (";", "\t", "|", ",", BLANK)
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
-GROUPS = "'’\u202f\xa0 "  # marks between groups of digits that are no decimal mark
+GROUPS = ("", ".", ",", "'", "’", "\u202f", "\xa0", " ")  # marks between groups of digits
+LIKELY = 0.95  # of the numbers that the marks of a text must read; the others are damaged
+SAME_DIGITS = str.maketrans("23456789", "11111111")  # for numbers of one form
 HEAD_BYTES = 400_000
 LATIN = "cp1252"
 MOST_LINES = 200  # of a file that are looked at
@@ -31,14 +35,6 @@ WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
     r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|s|ms|us|ns|min|h)[\])]?"
 )
-# Numbers in which a mark can only be the decimal one.
-DECIMAL = {
-    mark: re.compile(
-        rf"[-+−]?([^.,]*{m}(\d{{0,2}}|\d{{4,}})|0?{m}\d+|\d{{4,}}{m}\d*|.*[^\d{m}]\d{{3}}{m}\d*)"
-        r"([eE].*)?"
-    )
-    for mark, m in ((".", r"\."), (",", ","))
-}
 Rows = Sequence[Sequence[str]]
 
 
@@ -201,28 +197,29 @@ def _column_names(usual: Look) -> Sequence[str]:
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
-    """Set in `p` the decimal mark and that of groups, which numbers prove.
+    """Set in `p` the decimal mark and that of groups with which most numbers are read.
 
-    A mark is a decimal one where other than three digits follow it, it follows a 0 or more than
-    three digits, or stands behind the other mark: `0,004` and `1.043,5` prove a comma, `1.043`
-    proves nothing. Where both fit, the decimal mark is `?`, with a note.
+    `1.043,5` is read with a decimal comma and a point between groups alone. The decimal mark is
+    `?`, with a note, if as many are read with the other one, since `1.043` is read with both, or if
+    more than 5 % with neither. The mark between groups is `?` if few numbers need it, and
+    none has both marks: `7,286` among numbers with a decimal point may be damaged.
     """
-    seen = {mark: [cell for cell in cells if mark in cell] for mark in ".,"}
-    proofs = {mark: len([*filter(DECIMAL[mark].fullmatch, seen[mark])]) for mark in ".,"}
-    groups = re.findall(rf"\d([{GROUPS}])\d{{3}}", "\n".join(cells))
-    group = groups[0] if groups else ""
-    repeats = {mark: any(cell.count(mark) > 1 for cell in seen[mark]) for mark in ".,"}
-    likely = [
-        (mark, other)
-        for mark, other in (".,", ",.")
-        if proofs[mark] > 20 * proofs[other] or (repeats[other] and not proofs[other])
-    ]
-    if len(likely) == 1:
-        mark, other = likely[0]
-        p.put("text.decimal", mark)
-        p.put("text.thousands", other if seen[other] else group)
-        return
-    p.put("text.thousands", group)
-    if example := min(seen["."] + seen[","], default=""):
-        note = f"'.' or ','; {example} may be a fraction or a thousand"
+    counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
+    n_read = dict[tuple[str, str], int]()
+    possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
+    for mark, group in product(possible, GROUPS):
+        if mark != group:
+            pattern = pattern_of(mark, group)
+            n_read[mark, group] = sum(n for cell, n in counts.items() if pattern.fullmatch(cell))
+    most = max(n_read.values())
+    marks, groups = zip(*(key for key, n in n_read.items() if n == most), strict=True)
+    p.put("text.decimal", marks[0])
+    p.put("text.thousands", groups[0])
+    is_both = any({*".,"} <= {*cell} for cell in cells)
+    n_needed = most - n_read[marks[0], ""]
+    if groups[0] in (".", ",") and not is_both and n_needed < (1 - LIKELY) * len(cells):
+        p.put("text.thousands", UNKNOWN, f"'.' or ',', or '' if there is none: {n_needed} need it")
+    marked = [cell for cell in cells if {*cell}.intersection(".,")]
+    if marked and (len({*marks}) > 1 or most < LIKELY * len(cells)):
+        note = f"'.' or ','; {min(marked)} may be a fraction or a thousand"
         p.put("text.decimal", UNKNOWN, note)

@@ -24,21 +24,18 @@ from .split import signals_of, verdicts_of
 
 SUFFIX = ".mcap"
 STAMP, LOG_TIME = "stamp", "log_time"
-MAGIC = b"\x89MCAP0\r\n"  # at the end of a file that was closed
 RECOVER = "mcap recover or ros2 bag reindex may save what is whole"
-Message = tuple[str, str, int, Any]  # topic, type, nanoseconds of the log, message
+Message = tuple[str, int, Any]  # topic, nanoseconds of the log, message
 Files = Sequence[tuple[Path, str]]
 Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, data
 
 
-def read_messages(
-    path: Path, topics: Collection[str] | None, notes: list[str]
-) -> Iterator[Message]:
+def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Message]:
     """Yield the messages of some topics, or of all for None, in their order in the file.
 
-    A file that was not closed is read up to where it ends, with a note in `notes`. Raises DataError
-    if its name does not end in .mcap, or if a package that reads such files is not installed, and
-    UnreadableError if it is damaged, or ends before its first message.
+    Raises DataError if its name does not end in .mcap, or if a package that reads such files is not
+    installed. If the file is damaged, or was not closed, UnreadableError is raised behind the
+    messages before that.
     """
     if path.suffix.lower() != SUFFIX:
         do = "`ros2 bag convert` makes them of .db3 files"
@@ -51,26 +48,20 @@ def read_messages(
     damages: tuple[type[Exception], ...] = (*UNREADABLE, McapError, ZstdError, struct.error)
     n = 0
     with path.open("rb") as file:
-        file.seek(max(path.stat().st_size - len(MAGIC), 0))
-        is_closed = file.read() == MAGIC
-        file.seek(0)
         try:
             reader = NonSeekingReader(file, True, [DecoderFactory()])
             messages = reader.iter_decoded_messages(topics, log_time_order=False)
-            for n, (schema, channel, record, message) in enumerate(messages, 1):  # noqa: B007
-                yield channel.topic, schema.name if schema else "", record.log_time, message
+            for n, (_, channel, record, message) in enumerate(messages, 1):  # noqa: B007
+                yield channel.topic, record.log_time, message
         except damages as error:
-            if is_closed or not n:
-                raise UnreadableError(f"Expected a whole MCAP file: {error}; {RECOVER}") from error
-    if not is_closed:
-        notes.append(f"{path.name} was not closed: {n} messages before its end are read.")
+            wanted = f"Expected a whole MCAP file, that was closed, {n} messages are read"
+            raise UnreadableError(f"{wanted}: {error}; {RECOVER}") from error
 
 
 def read_bag(
     files: Files,
     title: str,
     description: Description,
-    notes: list[str],
     faults: list[Fault],
 ) -> Table:
     """Return a table with a row for each message of the channels, in the order of the log.
@@ -85,8 +76,8 @@ def read_bag(
     title : str
         What the bag is called in messages.
     description : Description
-    notes, faults : list
-        Get what users should know, and the files that are damaged.
+    faults : list
+        Gets the files that are damaged; their messages before the damage are read.
 
     Raises
     ------
@@ -101,7 +92,7 @@ def read_bag(
     verdicts = verdicts_of(description)
     others = verdicts.union(description.part.column, signals_of(description), [description.order])
     events: Events = {name: [] for name in others if name.startswith("/") and "." not in name}
-    rows = _rows_of(files, description, topics, events, notes, faults)
+    rows = _rows_of(files, description, topics, events, faults)
     rows.sort(key=itemgetter(0))
     cells = map(as_cells, zip(*rows, strict=True))
     table = dict(zip((LOG_TIME, STAMP, *columns), cells, strict=True))
@@ -115,7 +106,6 @@ def _rows_of(
     description: Description,
     topics: set[str],
     events: Events,
-    notes: list[str],
     faults: list[Fault],
 ) -> list[Any]:
     """Return the times and values of each message of the channels, and put others into `events`.
@@ -125,26 +115,23 @@ def _rows_of(
     fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
     for path, name in files:
-        if description.windows.trigger and (notes or faults):
-            why = (*notes, *faults)[0]
-            raise DataError(f"Expected whole files before {name}, since a trigger cuts: {why}")
+        if description.windows.trigger and faults:
+            why = f"since a trigger cuts: {faults[0]}"
+            raise DataError(f"Expected whole files before {name}, {why}")
         with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
-            for topic, _, logged, message in [*read_messages(path, {*topics, *events}, notes)]:
+            for topic, logged, message in read_messages(path, {*topics, *events}):
                 if topic in events:
                     events[topic].append((logged, message.data))
                 if topic in topics:
                     values = [field(message) for field in fields]
-                    rows.append((logged, _stamp_of(message), *values))
+                    # in nanoseconds; 0 without a header
+                    stamp = getattr(getattr(message, "header", None), "stamp", None)
+                    stamped = stamp.sec * 10**9 + stamp.nanosec if stamp else 0
+                    rows.append((logged, stamped, *values))
     if not rows:
         why = f" {faults[0]}." if faults else ""
         raise DataError(f"Expected messages of {listed(topics)}, found none.{why}")
     return rows
-
-
-def _stamp_of(message: Any) -> int:
-    """Return the time in the header of a message, in nanoseconds; 0 if it has none."""
-    stamp = message.header.stamp if hasattr(message, "header") else None
-    return stamp.sec * 10**9 + stamp.nanosec if stamp else 0
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:

@@ -165,9 +165,8 @@ def read_recordings(
         If `windows.trigger` is malformed.
     """
     check_description(description)
-    notes: list[str] = []
     faults: list[Fault] = []
-    name, base, files = files_of(source, description, notes, faults)
+    name, base, files = files_of(source, description, faults)
     labels = [read_labels(base, label, description.text) for label in description.labels]
     recordings: list[Recording] = []
     n_unlabelled = 0
@@ -191,7 +190,7 @@ def read_recordings(
     data = dataset_of(recordings, description)
     n_found = len(data) + len(faults) + n_unlabelled
     n_seen = description.seen.recordings
-    notes += [label.unused_note() for label in labels]
+    notes = [label.unused_note() for label in labels]
     if n_found < n_seen:
         notes.append(f"The description was made for {n_seen} recordings, now there are {n_found}.")
     notes.append(lost_note(recordings))
@@ -200,11 +199,11 @@ def read_recordings(
 
 
 def files_of(
-    source: Any, description: Description, notes: list[str], faults: list[Fault]
+    source: Any, description: Description, faults: list[Fault]
 ) -> tuple[str, Path, Sequence[tuple[Path | Table, str]]]:
     """Return the name of a data set, its folder, and its files or its table, each with a name.
 
-    A bag is read as one table here, which adds to `notes` and `faults`. Raises DataError if there
+    A bag is read as one table here, which adds to `faults`. Raises DataError if there
     is no file, or as `read_bag`.
     """
     if not isinstance(source, Path):
@@ -215,7 +214,7 @@ def files_of(
     if description.layout != "mcap":
         return name, source if is_folder else source.parent, files
     title = files[0][1] if len(files) == 1 else name
-    bag = read_bag(files, title, description, notes, faults)
+    bag = read_bag(files, title, description, faults)
     return name, source if is_folder else source.parent, [(bag, title)]
 
 
