@@ -55,10 +55,6 @@ class DecisionMaker:
     outbox : Outbox
         Takes the decisions.
 
-    Attributes
-    ----------
-    has_seen_trace : bool
-        Whether a finite trace came since the engine was made or opened.
     """
 
     def __init__(
@@ -68,12 +64,12 @@ class DecisionMaker:
         labels: CellLabels | ProductLabels,
         outbox: Outbox,
     ) -> None:
-        self.has_seen_trace = False
         self._settings = settings
         self._live = live
         self._labels = labels
         self._outbox = outbox
         self._first_conditions: DecisionConditions | None = None
+        self._has_seen_trace = False  # a finite one, since the engine was made or opened
         self._run = uuid.uuid4().hex[:12]
         self._count = count(1)
 
@@ -122,8 +118,8 @@ class DecisionMaker:
         elif self._settings.is_unsaved:
             self._settings.save()
         has_contract = self._settings.now.trace is not None
-        if not self.has_seen_trace and has_contract and np.isfinite(x).all():
-            self.has_seen_trace = True
+        if not self._has_seen_trace and has_contract and np.isfinite(x).all():
+            self._has_seen_trace = True
             if not self._live.version:  # what will answer is compiled before there is much to do
                 guarded(NOT_PRECOMPUTED, self._live.template.precompute, x[None])
         return x
@@ -222,10 +218,8 @@ class DecisionMaker:
         decision is on disk, or when the store's time limit is over. With a store in memory, and
         before the first trace, nothing is recorded: only the thread that uses the engine may do
         that. Raises TraceError for a wrong part's number, an id of another trace, and a trace that
-        the contract does not allow, ReportError for what is no id, and StoreError for an engine
-        that is closed or only reads.
+        the contract does not allow, and ReportError for what is no id.
         """
-        self._outbox.check_usable()
         id_ = as_id(decision_id)
         number = as_part(part)
         earlier = self.find_earlier(id_, number, trace)

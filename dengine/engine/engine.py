@@ -41,7 +41,6 @@ from ..records import (
     Decision,
     Outcome,
     PartNumber,
-    Reason,
     RetrainReport,
     TraceSpec,
     as_id,
@@ -462,7 +461,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     # Decisions
 
-    @overload
     def decide(
         self,
         trace: ArrayLike,
@@ -470,28 +468,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         *,
         decision_id: str | None = None,
         timed_out: bool = False,
-    ) -> Decision: ...
-
-    @overload
-    def decide(
-        self,
-        trace: ArrayLike,
-        part: PartNumber = None,
-        *,
-        decision_id: str | None = None,
-        timed_out: bool = False,
-        wait: bool,
-    ) -> Decision | None: ...
-
-    def decide(
-        self,
-        trace: ArrayLike,
-        part: PartNumber = None,
-        *,
-        decision_id: str | None = None,
-        timed_out: bool = False,
-        wait: bool = True,
-    ) -> Decision | None:
+    ) -> Decision:
         """Decide on one trace, and record the decision.
 
         Parameters
@@ -506,24 +483,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         timed_out : bool, default False
             The caller, who gave an id, does not wait any more and verifies the part. Record this
             as VERIFY with `Reason.LATE`, without asking the model. If the trace or the store has a
-            fault, this fault is the reason instead.
-        wait : bool, default True
-            False is for a server that answers by a deadline: the call waits neither for another
-            call of the engine nor for the disk. Any thread may make it while no other thread uses
-            the engine; it has one torch thread from then on. The call returns None, and changes
-            nothing, if it cannot decide at once. That is so with an id, before the first trace,
-            while something must be stored or rebuilt first, and if the model is a baseline (handed
-            in as `model`), uses classes of the user's or is not compiled. Only a later `poll` lets
-            a trained version answer, and calls `on_safe_mode`. With `timed_out` another thread may
-            use the engine meanwhile. The VERIFY is recorded beside that thread's call, and this
-            call waits for the disk. With a store in memory, and before the first trace, it is not
-            recorded: call again with `wait`, in the engine's thread.
+            fault, this fault is the reason instead. Any thread may make this call, also while
+            another thread uses the engine; it waits for the disk, but not for that thread. With a
+            store in memory, and before the first trace, the VERIFY is not recorded.
 
         Returns
         -------
-        Decision or None
-            None only with wait=False. If anything fails that is not an error below, the decision is
-            VERIFY. If an id cannot be looked up, this VERIFY is not recorded.
+        Decision
+            If anything fails that is not an error below, the decision is VERIFY. If an id cannot be
+            looked up, this VERIFY is not recorded.
 
         Raises
         ------
@@ -535,13 +503,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ReportError
             For an invalid id.
         StoreError
-            For an engine that is closed, was opened for reading, or is in use by another thread.
+            For an engine that is closed or was opened for reading, and, unless `timed_out`, for one
+            that is in use by another thread.
         """
-        if not wait and timed_out:
-            return self._maker.record_timeout(trace, part, decision_id)
-        if not wait:
-            return self._decide_at_once(trace, part, decision_id)
         self._outbox.check_usable()
+        if timed_out:
+            return self._maker.record_timeout(trace, part, decision_id)
         with self._exclusive:
             id_ = None if decision_id is None else as_id(decision_id)
             number = as_part(part)
@@ -550,14 +517,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 if earlier is not None:
                     return earlier
             self._learner.advance()  # the newest version is to answer
-            decision = self._decide(trace, number, id_, Reason.LATE if timed_out else None)
+            decision = self._decide(trace, number, id_)
             self._feedback.announce_safe_mode()  # last: a user's function may fail
         return decision
 
-    def _decide(
-        self, trace: ArrayLike, part: str | None, decision_id: str | None, reason: Reason | None
-    ) -> Decision:
-        """Decide on one trace by the model, or verify for a reason; record and return that.
+    def _decide(self, trace: ArrayLike, part: str | None, decision_id: str | None) -> Decision:
+        """Decide on one trace by the model, record the decision and return it.
 
         The steps are in this order because each needs the one before: a wrong trace must confirm
         nothing; a rule that lacks a correction must not decide; this trace is the next one after
@@ -569,35 +534,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         x = self._maker.convert(trace)
         self._learner.catch_up()
         self._feedback.confirm_unreported()
-        stored = self._maker.record(x, part, decision_id, reason)
+        stored = self._maker.record(x, part, decision_id)
         if decision_id is not None:
             stored = self._maker.sync(stored)
         self._feedback.record_decision(stored)
         return stored.decision
-
-    def _decide_at_once(
-        self, trace: ArrayLike, part: PartNumber, decision_id: str | None
-    ) -> Decision | None:
-        """Decide if nothing has to be waited for, in any thread; else return None.
-
-        It returns None, and changes nothing, with an id, before the first trace, while settings or
-        a correction wait for the store or another call holds the outbox's lock, and if the model is
-        a baseline, uses classes of the user's or is not compiled. While it decides it holds that
-        lock, so that nothing that it records waits. It sets the present thread to one torch thread.
-        Raises StoreError if another thread uses the engine or it is closed, and TraceError for a
-        wrong trace or part's number.
-        """
-        self._outbox.check_usable()
-        with self._outbox.try_lock() as is_free, self._exclusive:
-            newest = self._live.newest
-            is_own_code = newest.keeps_references and not self.recipe.user_classes
-            is_quick = newest.is_compiled or not self.version
-            has_work = self._settings.is_unsaved or self._feedback.remedy is not None
-            has_work = has_work or not self._maker.has_seen_trace
-            if has_work or decision_id is not None or not (is_free and is_own_code and is_quick):
-                return None
-            torch.set_num_threads(1)  # it holds for the present thread only
-            return self._decide(trace, as_part(part), None, None)
 
     def report(
         self,
