@@ -57,7 +57,7 @@ from ..traces import check_rate
 from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_part
 from .exclusive import ExclusiveUse
-from .feedback import Feedback
+from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
 from .labels import CellLabels, ProductLabels
@@ -436,26 +436,21 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. Labels of parts that the next decision confirmed
-        are stored, too. A second call does nothing. Records that the disk does not take are given
-        up, and an error is logged; none of them was acknowledged. Raises StoreError while another
-        thread uses the engine.
+        A retrain that takes longer is dropped. A second call does nothing. Records that the disk
+        does not take are given up, and an error is logged; none of them was acknowledged. Raises
+        StoreError while another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
-                self._feedback.store_confirmations()
                 self._learner.advance(to_the_end=True, wait=CLOSE_SECONDS)
             self._outbox.close()
 
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        Labels of parts that the next decision confirmed, which wait in memory, are recorded first,
-        so that they are among the traces of the next training. A rule that a wrong confirmation
-        updated is put right, too, if the store has answered. Raises NotTakenError after `wait`
-        seconds; None: the store's own limit.
+        A rule that a wrong confirmation updated is put right, too, if the store has answered.
+        Raises NotTakenError after `wait` seconds; None: the store's own limit.
         """
-        self._feedback.store_confirmations()
         self._outbox.flush(wait)
         self._learner.catch_up()
 
@@ -589,10 +584,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             stored = self._outbox.find_decision(id_, unsynced=True)
             if stored is None:
                 stored = self._record_lost_accept(id_, label, trace, part)
-            confirmed_wrongly = self._feedback.take_in(stored, label)
+            self._feedback.take_in(stored, label)
             self._outbox.sync()  # before anything else: nobody may hear of a label that can be lost
             self._feedback.note_synced(id_)
-            if confirmed_wrongly:
+            if self._feedback.remedy is Remedy.CORRECT:
                 with suppress(StoreError):  # then the rule is put right when the store is back
                     self._outbox.drain()
             self._learner.catch_up()  # the rule is put right, the label enters the window

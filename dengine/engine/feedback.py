@@ -4,13 +4,12 @@ decision, `learner.Learner` for each report.
 
 With `Policy(stops="all")` a bad part stops the system before the next decision, so the next
 decision confirms an accepted part: the rule is updated, the trace becomes a reference, and its
-label, CONFIRMED, is stored with the next report, before the next retrain, or when 100 of them wait.
-A line stop that comes later takes the confirmation back, in the store as a correction. With "some"
-the part counts as unreported, which is no success.
+label, CONFIRMED, is recorded. A line stop that comes later takes the confirmation back as a
+correction. With "some" the part counts as unreported, which is no success.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from enum import Enum
 
 from ..errors import log
@@ -28,7 +27,6 @@ from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
 
-MOST_CONFIRMED = 100  # labels of confirmed parts that wait for a report
 RECENT = 50  # decisions that the share of novel ones fades over
 NEARLY_ALL = 0.8  # of them, and somebody should look
 ALL_NOVEL = (
@@ -84,8 +82,6 @@ class Feedback:
         self.remedy: Remedy | None = None
         # Accepted parts without an outcome yet.
         self._unreported: OrderedDict[str, StoredDecision] = OrderedDict()
-        # Labels of confirmed parts that were not handed to the outbox.
-        self._confirmations: dict[str, tuple[StoredDecision, NewLabel]] = {}
         # Reports that were learned and are not known to be on disk.
         self._unsynced: dict[str, bool] = {}
         # Decisions whose check was asked for, not reported and not overdue, oldest first.
@@ -151,51 +147,39 @@ class Feedback:
         """Settle accepted parts without an outcome, because the next trace has come.
 
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each is a
-        success: rule and references learn it at once, and its label, CONFIRMED, waits in memory;
-        when `MOST_CONFIRMED` labels wait, all are handed to the outbox, the queue of records for
-        the store. With "some" the parts are only counted, and nothing is learned.
+        success: rule and references learn it at once, and its label, CONFIRMED, is recorded. With
+        "some" the parts are only counted, and nothing is learned.
         """
-        if not self._unreported:
-            return
         while self._unreported:
-            id_, stored = self._unreported.popitem(last=False)
+            _, stored = self._unreported.popitem(last=False)
             if self._stops_all:
-                self._confirmations[id_] = stored, self._learn(stored, True, Source.CONFIRMED)
+                self._learn_and_record(stored, True, Source.CONFIRMED)
             else:
                 self._n_unreported += 1
-        if len(self._confirmations) >= MOST_CONFIRMED:
-            self.store_confirmations()
 
-    def take_in(self, stored: StoredDecision, success: bool) -> bool:
+    def take_in(self, stored: StoredDecision, success: bool) -> None:
         """Learn a reported label and have it recorded, without waiting for the disk.
 
-        The same report once more, before `note_synced`, does nothing and returns False. Returns
-        whether the next decision had confirmed the part before this report (`Policy(stops="all")`),
-        whatever its label is now. Raises ReportError if the decision has a label already, except
-        that a line stop may follow a confirmation; one whose confirmation is recorded already is
-        learned later, as a correction. `remedy` is set where the rule must be rebuilt, which is not
-        done here.
+        The same report once more, before `note_synced`, does nothing. Raises ReportError if the
+        decision has a label already, except that a line stop may follow a confirmation by the next
+        decision (`Policy(stops="all")`): it is recorded here, and learned later, as a correction.
+        `remedy` is set where the rule must be rebuilt, which is not done here.
         """
         id_ = stored.decision.id
-        was_confirmed = False
         if self._unsynced.get(id_) is not success:
-            was_confirmed = self._take_in_new(stored, success)
+            self._take_in_new(stored, success)
         self._unsynced[id_] = success
-        return was_confirmed
 
     def note_synced(self, decision_id: str) -> None:
         """Note that the label of this decision is on disk: another report is now an error."""
         del self._unsynced[decision_id]
 
-    def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
-        """Learn a label that is no repetition and hand it to the outbox, after labels that wait.
+    def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
+        """Learn a label that is no repetition and hand it to the outbox.
 
-        The outbox is the queue of records for the store. A confirmation by the next decision, as a
-        success, is taken back first. If its label was handed over before, the new label follows it,
-        but is not learned yet: `remedy` is set to CORRECT. Otherwise its reference is removed, and
-        `remedy` is set to REBUILD_RULE. The latter is also set for a check that the rule counted as
-        overdue. Returns whether there was such a confirmation, whatever the label is now. Raises
-        ReportError for any other second label.
+        The outbox is the queue of records for the store. A line stop that follows a confirmation is
+        handed to it, but is not learned yet: `remedy` is set to CORRECT. It is set to REBUILD_RULE
+        for a check that the rule counted as overdue. Raises ReportError for any other second label.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -204,33 +188,25 @@ class Feedback:
             reported = (success, source)
             if (earlier, reported) != LATE_STOP:
                 raise already_reported(decision.id, earlier, reported)
-            self.store_confirmations()
             self.remedy = Remedy.CORRECT
             label = NewLabel(decision.id, False, source, self._live.version, None)
             self._outbox.record_labels([(stored, label)])
-            return True
-        confirmation = self._confirmations.pop(decision.id, None)
-        was_confirmed = confirmation is not None
-        self.store_confirmations()
-        if confirmation is not None:
-            self._live.unlearn(stored, confirmation[1].seq)
-            self._labels.count_learned(-1)
-        self._record([(stored, self._learn(stored, success, source))])
+            return
+        self._learn_and_record(stored, success, source)
         self._unreported.pop(decision.id, None)
         self._awaiting_check.pop(decision.id, None)
-        if self._live.clear_overdue(decision.id) or was_confirmed:
+        if self._live.clear_overdue(decision.id):
             self.remedy = self.remedy or Remedy.REBUILD_RULE
-        return was_confirmed
 
-    def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
-        """Update rule and references with the outcome of a part; return its label for the store.
+    def _learn_and_record(self, stored: StoredDecision, success: bool, source: Source) -> None:
+        """Update rule and references with the outcome of a part, and have its label recorded.
 
         A trace with a fault updates neither, but its label takes a number. A rejected part that was
         inspected becomes a reference and does not update the rule: which parts are inspected is
         somebody's choice, and no sample. Any other label takes over the count of unreported parts,
-        which begins again at 0, also if the decision is from before the present rule. The label
-        uses up the next number of the outbox; nothing is recorded here. If this part was itself
-        counted as unreported it is subtracted, so a late report may give -1.
+        which begins again at 0, also if the decision is from before the present rule. If this part
+        was itself counted as unreported it is subtracted, so a late report may give -1. The label
+        of a usable trace enters the training window, in a product once it is numbered.
         """
         decision = stored.decision
         version = self._live.version
@@ -242,9 +218,8 @@ class Feedback:
                 n_unreported = self._n_unreported - self._was_unreported(stored)
                 self._n_unreported = 0
             point = self._live.learn(stored, success, number, n_unreported)
-            self._labels.count_learned(1)
         overdue_to = self._live.overdue_to
-        return NewLabel(
+        label = NewLabel(
             decision.id,
             success,
             source,
@@ -254,13 +229,9 @@ class Feedback:
             overdue_to=overdue_to,
             seq=number,
         )
-
-    def _record(self, labels: Collection[tuple[StoredDecision, NewLabel]]) -> None:
-        """Hand learned labels to the outbox; those of usable traces enter the training window."""
-        self._outbox.record_labels(labels)
-        for stored, label in labels:
-            if not stored.quarantined:
-                self._labels.add(stored, label)
+        self._outbox.record_labels([(stored, label)])
+        if not stored.quarantined:
+            self._labels.add(stored, label)
 
     def _was_unreported(self, stored: StoredDecision) -> bool:
         """Return whether this part is one of those counted as unreported.
@@ -273,19 +244,6 @@ class Feedback:
             return False
         is_of_policy = decision.model_version >= self._settings.now.policy_since
         return decision.id not in self._unreported and is_of_policy
-
-    def store_confirmations(self) -> bool:
-        """Hand the labels of parts that the next decision confirmed to the outbox, without waiting.
-
-        They enter the training window, in a product once they are numbered. Returns False, and does
-        nothing, if there are none; else True.
-        """
-        if not self._confirmations:
-            return False
-        self._record(self._confirmations.values())
-        self._confirmations.clear()
-        self.number_labels()
-        return True
 
     def number_labels(self) -> None:
         """In a product, give learned labels the numbers that the store has newly assigned.

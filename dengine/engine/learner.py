@@ -149,9 +149,6 @@ class Learner:
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
-        # A rule that is rebuilt from the store would forget labels that wait in memory.
-        if self._feedback.store_confirmations() and not self._outbox.is_drained:
-            return
         remedy = self._feedback.take_remedy()
         if remedy is None:
             return
@@ -166,18 +163,9 @@ class Learner:
             log.exception("the rule is rebuilt when the store is back")
 
     def store_labels(self) -> None:
-        """Wait until every label is in the store and has its number.
+        """Wait until every label is in the store and has its number, then catch up.
 
-        That includes labels of parts that the next decision confirmed. Then it catches up, as
-        `catch_up`. Raises StoreError where the store is unavailable or takes too long.
-        """
-        self._feedback.store_confirmations()
-        self._drain_labels()
-
-    def _drain_labels(self) -> None:
-        """Wait until the store has the labels that are in the journal, then catch up.
-
-        Raises StoreError where it is unavailable or takes too long.
+        Raises StoreError where the store is unavailable or takes too long.
         """
         if self._outbox.request_label_drain():
             self._outbox.drain()
@@ -413,13 +401,11 @@ class Learner:
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
         """Make all labels that came references of the candidate, one a step, and have them stored.
 
-        Labels of parts that the next decision confirmed are recorded, and overdue checks counted,
-        before each look. Yields as `_see_through` does. It ends when no label is missing or waits
-        to be stored. In a cell that never pauses some label always waits, so every `PATIENCE`-th
+        Overdue checks are counted before each look. Yields as `_see_through` does. It ends when no
+        label is missing or waits to be stored. In a cell that never pauses some label always waits, so every `PATIENCE`-th
         time this call waits for the store itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
-            self._feedback.store_confirmations()
             self._feedback.number_labels()
             while candidate.learn_next(self._window):
                 yield None
@@ -539,10 +525,9 @@ class Learner:
         """
         version = None
         try:
-            self._drain_labels()  # one of the news may be a label of this cell
+            self.store_labels()  # one of the news may be a label of this cell
             news, has_newer_version = peers.fetch_news()
             if has_newer_version:
-                self.store_labels()  # the peers' version is to have them among its references
                 version = self._outbox.call_store(self._store.versions.newest)
         except StoreError as error:
             peers.note_loss(error)
