@@ -187,14 +187,6 @@ class TraceSpec:
         """The name of each channel: the name of its column if known, else "channel 0" and so on."""
         return self.columns or tuple(f"channel {i}" for i in range(self.channels))
 
-    def time_text(self, sample: int) -> str:
-        """Return the time from the first sample to another, "0.060 s" or "30 samples"."""
-        return f"{sample} samples" if self.rate_hz is None else f"{sample / self.rate_hz:.3f} s"
-
-    def value_text(self, value: float, channel: int) -> str:
-        """Return a value of a channel with its unit, if that is known, "200 N" or "200"."""
-        return f"{value:g} {self.units[channel]}".rstrip()
-
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
         """Return a copy that takes the rate, units and columns that it lacks from another contract.
 

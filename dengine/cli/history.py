@@ -33,7 +33,6 @@ SECONDS_OF = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 TABLE_WIDTH = 120  # columns
 PART_LENGTH = 10  # characters of a part's number that are shown, its last
 SHORT_TIME = "%Y-%m-%d %H:%M:%S"
-MOST_EXCESSES = 5  # that are listed
 NEIGHBOUR_FIELDS = ("decision_id", "part", "success", "source", "distance", "space", "inside")
 
 
@@ -243,10 +242,6 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     explained = explanation.decision.decision
     title = f"{explained.id}: {explained.action.value}, {explained.reason.value}"
     tables = [table_of_rows(title, _explanation_rows(explanation))]
-    if explanation.envelope is not None and explanation.envelope.excesses:
-        title = "Where it leaves the band, the farthest first"
-        columns = ("", "from", "to", "in widths")
-        tables.append(table_of_rows(title, _excess_rows(explanation), columns))
     if explanation.neighbours:
         title = (
             f"Nearest references of version {explained.model_version}; the radius of the "
@@ -282,29 +277,5 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     if envelope is None:
         yield "envelope", "too few successes of this shape are known yet"
         return
-    yield (
-        "envelope",
-        f"{percent(envelope.outside, '.0f')} of its samples leave the band of {envelope.n:,} "
-        f"successes; of 95 % of them fewer than {percent(envelope.usual, '.0f')} do",
-    )
-    if envelope.not_finite:
-        yield "", f"{envelope.not_finite} samples are NaN or infinite"
-
-
-def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
-    """Yield table rows of where the trace leaves the envelope, at most 5, the farthest first.
-
-    Each has the channel's name, begin and end, and how far above or below, in widths of the band.
-    There are none without an envelope.
-    """
-    spec = explanation.spec
-    if explanation.envelope is None:
-        return
-    for excess in explanation.envelope.excesses[:MOST_EXCESSES]:
-        side = "above" if excess.above else "below"
-        yield (
-            spec.names[excess.channel],
-            spec.time_text(excess.first),
-            spec.time_text(excess.last),
-            f"{excess.widths:.1f} {side}",
-        )
+    outside = percent(envelope.outside, ".0f")
+    yield "envelope", f"{outside} of its samples leave the band of {envelope.n:,} successes"

@@ -402,8 +402,9 @@ class Learner:
         """Make all labels that came references of the candidate, one a step, and have them stored.
 
         Overdue checks are counted before each look. Yields as `_see_through` does. It ends when no
-        label is missing or waits to be stored. In a cell that never pauses some label always waits, so every `PATIENCE`-th
-        time this call waits for the store itself; a StoreError there is ignored.
+        label is missing or waits to be stored. In a cell that never pauses some label always waits,
+        so every `PATIENCE`-th time this call waits for the store itself; a StoreError there is
+        ignored.
         """
         for n_waits in count(1):
             self._feedback.number_labels()
