@@ -221,7 +221,7 @@ def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
         return TraceSpec(**json.loads(settings["trace"]))
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Decision:
     """What the engine decided on one trace, and on what evidence.
 
@@ -268,13 +268,6 @@ class Decision:
     audit: bool
     propensity: float
     part: str | None = None
-
-    def __repr__(self) -> str:
-        labels = f"{self.n_success} good, {self.n_failure} bad labels around it"
-        bound = f"bound {self.lower:.3f} to {self.upper:.3f}, {labels}"
-        alone = f", alone the model would {self.predicted.value}" if self.audit else ""
-        summary = f"{self.action.value}, {self.reason.value}: {bound}{alone}"
-        return f"<Decision {summary}, version {self.model_version}, id {self.id}>"
 
     @property
     def inclusion_probability(self) -> float:

@@ -34,9 +34,8 @@ from ..records import (
 )
 from ..store.outbox import Outbox
 from ..store.records import StoredDecision
-from ..traces import convert_trace, infer_trace_spec
+from ..traces import as_trace, infer_trace_spec
 from .guard import NOT_PRECOMPUTED, guarded
-from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce, read_peers_trace_spec
 
@@ -50,37 +49,27 @@ class DecisionMaker:
         Read at each decision; the first sound trace sets the contract in them.
     live : LiveModel
         Answers.
-    labels : CellLabels or ProductLabels
-        Says whether anything was learned yet.
     outbox : Outbox
         Takes the decisions.
 
     """
 
-    def __init__(
-        self,
-        settings: SettingsInForce,
-        live: LiveModel,
-        labels: CellLabels | ProductLabels,
-        outbox: Outbox,
-    ) -> None:
+    def __init__(self, settings: SettingsInForce, live: LiveModel, outbox: Outbox) -> None:
         self._settings = settings
         self._live = live
-        self._labels = labels
         self._outbox = outbox
-        self._first_conditions: DecisionConditions | None = None
         self._has_seen_trace = False  # a finite one, since the engine was made or opened
         self._run = uuid.uuid4().hex[:12]
         self._count = count(1)
 
-    def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
+    def set_trace_spec(self, spec: TraceSpec) -> TraceSpec:
         """Set the trace contract (shape, rate and unit of all traces) and return the one in force.
 
         One that is set already stays, completed by what `spec` states and it does not. Where the
         cell shares a product with others, a contract that these have set is taken in place of
-        `spec`; if it cannot be read, that is logged. `inferred` says that `spec` comes from a first
-        trace. The settings are saved in the store; where that fails, they are saved with a later
-        trace. Raises SettingError where the force limits do not fit the contract.
+        `spec`; if it cannot be read, that is logged. The settings are saved in the store; where
+        that fails, they are saved with a later trace. Raises SettingError where the force limits do
+        not fit the contract.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -92,8 +81,7 @@ class DecisionMaker:
             log.exception("the product's contract of traces cannot be had")
         spec = spec if agreed is None else agreed.completed(spec)
         if spec != present.trace:
-            inferred = inferred or present.inferred
-            self._settings.change(replace(present, trace=spec, inferred=inferred))
+            self._settings.change(replace(present, trace=spec))
             self._settings.save()
         return spec
 
@@ -109,12 +97,11 @@ class DecisionMaker:
         or another fault, is returned like any other.
         """
         settings = self._settings.now
-        has_learned = self._live.version + self._labels.new_labels > 0
-        x = convert_trace(trace, settings.trace, settings.inferred and not has_learned)
-        spec = self._infer_trace_spec(x, trace) if settings.trace is None else None
-        if spec is not None:
-            if self.set_trace_spec(spec, inferred=True) != spec:  # a peer's trace came first
-                return convert_trace(trace, self._settings.now.trace, False)
+        x = as_trace(trace, settings.trace)
+        if settings.trace is None:
+            spec, is_sound = infer_trace_spec(x)
+            if is_sound and self.set_trace_spec(spec) != spec:  # a peer's trace came first
+                return as_trace(trace, self._settings.now.trace)
         elif self._settings.is_unsaved:
             self._settings.save()
         has_contract = self._settings.now.trace is not None
@@ -123,18 +110,6 @@ class DecisionMaker:
             if not self._live.version:  # what will answer is compiled before there is much to do
                 guarded(NOT_PRECOMPUTED, self._live.template.precompute, x[None])
         return x
-
-    def _infer_trace_spec(self, x: TraceArray, trace: Any) -> TraceSpec | None:
-        """Infer the trace contract from a first trace; return None if the trace has a fault.
-
-        The contract is also kept for the conditions of the decision, so that a trace with a fault
-        can be decided, too, although a later trace must set the contract. `trace` is `x` as the
-        caller passed it; a DataFrame names the channels. Raises TraceError for a trace of fewer
-        samples than a first trace must have.
-        """
-        spec, is_sound = infer_trace_spec(x, trace)
-        self._first_conditions = DecisionConditions(spec)
-        return spec if is_sound else None
 
     def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
         """Return the decision that a caller's id has already, or None for a new id.
@@ -165,8 +140,7 @@ class DecisionMaker:
     ) -> StoredDecision:
         """Decide on one trace and hand the decision to the outbox, without waiting for the disk.
 
-        Any thread may call it. A trace contract must be in force, or `convert` must have been
-        called before.
+        Any thread may call it.
 
         Parameters
         ----------
@@ -228,7 +202,7 @@ class DecisionMaker:
         spec = self._settings.now.trace
         if spec is None or not self._outbox.is_thread_safe:
             return verify_decision(id_, number, self._live.version, Reason.LATE)
-        stored = self.record(convert_trace(trace, spec, False), number, id_, Reason.LATE)
+        stored = self.record(as_trace(trace, spec), number, id_, Reason.LATE)
         with suppress(NotTakenError):
             self._outbox.sync()
         return check_same_trace(stored, trace, spec)
@@ -250,8 +224,10 @@ class DecisionMaker:
         has a fault or is outside a force limit.
         """
         part_hash_ = 0 if part is None else part_hash(part)
-        conditions = self._settings.conditions or self._first_conditions
-        assert conditions is not None  # a trace has come
+        # Without a contract the trace has a fault, and is decided all the same.
+        conditions = self._settings.conditions or DecisionConditions(
+            TraceSpec(samples=x.shape[1], channels=x.shape[0])
+        )
         if verify_reason is not None:
             unlimited = replace(conditions, force_limits=())
             verdict = _verify(x, unlimited, verify_reason)
@@ -291,25 +267,6 @@ class DecisionMaker:
         hash_ = part_hash_ or content
         return StoredDecision(decision, x.copy(), hash_, fault != 0, self._outbox.store.clock())
 
-    def record_lost_accept(
-        self, x: TraceArray, part: str | None, decision_id: str
-    ) -> StoredDecision:
-        """Record the ACCEPT behind a line stop whose decision was lost, and return the record.
-
-        The model is not asked: the decision has this id, `Reason.CERTAIN`, and no evidence, that is
-        no labels and the bound (0, 1). It does not wait for the disk. Its propensity is the present
-        audit rate, 1 in shadow mode.
-        """
-        stored = self._decide(x, part, None, decision_id=decision_id)
-        decision = replace(
-            stored.decision,
-            action=Action.ACCEPT,
-            predicted=Action.ACCEPT,
-            reason=Reason.CERTAIN,
-            propensity=self._settings.audited_share,
-        )
-        return self._outbox.record_decision(replace(stored, decision=decision))
-
 
 def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Verdict:
     """Decide without a model: VERIFY for `reason`, unless a fault or a force limit decides."""
@@ -327,7 +284,7 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
     TraceError
         For a trace that the contract `spec` does not allow.
     """
-    x = convert_trace(trace, spec, False)
+    x = as_trace(trace, spec)
     if not np.array_equal(x, stored.trace, equal_nan=True):
         raise TraceConflictError(
             f"Expected the trace that decision {stored.decision.id!r} was made on, got another; "

@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import NotTakenError, StoreError, UnknownDecisionError, expect, listed, log
+from ..errors import NotTakenError, StoreError, expect, listed, log
 from ..files import FilePath
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
@@ -52,7 +52,7 @@ from ..reducers.base import Reducer
 from ..store.journalled import CLOSE_SECONDS
 from ..store.opening import LONG_WAIT, open_outbox, opening
 from ..store.outbox import Outbox
-from ..store.records import StoredDecision
+from ..store.records import StoredDecision, unknown_decision
 from ..traces import check_rate
 from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_part
@@ -248,7 +248,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._learner = Learner(
             self._outbox, self._live, window, labels, self._feedback, peers, retrainer, clock
         )
-        self._maker = DecisionMaker(self._settings, self._live, labels, self._outbox)
+        self._maker = DecisionMaker(self._settings, self._live, self._outbox)
         self._corrections = Corrections(
             self._outbox, self._settings, self._live, self._learner, self._feedback
         )
@@ -468,8 +468,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         Parameters
         ----------
-        trace : array or DataFrame, shape (samples,) or (channels, samples)
-            The rows of a DataFrame are samples.
+        trace : array, shape (samples,) or (channels, samples)
         part : str or int, optional
             The part's number. A part that comes again has one vote, and none on itself.
         decision_id : str, optional
@@ -535,13 +534,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._feedback.record_decision(stored)
         return stored.decision
 
-    def report(
-        self,
-        decision_id: str,
-        success: bool,
-        trace: ArrayLike | None = None,
-        part: PartNumber = None,
-    ) -> RetrainReport | None:
+    def report(self, decision_id: str, success: bool) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
 
         After the label, safe mode may begin or end, and a retrain that is due runs in this thread
@@ -557,8 +550,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             known to be good. A line stop that comes after the part was confirmed, however late,
             takes the confirmation back and counts as a correction. If somebody inspected a
             rejected part, its label is used for training, but does not update the rule.
-        trace, part : optional
-            Only for a line stop whose decision was lost: it is then stored with this trace.
 
         Returns
         -------
@@ -569,8 +560,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ------
         ReportError
             For an unknown id, a second report on the decision, or an invalid label.
-        TraceError
-            For an invalid trace or part number of a lost decision.
         StoreError
             If it is not certain that the label is on disk: it is learned all the same, and the
             same report may come again. Also for an engine that is closed, was opened for reading,
@@ -583,7 +572,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._learner.advance()  # so that a version that is ready learns the label as well
             stored = self._outbox.find_decision(id_, unsynced=True)
             if stored is None:
-                stored = self._record_lost_accept(id_, label, trace, part)
+                raise unknown_decision(id_)
             self._feedback.take_in(stored, label)
             self._outbox.sync()  # before anything else: nobody may hear of a label that can be lost
             self._feedback.note_synced(id_)
@@ -596,25 +585,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return None
             # Last, since it may take its budget.
             return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
-
-    def _record_lost_accept(
-        self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
-    ) -> StoredDecision:
-        """Record an ACCEPT under this id for a line stop whose decision was lost; return the
-        record.
-
-        Raises UnknownDecisionError if `trace` is None or `success` is True, and TraceError for a
-        wrong trace or part's number; then nothing is recorded.
-        """
-        if trace is None or success:
-            raise UnknownDecisionError(
-                f"Expected the id of a decision of this cell, got {decision_id!r}, which is "
-                "unknown; a system stop whose decision was lost can be reported with its trace."
-            )
-        x = self._maker.convert(trace)
-        stored = self._maker.record_lost_accept(x, as_part(part), decision_id)
-        self._feedback.record_decision(stored)
-        return stored
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a cell, and yield a record of each cycle as it happens.
@@ -890,19 +860,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises ReportError for an unknown id.
         """
         return explain(self.store, decision_id, neighbours)
-
-    def __repr__(self) -> str:
-        parts = [f"version {self.version}", self.policy.summary]
-        if self.trace is None:
-            parts.append("no trace yet")
-        else:
-            parts.append(f"traces {self.trace.channels} x {self.trace.samples}")
-        parts.append(f"{self.state.new_labels} new labels")
-        if self.safe_mode:
-            parts.append("safe mode")
-        elif self.policy.shadow:
-            parts.append("shadow mode")
-        return f"<DataEngine {self.recipe.name}: {', '.join(parts)}>"
 
     def __exit__(self, *exception: object) -> None:
         self.close()

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from ..decision.certificate import Certificate
 from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
-from ..errors import StoreError, counted, expect
+from ..errors import StoreError, expect
 from ..recipe import Recipe
 from ..records import (
     REPEATS,
@@ -172,7 +172,7 @@ class Watch:
     novelty: float
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Status:
     """The status of an engine. Times are in seconds since 1970.
 
@@ -259,14 +259,6 @@ class Status:
     store_fault: str = ""
     retraining: bool = False
     store_lag: float = 0.0
-
-    def __repr__(self) -> str:
-        counts = self.ever
-        name = f"{self.cell}: version {self.version}, {counted(counts.decisions, 'decision')}"
-        return (
-            f"<Status of {name}, {counts.verified} verified, {counts.accepted} accepted, "
-            f"{counts.false_accepts} known bad, {counts.rejected} rejected>"
-        )
 
     @property
     def alarm(self) -> str:
