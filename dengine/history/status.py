@@ -629,8 +629,8 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     last : int
         Number of newest decisions that the picture marks; it is only passed on to `Course`.
     **by
-        `seconds` and `start` for periods of time, or `batch` for batches, as `SqlStore.stretches`
-        takes them. By default a stretch has at least 20 decisions, the newest perhaps fewer.
+        `seconds` and `start` for periods of time, as `SqlStore.stretches` takes them. By default a
+        stretch has at least 20 decisions, the newest perhaps fewer.
 
     Returns
     -------

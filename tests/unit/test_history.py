@@ -198,12 +198,6 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore, n: int) 
     assert store.decisions.stretches(n) == expected
     shifts = [[item for item in whole if item.time // (10.0 * n) == k] for k in range(N)]
     assert store.decisions.stretches(seconds=10.0 * n) == [counted(item) for item in shifts if item]
-    for batch, name in (
-        ("5", lambda part: part[:5]),
-        ("-/", lambda part: part[: part.rindex("-") + 1]),
-    ):
-        sizes = Counter(name(item.decision.part) for item in whole)
-        assert {item.batch: item.n for item in store.decisions.stretches(batch=batch)} == sizes
 
 
 def test_an_empty_store_has_no_past() -> None:
