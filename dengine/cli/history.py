@@ -4,6 +4,7 @@ between them, and `dengine explain`, which says why one decision came out as it 
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -105,7 +106,6 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     tells more about one decision.
     """
     from ..history.status import history as read_history
-    from ..history.status import read_retrains_and_events
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
@@ -114,7 +114,14 @@ def history(store: str, events: bool, **criteria: Any) -> None:
         since = criteria["since"]
         if since is None and decisions:
             since = decisions[0].time
-        others = read_retrains_and_events(opened, since, criteria["until"]) if events else {}
+        others: dict[str, list[Any]] = {}
+        if events:
+            others["retrains"] = opened.versions.all(cell_only=True)
+            others["events"] = opened.events.newest()
+    first = since or 0.0
+    end = math.inf if criteria["until"] is None else criteria["until"]
+    for name, items in others.items():
+        others[name] = [item for item in items if first <= item.time < end]
     rows = [to_jsonable(decision) | {"label": decision.label} for decision in decisions]
     record = {"store": store, "decisions": rows} | others
     in_order = merge(*others.values(), decisions, key=lambda item: item.time)

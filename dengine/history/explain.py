@@ -26,7 +26,7 @@ from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
 from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
-from ..store.records import SAFE_MODE_BEGAN, StoredDecision, unknown_decision
+from ..store.records import POLICY_KINDS, SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from .envelope import Envelope, envelope_of
 from .past_versions import Novelty, PastVersion, load_past_version
@@ -191,9 +191,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         raise unknown_decision(decision_id)
     decision = item.decision
     recipe = Recipe.from_store(settings)
-    change = store.events.policy_change_after(decision.id)
-    if change is not None and change.data is not None:  # the policy that was in force then
-        recipe = replace(recipe, policy=Policy.from_values(change.data["old"]))
+    recipe = replace(recipe, policy=_find_policy(store, item.time, recipe.policy))
     channels, samples = item.trace.shape
     version = None
     if decision.model_version:
@@ -221,6 +219,17 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         envelope=_find_envelope(store, item, version),
         policy=recipe.policy,
     )
+
+
+def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
+    """Return the policy that was in force at a time: the old one of the first change after it.
+
+    `present` is the policy in force now.
+    """
+    for event in store.events.newest():
+        if event.kind in POLICY_KINDS and event.time > time and event.data is not None:
+            return Policy.from_values(event.data["old"])
+    return present
 
 
 def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:

@@ -347,8 +347,8 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
         answers = [(event.kind, event.author) for event in store.events.newest(4)]
     assert answers == [
         ("report", "Kim"),
-        ("shadow", "Kim"),
-        ("shadow", "Kim"),
+        ("policy", "Kim"),
+        ("policy", "Kim"),
         ("policy", "Kim"),
     ]  # nobody typed a name
 

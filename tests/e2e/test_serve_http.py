@@ -277,7 +277,7 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
             again = client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()
             assert again["event"] is None
         events = client.get("/events").json()["events"]
-        kinds = ["shadow", "policy", "policy", "forget", "correct"]
+        kinds = ["policy", "policy", "policy", "forget", "correct"]
         assert [(item["kind"], item["author"]) for item in events] == [
             (kind, "Kim Lee") for kind in kinds
         ]
@@ -510,7 +510,7 @@ def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dat
                 == status
             )
         (event,) = client.get("/events", headers=viewer).json()["events"]
-        assert (event["kind"], event["author"]) == ("shadow", "Kim")
+        assert (event["kind"], event["author"]) == ("policy", "Kim")
         assert client.get("/healthz").status_code == 200
         must_be_problem(client.get(f"/RPC2/{TOKEN}"), 404)  # let in; the interface is off here
         must_be_problem(client.get(f"/RPC2/{TOKEN}/status"), 401)

@@ -240,11 +240,10 @@ def test_the_envelope_counts_the_samples_that_leave_it_and_needs_twenty_successe
     assert envelope_of(X[:19], trace) is envelope_of(X, trace[:, :49]) is None
 
 
-@pytest.mark.parametrize("clock_goes", [1.0, 0.0, -1.0], ids=["on", "not", "back"])
 def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_made(
-    make_data, tmp_path: Path, clock_goes: float
+    make_data, tmp_path: Path
 ) -> None:
-    times = iter(np.arange(1e6) * clock_goes + 1e9)
+    times = iter(np.arange(1e6) + 1e9)
     data, window = make_data(160, samples=60), "0:0.1:-1000:1000"
     engine = played(
         SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))),

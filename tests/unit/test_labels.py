@@ -27,7 +27,7 @@ GOOD = [
     Fraction(1),
 ]
 BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
-HUGE = [10**5000, "x" * 2**20, list(range(10**5))]
+HUGE = ["x" * 2**20, list(range(10**5))]
 NONE = [
     100,
     -1,
