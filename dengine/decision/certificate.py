@@ -8,8 +8,8 @@ drift detectors of `members`.
 
 With probability 1 - alpha the bound is, at all moments together, at or above the mean of the
 failure probabilities that the parts so far really had. These may differ and drift, the model may be
-retrained, and its rule may learn from every outcome. The one assumption is that an audit coin falls
-with the stated probability whatever the part is. An audit that is overdue (`Policy.label_within`)
+retrained, and its rule may learn from every outcome. The one assumption is that audits are drawn
+with the stated probability, whatever the part is. An audit that is overdue (`Policy.label_within`)
 counts as bad until it is reported, so that a lost one cannot make the bound smaller; a younger one
 is left out. The bound is about parts so far, not about those to come.
 
@@ -45,10 +45,10 @@ BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capit
 
 
 def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) -> float:
-    """Return the log capital of a bettor who stakes on a mean failure probability below tolerance.
+    """Return the log capital of a bettor who bets that parts fail less often than `tolerance`.
 
     The capital starts at 1, so the result is 0 for no parts. It falls with each bad part, unless
-    tolerance and propensity are 1, and rises with each other one, unless the tolerance is 0. It is
+    tolerance and propensity are 1, and rises with each other part, unless the tolerance is 0. It is
     a weighted mean of six capitals, each with a fixed stake. No argument is checked.
 
     Parameters
@@ -58,7 +58,7 @@ def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) 
     n_bad : int
         Parts among them whose outcome was asked for and is bad.
     tolerance : float
-        From 0 to 1.
+        Mean failure probability, from 0 to 1.
     propensity : float, default 1.0
         Probability, above 0, with which the outcome of each part was asked for. If it changed, the
         smallest value is on the safe side.
@@ -66,8 +66,8 @@ def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) 
     Returns
     -------
     float
-        log(1 / alpha) or more refutes, at error level alpha, that the mean is at the tolerance or
-        above.
+        log(1 / alpha) or more refutes, at error level alpha, that the mean failure probability of
+        the parts is at the tolerance or above.
     """
     rate = propensity * tolerance
     logs = [n_bad * math.log1p(-bet) - n * math.log1p(-bet * rate) for bet in BETS]
@@ -138,15 +138,15 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     share : float
         Probability, above 0 and below 0.5, with which a part may be wrong.
     parts : float
-        Mean number of parts to a false alarm, at least, while each part is wrong with probability
-        `share` or less given the past.
+        So many parts, or more, shall pass on average before a false alarm, as long as each part is
+        wrong with probability `share` or less given the past.
 
     Returns
     -------
     step : int
         At least 1.
     limit : int
-        The smallest, from 1 on, whose mean number of parts to a false alarm is `parts` or more.
+        The smallest limit, from 1 on, with which so many parts pass.
 
     References
     ----------
@@ -243,7 +243,7 @@ class OutcomeBound:
     upper : float
         The bound; 1 if nothing is known.
     shadowed : bool
-        Whether each of them was audited, as in shadow mode.
+        Whether each of the parts was audited, as in shadow mode.
     """
 
     n: int
@@ -271,7 +271,8 @@ class Certificate:
     rejected : OutcomeBound
         On the mean probability that a rejected part was good.
     prices : three floats or None
-        Of a check, an escape and a false reject, if these decide; see `Policy`.
+        Prices of a check, of a bad accepted part and of a good rejected part, if the policy decides
+        by prices.
     """
 
     alpha: float
@@ -284,10 +285,10 @@ class Certificate:
     def saved(self) -> float | None:
         """Lower bound on what was saved by not checking accepted parts, in the unit of the prices.
 
-        With the prices of a check and of an escape it is check * n_unchecked - escape *
-        min(n_unchecked, n * upper), an expectation as the bound is: an audited part saves no check,
-        and it cannot escape. It may be negative: then not checking may have cost money. None
-        without prices.
+        It is check * n_unchecked - escape * min(n_unchecked, n * upper), where `check` and `escape`
+        are the prices of a check and of a bad part that is accepted. An audited part saves no
+        check, and it cannot escape. Like `upper` it bounds an expectation. It may be negative: then
+        not checking may have cost money. None without prices.
         """
         if self.prices is None:
             return None
@@ -295,7 +296,7 @@ class Certificate:
         return checks - escapes
 
     def _checks_and_escapes(self, prices: tuple[float, float, float]) -> tuple[float, float]:
-        """Return what the checks that were left out would have cost, and bad parts cost at most."""
+        """Return the price of the checks left out, and an upper bound on the cost of bad parts."""
         check, escape, _ = prices
         n_unchecked = self.accepted.n_unchecked
         n_escaped = min(n_unchecked, self.accepted.n * self.accepted.upper)
@@ -310,11 +311,11 @@ class Certificate:
     def sentence(self) -> str:
         """The claim about accepted parts in English: "Of 1,203 parts ..., at most 3.5 % were bad".
 
-        It names the confidence and the tolerance. Where nothing can be claimed it says so, and why.
+        It names the confidence and the tolerance. If nothing can be claimed, it says so, and why.
         With prices it also says what the checks that were left out would have cost, what bad parts
-        cost at most, rounded up, and what is left of it, rounded down: saved for certain, or lost
-        at most. That is missing if the bound is 1 or all were checked. The last sentence says when
-        accepting pauses.
+        cost at most, rounded up, and the difference, rounded down: what was saved at least, or lost
+        at most. These costs are missing if the bound is 1 or all parts were checked. With prices
+        the last sentence says when accepting pauses.
         """
         unknown = (
             "silence is no success: set audit_rate, or stops='all' where every bad part stops the "
@@ -346,7 +347,7 @@ class Certificate:
     def sentence_on_rejects(self) -> str:
         """The claim about rejected parts as one sentence.
 
-        Where nothing can be claimed it says so, and why.
+        If nothing can be claimed, it says so, and why.
         """
         unknown = "nobody looks at what is rejected: set audit_rate"
         return self._claim(self.rejected, "rejected without a check", "reject", "good", unknown)
@@ -355,11 +356,13 @@ class Certificate:
         """Return the claim about a group of parts as one sentence.
 
         It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
-        tolerance or, with prices, the share up to which the decision pays. `which` describes parts
-        without a check; if the claim rests on audits, their number and `verb`, what the model would
-        do, stand instead. `wrong` is what a part was that was decided wrongly. The sentence says
-        that nothing can be said if the group is empty, no outcome was asked for (`unknown` is the
-        reason), or the bound is 1.
+        tolerance or, with prices, the share up to which the decision pays. It says that nothing can
+        be said if the group is empty, if no outcome was asked for (`unknown` is the reason), or if
+        the bound is 1.
+
+        `which` describes the parts, for example "rejected without a check". A claim that rests on
+        audits names instead the parts that the model would `verb`, for example "reject", and how
+        many of them were audited. `wrong` says what a wrongly decided part was, "bad" or "good".
         """
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""
@@ -404,7 +407,7 @@ def certify(
     Parameters
     ----------
     outcomes : Outcomes
-        Under "all" without accepted parts whose outcome is still open.
+        If `stops` is "all", accepted parts whose outcome is still open must be left out of it.
     alpha : float
         Error level.
     tolerance : float
@@ -429,13 +432,13 @@ def certify(
 
     Notes
     -----
-    Under "all", or if every accepted part was confirmed or stopped the line, all outcomes are
+    If `stops` is "all", or every accepted part was confirmed or stopped the line, all outcomes are
     known, and the bound is about the accepted parts. Otherwise it comes from audits and is about
     all parts that the model would have accepted, those that were audited included; it is never
-    below the share known to be bad. Without audits it is 1. Where both ways are possible they share
-    alpha, a tenth for known outcomes and nine tenths for audits, so that whoever sees now the one
-    bound and now the other is wrong with probability alpha at most. The bound on rejected parts
-    comes from audits, and without these it is 1; it is never below the share known to be good. A
+    below the share known to be bad. Without audits it is 1. If either bound may come up, they share
+    alpha, a tenth for known outcomes and nine tenths for audits: whoever sees one of them now and
+    the other later is then wrong with probability alpha at most. The bound on rejected parts comes
+    from audits, and without these it is 1; it is never below the share known to be good. A
     forgotten or overdue label counts as a wrong decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)

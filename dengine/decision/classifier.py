@@ -64,7 +64,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Parameters
         ----------
         Z : array, shape (n, d)
-            Embeddings. Of more than `capacity` the last rows stay.
+            Embeddings. If there are more than `capacity` rows, the last ones stay.
         y : array, shape (n,)
             Labels of at most two classes.
 

@@ -1,11 +1,11 @@
 """Detects code that was changed after TorchScript compiled it: torch compiles each class once.
 `remember_code` notes the code of a module when `scripting.script` compiles it, and
-`is_code_changed` says later whether it is another. The model then answers in Python, and the export
+`is_code_changed` says later whether it is another. The model then decides in Python, and the export
 refuses.
 
 A notebook cell that is run again defines another class, which is compiled. But if a method, a
 function that it calls or a constant of a module is replaced, the class stays the same, and torch
-answers with the code of before.
+goes on with the code of before.
 """
 
 import sys
@@ -63,10 +63,10 @@ def _is_of_library(value: Any) -> bool:
 
 
 def _code_of(unit: Any) -> list[Any]:
-    """Return what tells whether a function, or any method of a class, has changed.
+    """Return a list by which `==` tells whether a function, or any method of a class, has changed.
 
-    It is a list to be compared with `==`: of each function the byte code, the defaults and the
-    values that it names, of a class also its plain attributes. Bases of `LIBRARIES` are left out.
+    For each function it holds the byte code, the defaults and the values that the code names; for a
+    class also its plain attributes. Base classes that belong to `LIBRARIES` are left out.
     """
     if isinstance(unit, FunctionType):
         return [_note(unit), *_named_values(unit)]
@@ -84,8 +84,8 @@ def _code_of(unit: Any) -> list[Any]:
 def _named_values(function: FunctionType) -> list[Any]:
     """Return the name of each global and closure variable that a function reads, with its `_note`.
 
-    They are compared later, to see whether one has changed. [] if a variable has no value, so that
-    nothing of this function's variables is compared.
+    They are compared later, to see whether a variable has changed. If one of them has no value, the
+    list is empty: then no variable of this function is compared.
     """
     try:
         variables = getclosurevars(function)
@@ -96,10 +96,11 @@ def _named_values(function: FunctionType) -> list[Any]:
 
 
 def _note(value: Any, names: Collection[str] = ()) -> Any:
-    """Return what a value is compared by: a function's code, a constant's text, else None.
+    """Return the part of a value that is compared later, to see whether the value has changed.
 
-    None also for a function of `LIBRARIES`: a change of such a value is not noticed. Of a module
-    that is no library, those of its variables that are among `names`.
+    For a function it is the code with its defaults, for a constant its text, and for a module the
+    notes of its variables among `names`. For any other value, and for functions and modules of
+    `LIBRARIES`, it is None: a change of these is not noticed.
     """
     if isinstance(value, FunctionType) and not _is_of_library(value):
         return value.__code__, repr(value.__defaults__)

@@ -43,7 +43,7 @@ class DecisionConditions:
     audit_rate : float
         Probability with which a certain decision is verified all the same.
     seed : int
-        Seed of the audit coin, which is a fixed function of seed and trace.
+        Seed of the audit draw, which is a fixed function of seed and trace.
     """
 
     trace: TraceSpec
@@ -99,7 +99,7 @@ class Decider(nn.Module):
         """Decide on one trace.
 
         First come faults of the trace, then the operator's force limits, then the model, then the
-        audit coin. The model is asked only if the trace has no fault and is within the limits.
+        audit draw. The model predicts only if the trace has no fault and is within the limits.
 
         Parameters
         ----------
@@ -117,17 +117,17 @@ class Decider(nn.Module):
         content : int
             Content hash of the trace (`folds.content_hash`).
         action, predicted : int
-            `ActionCode`s: what to do, and what the model alone would do. They differ in an
-            audit, and where a force limit rejects. `predicted` is VERIFY where the model was not
-            asked.
+            `ActionCode`s: what to do, and what the model alone would do. They differ in an audit,
+            and if a force limit rejects. `predicted` is VERIFY if the model did not predict.
         reason : int
-            Position in `Reason`; the fault's of a faulty trace.
+            Position in `Reason`; for a faulty trace it is the fault.
         lower, upper : float
             Bound on the success probability; (0, 1) without a prediction.
         n_success, n_failure : int
             Labels within the radius; 0 without a prediction.
         embedding : Tensor of float32, shape (K, d)
-            By the predictor, also where a force limit decides; NaN for a faulty trace.
+            A point in each of the K embedding spaces, also if a force limit decides; NaN for a
+            faulty trace.
         propensity : float
             Probability, fixed beforehand, that this part is verified: the audit rate if the model
             is certain, 0 if a force limit rejects, otherwise 1.
@@ -172,10 +172,10 @@ class Decider(nn.Module):
 
     @torch.jit.export
     def toss(self, value: int) -> int:
-        """Return a uniform integer below 2**30 that is a fixed function of the value.
+        """Return a pseudo-random integer from 0 to 2**30 - 1 that is a fixed function of the value.
 
-        It is `folds.toss` without a salt. The arithmetic is on tensors because int64 wraps around
-        there, compiled or not.
+        It is the number that `folds.toss` returns for this value. The arithmetic is on tensors
+        because int64 wraps around there, compiled or not.
         """
         h = torch.tensor(value)
         h = (h ^ (h >> 32)) * self.mix

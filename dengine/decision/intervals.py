@@ -9,8 +9,8 @@ into z.
 
 The public functions take integer arrays and return `(lower, upper)` with `0 <= lower <= n_success /
 n <= upper <= 1`. Each interval is two-sided at error level alpha: z is the 1 - alpha / 2 quantile
-of the normal distribution, and each tail holds alpha / 2. Where nothing was counted, the interval
-is (0, 1).
+of the normal distribution, and each tail holds alpha / 2. If nothing was counted, the interval is
+(0, 1).
 
 The Wilson and the Wald formula stand here twice, and nowhere else. `wilson_limits` and
 `wald_limits` are written for NumPy arrays and for PyTorch tensors alike (they are given the library
@@ -50,7 +50,7 @@ def interval_error_level(alpha: float, guarantee: str) -> float:
     Returns
     -------
     float
-        `SORTING_ERROR_LEVEL` where the interval only sorts parts, else `alpha`.
+        `SORTING_ERROR_LEVEL` if the interval only sorts parts, else `alpha`.
     """
     return SORTING_ERROR_LEVEL if guarantee in SORTING_GUARANTEES else alpha
 
@@ -228,7 +228,7 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
     Returns
     -------
     lower, upper : float64 array or tensor of that shape
-        Cut to [0, 1]; (0, 1) where nothing was counted.
+        Cut to [0, 1]; (0, 1) if nothing was counted.
     """
     n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
     half_width = z / xp.sqrt(n) * xp.sqrt(n_success * n_failure / (n * n))
@@ -239,8 +239,8 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
 def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
     """Compute `wilson_interval` of two integers at the normal quantile z.
 
-    Returns (lower, upper) within [0, 1], which is (0, 1) where both counts are 0. TorchScript
-    compiles it.
+    Returns (lower, upper) within [0, 1], which is (0, 1) if both counts are 0. TorchScript compiles
+    it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:
@@ -254,8 +254,8 @@ def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float
 def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
     """Compute `wald_interval` of two integers at the normal quantile z.
 
-    Returns (lower, upper) within [0, 1], which is (0, 1) where both counts are 0. TorchScript
-    compiles it.
+    Returns (lower, upper) within [0, 1], which is (0, 1) if both counts are 0. TorchScript compiles
+    it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:
@@ -319,7 +319,7 @@ def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, 
 def _clip_limits(
     xp: Any, lower: Any, upper: Any, n_success: Any, n_failure: Any
 ) -> tuple[Any, Any]:
-    """Return limits within [0, 1] that enclose the observed rate, (0, 1) where nothing was counted.
+    """Return limits within [0, 1] that enclose the observed rate; (0, 1) if nothing was counted.
 
     All are float64 arrays (`xp` is numpy) or tensors (`xp` is torch). Rounding alone could push a
     limit past the rate or out of [0, 1].

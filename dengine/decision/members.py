@@ -73,10 +73,10 @@ class SafeMode(IntEnum):
 
 
 def max_recent_errors(tolerance: float) -> int:
-    """Return the smallest k for which more than k of `N_RECENT` outcomes are unlikely to be wrong.
+    """Return how many of the newest `N_RECENT` outcomes of a level may be wrong.
 
-    More are wrong with a probability of at most `TAIL_PROBABILITY` if each outcome is wrong with
-    the probability `tolerance`, independently.
+    It is the smallest k for which more than k are wrong with a probability of at most
+    `TAIL_PROBABILITY`, if each outcome is wrong with the probability `tolerance`, independently.
     """
     tail = 1.0
     k = -1
@@ -131,8 +131,8 @@ class MemberEvidence(nn.Module):
     levels : two lists of float
         For each side the candidate levels of the score, strictest first; as many on each side.
     inclusion_probability : float, default 1.0
-        Probability, fixed beforehand, that the outcome of a certain decision is asked for; 1 where
-        all outcomes are known.
+        Probability, fixed beforehand, that the outcome of a certain decision is asked for; 1 if all
+        outcomes are known.
     kind : {"watched", "pooled", "priced"}, default "pooled"
         "watched": the first level is open from the start and closes at an alarm. "pooled": a level
         opens by the bet. "priced": a level opens by the account.
@@ -235,8 +235,8 @@ class MemberEvidence(nn.Module):
     def action(self, lower: float, upper: float) -> int:
         """Return the `ActionCode` that a bound allows at present.
 
-        It accepts where `lower` reaches the accept threshold, and rejects where 1 - `upper` reaches
-        the reject threshold. Where both hold, or neither, it verifies.
+        It accepts if `lower` reaches the accept threshold, and rejects if 1 - `upper` reaches the
+        reject threshold. If both hold, or neither, it verifies.
         """
         thresholds: list[float] = self.thresholds.tolist()
         accepts = lower >= thresholds[0]
@@ -248,13 +248,15 @@ class MemberEvidence(nn.Module):
     def observe(self, n_unreported: int, novel: bool) -> None:
         """Step the drift detectors with parts of unknown outcome and the novelty of one trace.
 
-        A detector is a sum of errors that raises an alarm, and so starts the safe mode, at a limit.
-        This is called just before `update`, for the same part. `n_unreported` accepted parts went
-        on since the last label. They count as not wrong, and outside of a safe mode as not novel,
-        so they lower the sums. `novel` says whether the trace of this part was novel. Outside of a
-        safe mode it steps the detector of novel traces, which may start one. In a safe mode for
-        novel traces the same sum counts how long few have been novel; `update` ends it. In any
-        other safe mode `novel` has no effect.
+        It is called just before `update`, for the same part. A detector is a running sum of errors;
+        when the sum reaches a limit, it raises an alarm, which starts the safe mode. `n_unreported`
+        accepted parts went on since the last label. They count as not wrong, and outside of a safe
+        mode as not novel, so they lower the sums.
+
+        `novel` says whether the trace of this part was novel. Outside of a safe mode it steps the
+        detector of novel traces. In a safe mode for novel traces, the sum of that detector counts
+        how long few traces have been novel, by which `update` ends the safe mode. In any other safe
+        mode `novel` has no effect.
         """
         self.step_detector(Detector.ACCEPTED_PARTS.value, self.correct_step, n_unreported)
         safe_mode = int(self.safe_mode.item())
@@ -280,16 +282,16 @@ class MemberEvidence(nn.Module):
         """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
 
         `lower` and `upper` are the bound that the part was decided by, `success` is its label, and
-        `predicted` (an `ActionCode`) what the model alone would have done. Where all outcomes are
-        known, every part counts as checked. Elsewhere `inclusion_probability`, with which the
-        outcome would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0
-        only the drift detectors see it. A wrong outcome may raise an alarm, which starts the safe
-        mode: both sides (accepting, rejecting) are closed, so every part is verified until one has
-        a threshold again that is not `CLOSED`.
+        `predicted` (an `ActionCode`) is what the model alone would have done. If the rule knows all
+        outcomes (its own inclusion probability is 1), every part counts as checked. Otherwise
+        `inclusion_probability`, with which this outcome would be asked for, says how it counts: 1
+        as checked, above 0 as audited, and at 0 only the drift detectors see it. A wrong outcome
+        may raise an alarm, which starts the safe mode: both sides (accepting, rejecting) are
+        closed, so every part is verified until one has a threshold again that is not `CLOSED`.
 
-        A safe mode ends only here: after an alarm of a side when that side has such a threshold
-        (the other side may have one before, and then decides again); after too many novel traces
-        (unlike all references), when they are few again and either side has one.
+        A safe mode ends only here. After an alarm of a side it ends when that side has such a
+        threshold; the other side may have one earlier, and then decides again. After too many novel
+        traces it ends when few traces are novel again and either side has such a threshold.
         """
         side = Detector.ACCEPTED_PARTS.value
         self.count_outcome(side, lower, not success, predicted, inclusion_probability)
@@ -314,15 +316,17 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count one part of known outcome on one side, then choose the threshold of that side.
 
-        The sides are the first two of `Detector`. The score for accepting is the lower bound, for
-        rejecting 1 - upper bound. `wrong` says whether the side's action would have been wrong. If
-        the score reaches the threshold, the drift detector of the side takes a step first, which
-        may start the safe mode. Then each level that the score reaches counts the part. It is a
-        member (one of the parts that the claim is about) if it reaches the target level, the one
-        that `choose_threshold` found last and after an alarm the strictest, or if `predicted` is
-        the side's action. It counts as one part, without a weight. If the rule knows all outcomes,
-        it counts as checked; else this part's `inclusion_probability` says how: 1 as checked, above
-        0 as audited, and 0 not at all. No threshold is chosen if the part is counted nowhere.
+        Side 0 accepts, and its score is the lower bound; side 1 rejects, and its score is 1 - upper
+        bound. `wrong` says whether the side's action would have been wrong. If the score reaches
+        the threshold, the drift detector of the side takes a step first, which may start the safe
+        mode.
+
+        If the rule knows all outcomes, the part counts as checked; otherwise
+        `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. Each
+        level that the score reaches counts the part. The part is a member (one of the parts that
+        the claim is about) if its score reaches the target level, or if `predicted`, what the model
+        alone would have done, is the side's action. No threshold is chosen if the part is counted
+        nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -363,8 +367,9 @@ class MemberEvidence(nn.Module):
     def add_steps(self, detector: int, step: float, times: int) -> float:
         """Add `step` to a detector's sum `times` times, once or more, and return the new sum.
 
-        Before each step a sum below 0 is taken as 0, so the new sum may be one step below 0. More
-        than one step must be negative: only then do the earlier ones need no look at the limit.
+        Before each step a sum below 0 is taken as 0, so the new sum may be one step below 0. If
+        `times` is above 1, `step` must be negative: the caller compares only the new sum with the
+        limit.
         """
         before = float(self.detector_sums[detector].item())
         total = max(before + (times - 1) * step, 0.0) + step
@@ -374,8 +379,8 @@ class MemberEvidence(nn.Module):
     def raise_alarm(self, detector: int) -> None:
         """Start the safe mode (every part is verified) for a detector, or start it anew during one.
 
-        During one the reason is that of the two which stands first in `SafeMode`: a side that has
-        not shown its tolerance yet stays the reason when novel traces come on top.
+        An alarm during a safe mode keeps the reason that stands first in `SafeMode`: a side that
+        has not shown its tolerance yet stays the reason when novel traces come on top.
         """
         safe_mode = int(self.safe_mode.item())
         reason = SafeMode.ACCEPTED_PARTS.value + detector
@@ -398,13 +403,15 @@ class MemberEvidence(nn.Module):
     def choose_threshold(self, side: int) -> None:
         """Set target level and threshold of one side, accept or reject, from the counts.
 
-        The target is the lowest level whose parts since the last alarm pass the bet (their log
-        capital is enough; under the priced rule the balance of their costs) and, under the pooled
-        rule, whose newest parts have few errors; if there is none, it is the strictest level. The
-        threshold is the target's score if such a level was found, the members of all time pass, and
-        those since an alarm show recovery; else it is `CLOSED`. The watched rule has no target: its
-        threshold stays, and after an alarm is the first level again once the members since then
-        show recovery.
+        The target is the lowest level whose parts since the last alarm give enough evidence: log
+        capital of the bet, or under the priced rule balance of costs. Under the pooled rule its
+        newest parts must also have few errors. If no level is like this, the target is the
+        strictest level. The threshold is the score of the target if such a level was found, all
+        members so far give enough evidence, and the members since an alarm, if there was one, show
+        recovery; otherwise it is `CLOSED`.
+
+        The watched rule has no target. Only an alarm closes its threshold, which becomes the first
+        level again once the members since the alarm show recovery.
         """
         is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it
@@ -438,11 +445,11 @@ class MemberEvidence(nn.Module):
         return weighted_sum(counts, self.level_steps[side]) >= self.level_minimum[side]
 
     def members_to_recovery(self, side: int) -> float:
-        """Return how many more members a side needs to recover, if they go on like since the alarm.
+        """Return how many more members a side needs until it shows recovery from an alarm.
 
-        Members are the parts that the rule's claim is about; a side accepts or rejects, and is
-        closed by an alarm. It is 0 or less once they show recovery, so that the side may open
-        again. It is huge, about 1e12, while more evidence is needed and it does not grow. The
+        Members are the parts that the rule's claim is about. It is assumed that their outcomes go
+        on as they were since the alarm. The result is 0 or less if they show recovery now, so that
+        the side may open again. It is huge, about 1e12, while their evidence does not grow. The
         priced rule needs at least `FEWEST_SINCE_ALARM` members.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()

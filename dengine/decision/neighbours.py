@@ -18,8 +18,8 @@ SAFE_MODE = REASONS.index(Reason.SAFE_MODE)
 def fade(probability: float, n_labels: int, prior_labels: float) -> float:
     """Return a probability that is drawn towards 1/2 while a model has learned from few labels.
 
-    Its logit is multiplied by n / (n + `prior_labels`), where n is the number of labels. Without
-    `prior_labels` the probability stays.
+    Its logit is multiplied by n / (n + `prior_labels`), where n is the number of labels. If
+    `prior_labels` is 0, the probability is returned unchanged.
     """
     if prior_labels == 0.0:
         return probability
@@ -41,10 +41,11 @@ class RadiusNeighbours(nn.Module):
     radius : float
         Radius within which labels count, in units of the scaled embedding, surface included.
     scored : bool, default False
-        Whether the first axis of each space is a probability of success. A rule whose bound only
-        sorts then takes the mean of these for both ends of the bound: it uses all labels except the
-        part's own. For a rule with `prior_labels` the mean is drawn towards 1/2 (`fade`). The
-        counts are returned all the same.
+        Whether to decide by a score: the first coordinate in each embedding space must be a
+        probability of success, and the bound of `rule` must only sort parts. The mean of these
+        probabilities is then both ends of the bound: it uses all labels except the part's own. For
+        a rule with `prior_labels` the mean is drawn towards 1/2 (`fade`). The counts are returned
+        all the same.
     """
 
     def __init__(
@@ -77,7 +78,7 @@ class RadiusNeighbours(nn.Module):
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
-            The scaled embedding in each of the K spaces.
+            The scaled embedding in each of the K embedding spaces.
         part : int, default 0
             Hash of its part, whose own references do not count; 0 for an unknown part.
 
@@ -87,10 +88,10 @@ class RadiusNeighbours(nn.Module):
             0 verify, 1 accept, 2 reject.
         lower, upper : float
             Bound on the success probability, from the counts. If `scored`, both are the mean of the
-            first axis over the K spaces, drawn towards 1/2 by the rule's `prior_labels` (`fade`),
-            and the action follows from it.
+            first coordinates in the K spaces, drawn towards 1/2 by the rule's `prior_labels`
+            (`fade`), and the action follows from it.
         n_success, n_failure : int
-            Labels within the radius; several of one part may count as fewer.
+            Labels within the radius; several labels of one part may count as fewer.
         """
         distances = self.references.squared_distances(z, part)
         n_success, n_failure = self.references.count_near(distances, self.radius)

@@ -70,12 +70,12 @@ class NoveltyGate(nn.Module):
     discriminants : Tensor of float32, shape (P, D)
     offset, gain : Tensor of float32, shape (4, P + D)
         For level, texture, distortions and gaps: they standardise the features of the group,
-        divided by the root of its limit, and are zero for the features of the others.
+        divided by the root of its limit, and are zero for the features of the other groups.
     points : Tensor of float32, shape (P + D, REFERENCES)
         Standardised features of the references, one column each.
     norms : Tensor of float32, shape (4, REFERENCES)
         Squared norm of each reference in each group, less what it reaches farther than others;
-        infinity for no reference.
+        infinity in a column without a reference.
     """
 
     noise_floor: Tensor
@@ -118,12 +118,14 @@ class NoveltyGate(nn.Module):
 
     @torch.jit.export
     def scores(self, x: Tensor) -> Tensor:
-        """Return how far a trace (C, T) lies from its nearest reference, (4,) float32.
+        """Return four scores of a trace (C, T), float32 (4,); a trace with one above 1 is novel.
 
-        Each is a squared distance over its limit, so above 1 is novel: by level, texture,
-        distortion and gaps. References are traces of the training. A score may be below 0 near a
-        reference with a larger reach than others, and it is NaN or infinite where features
-        overflow.
+        Each score looks at one group of features: the level of the signals, their texture (how
+        rough they are), distortions (what a faulty sensor or clock would do), and gaps. It is the
+        squared distance to the nearest reference in these features, divided by the limit of the
+        group; references are traces of the training. A reference in a small cluster of unusual
+        traces counts as nearer than it is, so a score near it may be below 0. A score is NaN or
+        infinite if a feature overflows.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])
@@ -134,10 +136,11 @@ class NoveltyGate(nn.Module):
     def plain_features(self, x: Tensor) -> Tensor:
         """Return the features of traces (..., C, T) that are not distortions, (..., P) float32.
 
-        For each channel they are the S minima and the S maxima of the segments, then logarithms of
-        roughness, which is a norm of differences: of first differences in the S segments, of second
-        differences in the S segments, and three of first differences for gaps: in the quietest of
-        the longer brief stretches, in the quietest and in the loudest of the brief ones.
+        For each channel they are the S minima and the S maxima of the segments, then 2*S + 3
+        logarithms of roughness, which is a norm of differences. The first S are of first
+        differences in the segments, the next S of second differences in the segments. The last
+        three, for gaps, are of first differences in brief stretches: the least over stretches of
+        twice the brief length, then the least and the largest over stretches of the brief length.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
@@ -155,7 +158,7 @@ class NoveltyGate(nn.Module):
         return torch.cat([pieces.amin(-1), pieces.amax(-1), logs], -1).flatten(-2)
 
     def stretch_lengths(self) -> list[int]:
-        """Return how many samples each roughness of a channel is taken over, of 2*S + 3.
+        """Return how many samples each of the 2*S + 3 roughnesses of a channel is taken over.
 
         The order is that of `plain_features`.
         """
@@ -177,20 +180,21 @@ def fit_novelty(
 ) -> NoveltyGate:
     """Fit the gate that takes these traces for usual; there is no randomness.
 
-    At most `REFERENCES` of the traces, evenly spaced in time, become its references; of these, ones
-    whose features overflow are left out.
+    At most `REFERENCES` of the traces, evenly spaced in time, become its references; of these,
+    traces whose features overflow are left out.
 
     Parameters
     ----------
     traces : array of float32, shape (n, C, T)
         Finite, with any labels, oldest first.
     margin : float
-        Factor on the limits, which are 99.5 % quantiles of the references' squared distances to the
-        nearest other reference, or lower where outliers would set these. With fewer than 200
-        different references, and for distortions fewer than `REFERENCES`, the limits are wider.
+        Factor on the limits. A limit is the 99.5 % quantile of the references' squared distances to
+        the nearest other reference, or less, so that a few outliers do not set it. The limits are
+        wider with fewer than 200 different references, and those for distortions with fewer than
+        `REFERENCES`.
     parts : array of int64, shape (n,), optional
         Hashes of the parts; None: each trace is a part of its own. Only distances between different
-        parts and different traces count, for what came twice is near itself.
+        parts and different traces count, because a trace that came twice is near itself.
 
     Returns
     -------
@@ -246,8 +250,8 @@ def fit_novelty(
 def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     """Return what is added to each roughness before its logarithm, float32, shape (C, 2*S + 3).
 
-    It is a twentieth of the roughness that the median of the traces x (n, C, T) has over as long a
-    stretch, and 1e-12 for a channel that never moved: any movement there is then far away.
+    It is a twentieth of the median roughness of the traces x (n, C, T), scaled to the length of the
+    stretch. For a channel that never moved it is 1e-12: any movement there is then far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))
@@ -260,8 +264,9 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
 def _distort(x: Tensor) -> list[Tensor]:
     """Return distorted copies of traces (n, C, T): a list of `DISTORTIONS` tensors of that shape.
 
-    They are what a sensor or a clock would make of the traces, each both ways: gain and fading gain
-    (4), offset, drift and a step (6), speed and delay (4). Beyond its ends a trace is mirrored.
+    They are what a sensor or a clock would make of the traces, each in both directions: gain and
+    fading gain (4), offset, drift and a step (6), speed and delay (4). Beyond its ends a trace is
+    mirrored.
     """
     n_samples = x.size(2)
     t = torch.linspace(0.0, 1.0, n_samples)
@@ -283,11 +288,11 @@ def _distort(x: Tensor) -> list[Tensor]:
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) -> Tensor:
     """Return Fisher's discriminants between traces and their distortions, float32, shape (P, D).
 
-    Column j separates the traces from their j-th distortion. x (n, C, T) are the traces, plain (n,
-    P) float64 their features, not standardised, as the discriminants take them. used (P,) bool
-    marks the features that the discriminants read; the rows of the others are 0. Fewer than two
-    times `DISTORTED` of the traces, evenly spaced, are distorted. The mean is taken over these, and
-    standardised features are clipped at 6 deviations.
+    Column j separates the traces from their j-th distortion; it is for features that are not
+    standardised. x (n, C, T) are the traces, and plain (n, P), float64, their features. used (P,),
+    bool, marks the features that the discriminants read; the rows of the others are 0. Only some of
+    the traces are distorted, evenly spaced and fewer than two times `DISTORTED`; the mean
+    difference is taken over these. Inside, standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
@@ -309,8 +314,8 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
 
     A glitch among the references must not be the measure of the others, so mean and deviation are
     computed after the outermost values of each feature (n, P) are drawn in. A floor is added to the
-    deviation, so the gain is finite: a feature that never moved is far away once it moves, but not
-    by the rounding of its own size.
+    deviation, so the gain is finite. It is so small that a feature which never moved is far away
+    once it moves, but larger than the rounding errors of that feature.
     """
     n = len(features)
     n_outer = 1 + n // TAIL_TRACES
@@ -342,15 +347,18 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
 
 
 def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
-    """Return (usual squared distance between nearest points, reach of each point (n,)).
+    """Return (usual squared distance between nearest points, squared reach of each point (n,)).
 
-    `points` is (n, P); `same` (n, n) bool marks pairs whose distance does not count. The usual
-    distance is the `QUANTILE` of the squared distances to the nearest other point, capped at six
-    times their 0.9 quantile, so that a few outliers are not the measure of the others; it is 0.001
-    at least. Outliers are the points whose nearest is farther than that, or than three times the
-    0.9 quantile. The reach, squared as well, is the usual distance. Where more than three points
-    are outliers, one reaches to its third nearest outlier, if that is farther and all other points
-    are more than twice as far: such a cluster is a kind of its own.
+    `points` is (n, P); `same` (n, n), bool, marks pairs whose distance does not count. The usual
+    distance is the `QUANTILE` of the squared distances to the nearest other point. It is capped at
+    six times their 0.9 quantile, so that a few outliers are not the measure of the others, and is
+    at least 0.001. Outliers are the points whose nearest point is farther than that, or farther
+    than three times the 0.9 quantile.
+
+    The reach of a point is the usual distance. But if more than three points are outliers, some of
+    them may be a cluster, a kind of its own: an outlier reaches to its third nearest outlier if all
+    points that are no outliers are more than twice as far as that one. The reach is never less than
+    the usual distance.
     """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)

@@ -66,8 +66,8 @@ class Policy:
     shadow : bool, default False
         Shadow mode: every part is verified, and the model only says what it would have done.
     label_within : int, default 1000
-        Number of decisions within which a verification or an audit must be reported. Until it is
-        reported, an overdue one counts as a wrong decision, in the certificate and in the rule. The
+        A check, or an audit, is overdue if it has no report within this number of later decisions.
+        Until it is reported it counts as a wrong decision, in the certificate and in the rule. The
         unit is decisions, not seconds: a cell may stand still, and a replay gives the same result.
     force_limits : tuple of ForceLimits or str, default ()
         The operator's limits beside the model. A trace that leaves one of them is verified or
@@ -194,9 +194,10 @@ class Policy:
     def changed(self, **settings: Any) -> Self:
         """Return a copy with these settings changed.
 
-        Prices without a guarantee change the same settings as in a new policy: "cost" replaces
-        "local" and "pooled", which have no prices, and an audit rate of 0.05 replaces 0.
-        Raises SettingError for a value out of its range.
+        If `prices` are among them, and this policy has the guarantee "local" or "pooled", which
+        have no prices, then the guarantee becomes "cost", and an audit rate of 0 becomes 0.05. A
+        guarantee or an audit rate among the settings is taken instead. Raises SettingError for a
+        value out of its range.
         """
         implied: dict[str, Any] = {}
         if "prices" in settings and self.guarantee in ("local", "pooled"):
@@ -236,9 +237,9 @@ class Policy:
     def inclusion_probability(self) -> float:
         """Probability that the outcome of a certain decision is known; it is an argument of rules.
 
-        Where all line stops are known it is 1, of rejects too: nothing is claimed of rejects there,
-        because few audits would keep them closed for hundreds of parts. Else it is `audit_rate`,
-        but 1 where that is 0: without audits it says nothing.
+        It is 1 if all line stops are known, for rejects, too: nothing is claimed of rejects then,
+        because few audits would keep them closed for hundreds of parts. Otherwise it is
+        `audit_rate`, or 1 if that is 0: without audits it says nothing.
         """
         return 1.0 if self.stops == "all" else self.audit_rate or 1.0
 

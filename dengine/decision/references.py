@@ -54,8 +54,8 @@ def label_agreement(
     labels : array of int, shape (n,)
         1 is success, 0 is failure.
     spaces : array of int64, shape (n,)
-        Space of each point, the number of the encoder that embedded it; all points of a part are in
-        one.
+        Embedding space of each point, the number of the encoder that embedded it; all points of a
+        part are in one space.
     parts : array of int64, shape (n,)
         Hash of each point's part; 0 for an unknown part.
 
@@ -97,8 +97,8 @@ def _success_rate_around(
     """Return for each point the success rate among the nearest points of other parts, float64 (n,).
 
     The `N_NEIGHBOURS` nearest are taken, or all if there are fewer. Half a success in one trial is
-    added to the counts: the rate is one half without points of other parts. Unknown parts, which
-    have one `part`, are one part.
+    added to the counts: the rate is one half without points of other parts. All unknown parts share
+    one value of `part` and so count as one part.
     """
     from scipy.spatial.distance import cdist
 
@@ -111,10 +111,12 @@ def _success_rate_around(
 
 
 class RadiusIndex(nn.Module):
-    """A bounded block of labelled points in K spaces that counts labels around queries.
+    """A bounded block of labelled points in K embedding spaces that counts labels around queries.
 
-    When it is full, the oldest point leaves first, whatever its label. `put`, `squared_distances`
-    and `count_near` compile to TorchScript; `numbers` and what uses it stay in Python.
+    In the engine, space k holds the points of the traces in fold k, embedded by the encoder that
+    was trained without the labels of fold k. A point's position in the block is its slot. When the
+    block is full, the oldest point leaves first, whatever its label. `put`, `squared_distances` and
+    `count_near` compile to TorchScript; `numbers` and what uses it stay in Python.
 
     Parameters
     ----------
@@ -129,7 +131,7 @@ class RadiusIndex(nn.Module):
     labels : Tensor of float32, shape (2, capacity)
         A row of ones, and a row of 1.0 (success) or 0.0: one product counts both.
     spaces : Tensor of int64, shape (capacity,)
-        Space of each point.
+        Embedding space of each point.
     parts : Tensor of int64, shape (capacity,)
         Hash of each point's part; 0 for an unknown part.
     first : Tensor of int64, shape (capacity,)
@@ -137,7 +139,7 @@ class RadiusIndex(nn.Module):
     repeats : Tensor of int64, shape ()
         Number of points whose part is in an earlier slot.
     agreement : Tensor of float64, shape ()
-        See `label_agreement`.
+        How strongly repeated labels of a part agree, see `label_agreement`.
     total : Tensor of int64, shape ()
         Number of points ever added.
     part_filter : Tensor of bool, shape (FILTER_SIZE,)
@@ -191,8 +193,8 @@ class RadiusIndex(nn.Module):
 
         Returns
         -------
-        array, shape (n,), of points (n, d)
-            Labels are a copy, int8, 1 for success; the others are views of the index.
+        array, shape (n,); for "points" (n, d)
+            Labels are a copy, int8, 1 for success; the other attributes are views of the index.
         """
         block = self.numbers if name == "numbers" else getattr(self, name).numpy()
         values: NDArray[Any] = block[..., : self.size()]
@@ -217,8 +219,8 @@ class RadiusIndex(nn.Module):
         label : float
             1.0 is success, 0.0 is failure.
         space : int
-            Space of the point, from 0 to K - 1: which of a query's K embeddings it is compared
-            with.
+            Embedding space of the point, from 0 to K - 1: which of a query's K embeddings it is
+            compared with.
         part : int, default 0
             Hash of its part; 0 for an unknown part.
         """
@@ -234,8 +236,8 @@ class RadiusIndex(nn.Module):
     def set_part(self, slot: int, part: int) -> None:
         """Replace the part of a slot by the hash `part`; 0 is an unknown part.
 
-        `first` and `repeats` are updated for the part that leaves and the one that comes,
-        `part_filter` for the latter.
+        `first` and `repeats` are updated for the part that leaves and the part that comes,
+        `part_filter` only for the part that comes.
         """
         leaving = int(self.parts[slot].item())
         if leaving != 0 and int(self.repeats.item()) > 0:
@@ -255,7 +257,7 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def squared_distances(self, z: Tensor, part: int = 0) -> Tensor:
-        """Return the squared distance from a query to each point, in that point's own space.
+        """Return the squared distance from a query to each point, in the point's embedding space.
 
         Parameters
         ----------
@@ -282,7 +284,7 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def count_near(self, distances: Tensor, radius: float) -> tuple[int, int]:
-        """Count the labels within a radius; where parts came more than once, count their votes.
+        """Count the labels within a radius; several points of one part may count as fewer.
 
         Parameters
         ----------
@@ -295,8 +297,7 @@ class RadiusIndex(nn.Module):
         -------
         n_success, n_failure : int
             (0, 0) for an empty index. If any part in the index came more than once, these are the
-            rounded votes of `count_votes`, in which several points of one part may count less than
-            as many parts.
+            rounded votes of `count_votes`.
         """
         n = distances.size(0)
         if n == 0:
@@ -310,11 +311,11 @@ class RadiusIndex(nn.Module):
         return int(counts[1]), int(counts[0]) - int(counts[1])
 
     def count_votes(self, inside: Tensor) -> tuple[int, int]:
-        """Count the votes of the points `inside`, (n,) bool, where parts came more than once.
+        """Count the points `inside`, (n,) bool; several points of one part may count as fewer.
 
-        m points of a part are worth m / (1 + (m - 1) agreement) votes: one vote where its labels
-        always agree, m where they are independent. Returns (successes, failures), each rounded to a
-        whole number, for bounds are of whole trials.
+        m of them that are of one part are worth m / (1 + (m - 1) agreement) votes: one vote if the
+        labels of a part always agree, m votes if they are independent. Returns (successes,
+        failures), each rounded to a whole number, because bounds need whole trials.
         """
         slots = inside.nonzero().flatten()
         first = self.first.index_select(0, slots)
@@ -349,11 +350,11 @@ class RadiusIndex(nn.Module):
         Parameters
         ----------
         points : array, shape (n, d)
-            Of more than `capacity` rows the last ones are added.
+            If there are more than `capacity` rows, only the last ones are added.
         labels : array, shape (n,)
             1 is success, 0 is failure; not checked.
         spaces : array of int, shape (n,), optional
-            0 if None.
+            Embedding space of each point; 0 if None.
         parts : array of int64, shape (n,), optional
             Hashes; unknown parts if None.
         numbers : array of int64, shape (n,), optional
@@ -387,23 +388,26 @@ class RadiusIndex(nn.Module):
             self._index_parts()
 
     def relabel(self, number: int, part: int, label: int | None) -> bool:
-        """Change the label of the point with a number, or remove the point; `agreement` stays.
+        """Change the label of the point with a number, or remove the point.
+
+        `agreement`, the estimate of how strongly repeated labels of a part agree, is not computed
+        anew.
 
         Parameters
         ----------
         number : int
-            Sequence number of its label.
+            Sequence number of the point's label.
         part : int
-            Hash of its part.
+            Hash of the point's part.
         label : int or None
-            1 is success, 0 is failure. None removes the point; the others keep their order of age
-            and move to the first slots, and `total` becomes their number.
+            1 is success, 0 is failure. None removes the point: the other points move to the first
+            positions of the block, the oldest first, and `total` becomes their number.
 
         Returns
         -------
         bool
-            False, with nothing changed, if the point is of another part. True also if there is no
-            such point, because it has left already.
+            False, with nothing changed, if the point with this number is of another part. True if
+            the change was made, or if the point has left the index already.
         """
         slots = np.flatnonzero(self.column("numbers") == number)
         if not len(slots):
@@ -452,7 +456,7 @@ class RadiusIndex(nn.Module):
         Parameters
         ----------
         queries : array, shape (n, d) or (n, K, d)
-            (n, K, d) for K spaces.
+            (n, K, d) for K embedding spaces.
         radius : float
             A point at this distance counts.
 
@@ -468,10 +472,10 @@ class RadiusIndex(nn.Module):
         return counts[:, 0], counts[:, 1]
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return the state as plain arrays, copies, which `from_state` takes.
+        """Return copies of the index's arrays, by name, from which `from_state` makes it again.
 
-        They are points (d, n), labels, spaces, parts and numbers (n,), in the order of the slots,
-        and agreement and total (), by name.
+        `points` is (d, n). `labels`, `spaces`, `parts` and `numbers` are (n,), in the order of the
+        points. `agreement` and `total` are (). The attributes of the class say what they are.
         """
         names = ("labels", "spaces", "parts", "numbers")
         state = {"points": self.column("points").T.copy()}
@@ -483,8 +487,8 @@ class RadiusIndex(nn.Module):
         """Return a new index with the points of a state; with the same capacity in the same slots.
 
         `state` is what `get_state` returned, and is not changed. With a smaller `capacity` the
-        newest points stay; with a larger one the oldest is in the first slot, and `total` no longer
-        counts points that left.
+        newest points stay. With a larger one the oldest point is in the first slot, and `total` no
+        longer counts points that left.
         """
         n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)

@@ -24,15 +24,14 @@ INTERNAL = {*vars(nn.Module()), "__overloads__"} - {"training"}
 def script(module: nn.Module) -> Any:
     """Compile a module with `torch.jit.script`, without its deprecation notice.
 
-    TorchScript works in the supported range of PyTorch. The call waits while another thread
-    compiles: where two parse at once, Python's parser raises "AST constructor recursion depth
-    mismatch".
+    Only one thread compiles at a time; another one waits. If two parse at once, Python's parser
+    raises "AST constructor recursion depth mismatch".
 
     Parameters
     ----------
     module : nn.Module
-        The module to compile. Its code is remembered, so that `code.is_code_changed` notices a
-        later change.
+        The module to compile. Its source code is remembered, so that `code.is_code_changed` can
+        tell later whether it was changed.
 
     Returns
     -------
@@ -54,7 +53,8 @@ def script(module: nn.Module) -> Any:
 def reason_of(error: Exception) -> str:
     """Return the type of an error and the line of its message that says what is wrong.
 
-    That is the first line, and of an error inside TorchScript, which begins with a trace, the last.
+    That is the first line; for an error inside TorchScript, whose message begins with a traceback,
+    the last one.
     """
     lines = str(error).strip().splitlines() or [""]
     return f"{type(error).__name__}: {lines[-isinstance(error, torch.jit.Error)]}"
@@ -82,9 +82,10 @@ def has_tensor(value: Any) -> bool:
 def register_tensors(module: nn.Module) -> None:
     """Make the plain tensors of a module part of its `state_dict`, as persistent buffers.
 
-    These are attributes that hold a tensor, and buffers that are not persistent, of its submodules,
-    too. A tensor whose numbers share their memory is copied, since it cannot be written to. Tensors
-    in a list, tuple or dict stay as they are, and so does one whose name its class defines.
+    These are attributes that hold a tensor, and buffers that are not persistent, also of its
+    submodules. A tensor that is an expanded view, so that several of its numbers share memory, is
+    copied, since it cannot be written to. Tensors in a list, tuple or dict stay as they are, and so
+    does a tensor whose name is an attribute of the module's class.
     """
     for submodule in module.modules():
         for name, value in attributes_of(submodule).items():

@@ -1,8 +1,8 @@
-"""`Candidate`: a newly trained version of the model, from the end of its training until it answers.
-`learner.Learner` makes one after each training, and `Learner._see_through` names the steps in
-between.
+"""`Candidate`: a newly trained version of the model, from the end of its training until it is in
+force. `learner.Learner` makes a candidate after each training, and `Learner._see_through` names the
+steps in between.
 
-Meanwhile the previous version goes on answering. The candidate decides on some training traces, by
+Meanwhile the previous version stays in force. The candidate decides on some training traces, by
 which its compiled module is compared with what was trained. Then it takes in the labels that came
 since its training began, is stored, and replaces the previous version; or it is dropped. This
 happens either all at once or in short steps between cycles.
@@ -22,22 +22,22 @@ from .trainer import Trained, TrainedOn, TrainingWindow
 
 
 class Candidate:
-    """The outcome of a training, until it answers or is dropped.
+    """The outcome of a training, until it is in force or is dropped.
 
     Parameters
     ----------
     trained : Trained
     previous : EngineModel
-        The model that answers meanwhile; its rule is taken over.
+        The model that decides meanwhile; the candidate takes over its rule.
     version : int
-        Of the previous model, for the report of a training that was dropped.
+        Number of the version in force, for the report of a training that was dropped.
     clock : callable
         Seconds, of any origin.
 
     Attributes
     ----------
     model : EngineModel or None
-        None where the version is dropped: then only the report is stored.
+        None if the training is dropped: then only the report is stored.
     report : RetrainReport
     trained_on : TrainedOn
         Set by `complete_report`.
@@ -70,12 +70,12 @@ class Candidate:
         self._seconds += self._clock() - self._work_began
 
     def check(self) -> Iterator[None]:
-        """Make the model ready to answer, and compare its answers with what was trained.
+        """Make the model ready to decide, and test it on some traces of its training.
 
-        The model takes over the previous one's rule. Then this yields before each comparison, of
-        one trace. A model that answers otherwise than it was trained, or that raises, is dropped:
-        `model` is None then, and the report says why. An exception is logged; nothing is raised.
-        Without a model nothing is done.
+        The model takes over the rule of the previous model. Then the generator yields before each
+        test, which decides on one trace. If the compiled model gives another result than the
+        trained one, or raises, the training is dropped: `model` becomes None, and the report says
+        why. An exception is logged and not raised. If `model` is None already, nothing is done.
         """
         if self.model is None:
             return
@@ -95,11 +95,11 @@ class Candidate:
             self.report = replace(self.report, reason=f"dropped: {defect}")
 
     def learn_next(self, window: TrainingWindow) -> bool:
-        """Make the oldest label that came since the training a reference, which decisions count.
+        """Make one of the labels that came after the training began a reference of the model.
 
-        Each call takes the next label of `window`, in the order of their numbers. A label that the
-        model cannot take is logged and skipped, and the result is True all the same. Returns False,
-        and does nothing, if no label is left, and always where there is no model.
+        Each call takes the oldest label of `window` that the model did not get yet. It returns True
+        if there was such a label; a label that the model cannot take is logged and skipped. It
+        returns False, and does nothing, if no label is left or `model` is None.
         """
         if self.model is None:
             return False
@@ -113,12 +113,11 @@ class Candidate:
         return True
 
     def complete_report(self, version: int, corrected_to: int) -> RetrainReport:
-        """Complete the report, and mark the version as accepted if the training gave a model.
+        """Put the seconds of work so far into the report, and return it for the caller to store.
 
-        The report gets the seconds of work so far. With a model it also gets `version` as its
-        number, and `trained_on` is set, with `corrected_to` as the number of the newest correction
-        that the labels had. Without one the report stays that of a dropped retrain. Returns the
-        report, which the caller stores.
+        If there is a model, the report is also marked as accepted and gets the number `version`,
+        and `trained_on` is set. `corrected_to` is the number of the newest correction that the
+        labels of the training had. Without a model the report stays that of a dropped retrain.
         """
         seconds = self._seconds + self._clock() - self._work_began  # storing it comes on top
         self.report = replace(self.report, seconds=seconds)
@@ -130,8 +129,8 @@ class Candidate:
     def end_storing(self, version: int) -> None:
         """Note that the version is stored, and put the number that it got there in the report.
 
-        It differs from the report's where another cell of the product stored a version first. 0
-        keeps the report's.
+        It differs from the report's number if another cell of the product stored a version first.
+        With `version` 0 the report keeps its number.
         """
         self.is_stored = True
         self.report = replace(self.report, version=version or self.report.version)

@@ -5,7 +5,7 @@ release it, or set another policy. The methods of `DataEngine` that do this call
     engine.rollback(3)
 
 Each change is an event that is kept for ever. Nothing is overwritten: a correction is a later row,
-an earlier version answers again as a new one, and a decision stays as it was decided.
+an earlier version is put in force again as a new version, and a decision stays as it was decided.
 """
 
 from collections.abc import Sequence
@@ -49,9 +49,9 @@ class Changed:
     text : str
         A sentence for people.
     event : int or None
-        Number of the recorded event; None where everything was so already, and nothing changed.
+        Number of the recorded event; None if nothing changed, because all was so already.
     version : int
-        Of the model that answers now.
+        Number of the version in force.
     """
 
     kind: str
@@ -63,10 +63,10 @@ class Changed:
 class Corrections:
     """Carries out corrections in the store and in what the engine has learned.
 
-    Every verb first finishes what is under way: labels on their way to the store, news of peers. So
-    it blocks for the store, and raises StoreError where that does not answer. A training that is
-    under way in an executor is discarded, and another one begins afterwards, except after a
-    rollback.
+    Every method first finishes what is under way: it stores the labels that wait for the store, and
+    reads what peers have stored. So it waits for the store, and raises StoreError if the store does
+    not answer. A training that is under way in an executor is discarded, and another one begins
+    afterwards, except after a rollback.
 
     Parameters
     ----------
@@ -105,22 +105,22 @@ class Corrections:
         ----------
         decision_id : str
         success : bool
-            The right label. If it counts so already, nothing changes.
+            The right label. If this label counts already, nothing changes.
         author : str
             Who says so, for the record.
 
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
         ReportError
-            For an unknown decision, one without a label, and what is no label.
+            For an unknown decision, for a decision without a label, and for a `success` that is no
+            label.
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
-            reading.
+            If the store does not answer, or the engine is closed or was opened for reading.
         """
         label = as_success(success)
         (stored,) = self._find_labelled([decision_id])
@@ -136,14 +136,15 @@ class Corrections:
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
         """Leave labels out of all that is learned and counted, from the next decision on.
 
-        `correct` brings one back. Traces, and labels as they were reported, stay in the store, and
-        so do the versions that were trained with them. The one that answers goes on until the next
-        retrain, which starts from weights that never saw these labels; if a rollback pinned it, and
-        it saw one of these labels, it is released, so that retrains may replace it. A baseline is
-        retrained before this returns. A training under way in the executor is discarded, and begins
-        again. If a safe mode begins or ends by this, `on_safe_mode` is called. A guarantee assumes
-        that the choice of what is forgotten does not depend on the label. The certificate counts a
-        forgotten outcome of a certain decision as wrong, so that forgetting earns nothing.
+        `correct` brings a forgotten label back. Traces, and labels as they were reported, stay in
+        the store, and so do the versions that were trained with them. The version in force goes on
+        until the next retrain, which starts from weights that never saw these labels. If a rollback
+        pinned this version, and it was trained with one of these labels, it is released, so that
+        retrains may replace it. A baseline is retrained before this returns. A training under way
+        in the executor is discarded, and begins again. If a safe mode begins or ends by this,
+        `on_safe_mode` is called. A guarantee assumes that the choice of what is forgotten does not
+        depend on the label. The certificate counts a forgotten outcome of a certain decision as
+        wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -155,16 +156,15 @@ class Corrections:
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
         ReportError
-            For an unknown decision, for one without a label, and for no id at all; then none is
-            forgotten.
+            For an unknown decision, for a decision without a label, and if no id is given; then no
+            label is forgotten.
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
-            reading.
+            If the store does not answer, or the engine is closed or was opened for reading.
         """
         if not decision_ids:
             raise ReportError(
@@ -191,8 +191,8 @@ class Corrections:
         """Let retrains replace a version again that `rollback` pinned.
 
         The same model goes on, stored as a new version. Labels that came meanwhile count for the
-        next retrain. A training under way in the executor is discarded, and begins again, also
-        where no version was pinned.
+        next retrain. A training under way in the executor is discarded, and begins again, even if
+        no version was pinned.
 
         Parameters
         ----------
@@ -202,13 +202,12 @@ class Corrections:
         Returns
         -------
         Changed
-            Its `event` is None where no version was pinned.
+            Its `event` is None if no version was pinned.
 
         Raises
         ------
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
-            reading.
+            If the store does not answer, or the engine is closed or was opened for reading.
         """
         self._bring_up_to_date()
         if not self._live.pinned:
@@ -216,38 +215,41 @@ class Corrections:
         return self._finish_change(self._learner.release(author))
 
     def rollback(self, version: int, author: str = "") -> Changed:
-        """Let an earlier version answer again, stored as a new version with a new number, and pin
-        it.
+        """Put an earlier version in force again, as a new version with a new number, and pin it.
 
-        Labels that came since, up to the training window's size, are among its references,
-        corrections count, and the rule in force goes on. No automatic retrain replaces a pinned
-        version, until `release`, a retrain that somebody asks for, or `forget` of a label that it
-        was trained with. Labels are stored and counted, and become its references, meanwhile. A
-        retrain after that starts from this version. A training under way in the executor is
-        discarded, and none begins. A reducer that is stored by its traces (umap-learn), and a
-        baseline, are fitted again: the first on the traces that it was fitted on, the second on the
-        same traces with the labels as they count now.
+        Its references include the labels that came since, up to the size of the training window,
+        with all corrections. The decision rule in force goes on. While the version is pinned, new
+        labels are stored and counted and become its references, but no automatic retrain replaces
+        it. It stays pinned until `release`, a retrain that somebody asks for, or `forget` of a
+        label that it was trained with; the next retrain then starts from this version, unless it
+        saw a forgotten label.
+
+        A training under way in the executor is discarded, and no other one begins. A reducer that
+        is stored by its traces (umap-learn) is fitted again on the traces of the earlier version,
+        with the labels that they had then; a baseline on the same traces, with the labels as they
+        count now.
 
         Parameters
         ----------
         version : int
-            The one that answers now is stored as a new version, too, and pinned. One that is pinned
-            already changes nothing.
+            Number of the earlier version. If it is the version in force, this is stored as a new
+            version, too, and pinned. If it is pinned already, nothing changes.
         author : str
             For the record.
 
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
         SettingError
-            For what is no whole number.
+            If `version` is no whole number.
         StoreError
-            For a version that is not kept (it names those that are), for damaged traces, where the
-            store does not answer, and for an engine that is closed or was opened for reading.
+            If the version is not kept (the message names those that are), if traces that it must be
+            fitted on are damaged, if the store does not answer, or if the engine is closed or was
+            opened for reading.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
             raise SettingError(
@@ -269,48 +271,48 @@ class Corrections:
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on.
 
-        The policy is stored, and a trained model goes on under it as a new version. Before the
-        first training no version is made. Every earlier version keeps the bounds that it decided
-        by. Labels on their way to the store are waited for; a training under way in the executor is
-        discarded, and begins again.
+        The policy is stored. A trained model goes on under it as a new version; before the first
+        training no version is made. Earlier decisions keep their bounds. The call waits for labels
+        that are on their way to the store. A training under way in the executor is discarded, and
+        begins again.
 
-        Where alpha, lower_bound, interval, guarantee, stops or prices change, and under "pooled"
-        and "cost" with stops="some" where the audit rate does too, the decision rule (which turns
-        bounds into actions, and may learn from outcomes) starts anew. It is then updated with
-        decisions from now on only: alpha was not spent on a tolerance that was chosen after the
-        data was seen, and the old bounds are of another scale. `certificate` speaks of decisions
-        since any change of the policy; whoever may choose among the certificates of m policies errs
-        with probability up to m alpha.
+        The decision rule turns bounds into actions, and may learn from outcomes. It starts anew if
+        alpha, lower_bound, interval, guarantee, stops or prices change. Under the guarantees
+        "pooled" and "cost" with stops="some" it also starts anew if the audit rate changes. A new
+        rule is updated only with decisions from now on, because a tolerance that was chosen after
+        the data was seen cannot be tested on that data, and old bounds have another scale.
+        `certificate` counts decisions since the last change of the policy, whatever changed. If
+        somebody chooses the best of the certificates of m policies, the error probability of that
+        certificate is up to m alpha.
 
         A safe mode, in which every part is verified after an alarm, goes on until fresh evidence
-        ends it; where the new rule has none, it ends, and `on_safe_mode` is called. A part that was
-        accepted before, and was not reported, stays unreported. In the shadow mode,
-        `Policy(shadow=True)`, each part that the model is certain of is an audit:
-        `Decision.predicted` says what the model would have done, and all is learned from as always.
-        It lasts over restarts.
+        ends it. If the new rule has no safe mode, the safe mode ends now, and `on_safe_mode` is
+        called. An accepted part whose outcome was not reported before the change stays unreported.
+        With `Policy(shadow=True)` each part that the model is certain of is an audit:
+        `Decision.predicted` says what the model would have done, and all outcomes are learned from
+        as always. The shadow mode stays on when the engine is opened again.
 
         Parameters
         ----------
         policy : Policy
-            The whole policy; one equal to that in force changes nothing.
+            The whole policy. If it equals the policy in force, nothing changes.
         author : str
             For the record.
 
         Returns
         -------
         Changed
-            Its `event` is None where nothing changed.
+            Its `event` is None if nothing changed.
 
         Raises
         ------
         SettingError
-            For what is no policy, for force limits that the traces cannot hold, or in seconds at an
-            unknown rate, for a guarantee whose class cannot be imported or made, and, of a model
-            that was handed in, for anything but audit_rate, stops, label_within, force_limits and
-            shadow.
+            If `policy` is no Policy. If its force limits do not fit the traces, or are in seconds
+            while the rate of the traces is unknown. If the class of its guarantee cannot be
+            imported or made. If a model was handed in, and a setting changes other than audit_rate,
+            stops, label_within, force_limits and shadow.
         StoreError
-            Where the store does not answer, and for an engine that is closed or was opened for
-            reading.
+            If the store does not answer, or the engine is closed or was opened for reading.
         """
         expect(
             isinstance(policy, Policy),
@@ -354,19 +356,20 @@ class Corrections:
     def _bring_up_to_date(self) -> None:
         """Finish what is under way: a correction comes after everything that was known before it.
 
-        A trained version answers, a training that is not done is discarded and begins again later,
-        labels reach the store, and labels and versions of the product's other cells are taken in.
-        Raises StoreError where the engine is closed or the store does not answer.
+        A trained version is put in force or dropped, and a training that is not done is discarded
+        and begins again later. Labels reach the store, and labels and versions of the product's
+        other cells are taken in. Raises StoreError if the engine is closed or the store does not
+        answer.
         """
         self._outbox.check_usable()
         self._learner.bring_up_to_date()
 
     def _find_labelled(self, decision_ids: Sequence[Any]) -> list[StoredDecision]:
-        """Finish what is under way, then return the decisions of these ids, in their order.
+        """Finish what is under way (`_bring_up_to_date`), then return the decisions with these ids.
 
-        The first is done as `_bring_up_to_date` does. A decision whose label was forgotten has
-        `success` None. Raises ReportError for an unknown id, and for a decision that never had a
-        label, and StoreError where the store does not answer.
+        They are in the order of the ids. `success` of a decision is None if its label was
+        forgotten. Raises ReportError for an unknown id, and for a decision that never had a label,
+        and StoreError if the store does not answer.
         """
         self._bring_up_to_date()
         decisions = []
@@ -382,10 +385,10 @@ class Corrections:
     def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, and apply it to references, training window and rule.
 
-        A model that cannot change its references is retrained, in this thread. A safe mode that
-        began or ended is recorded and announced to the user's `on_safe_mode`. Returns what was
-        done, with the number of the change's event. Raises StoreError where the store does not
-        answer.
+        A model that cannot change its references is retrained, in this thread. If a safe mode
+        begins or ends by this, that is recorded and announced to the user's `on_safe_mode`. Returns
+        what was done, with the number of the change's event. Raises StoreError if the store does
+        not answer.
         """
         self._store.corrections.apply(change)
         for id_ in change.decisions:

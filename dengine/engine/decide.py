@@ -1,6 +1,6 @@
-"""`DecisionMaker` converts a trace as the trace contract demands, turns it into a `StoredDecision`
-(the model's decision, an id, a version and a time) and hands it to the outbox. `engine.DataEngine`
-calls its methods in order.
+"""`DecisionMaker` converts a trace as the `TraceSpec` in force demands, turns it into a
+`StoredDecision` (the model's decision, an id, a version and a time) and hands it to the outbox.
+`engine.DataEngine` calls its methods in order.
 
 The functions below it check what a caller passes, a part's number and an id that was decided
 before, and make a VERIFY without a trace.
@@ -46,9 +46,9 @@ class DecisionMaker:
     Parameters
     ----------
     settings : SettingsInForce
-        Read at each decision; the first sound trace sets the contract in them.
+        Read at each decision; the first trace without a fault sets the `TraceSpec` in them.
     live : LiveModel
-        Answers.
+        Holds the model that decides.
     outbox : Outbox
         Takes the decisions.
 
@@ -63,13 +63,15 @@ class DecisionMaker:
         self._count = count(1)
 
     def set_trace_spec(self, spec: TraceSpec) -> TraceSpec:
-        """Set the trace contract (shape, rate and unit of all traces) and return the one in force.
+        """Set the `TraceSpec` (shape, rate and unit of all traces); return the one in force.
 
-        One that is set already stays, completed by what `spec` states and it does not. Where the
-        cell shares a product with others, a contract that these have set is taken in place of
-        `spec`; if it cannot be read, that is logged. The settings are saved in the store; where
-        that fails, they are saved with a later trace. Raises SettingError where the force limits do
-        not fit the contract.
+        If a `TraceSpec` is in force already, it stays. It only gets from `spec` a rate, units and
+        columns that were unknown; a `spec` of another shape is ignored. If none is in force and
+        another cell of the product has set one, that one is taken in the same way; if it cannot be
+        read, that is logged and `spec` is set.
+
+        The settings are saved in the store; if that fails, they are saved with a later trace.
+        Raises SettingError if the force limits do not fit the `TraceSpec`.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -86,15 +88,16 @@ class DecisionMaker:
         return spec
 
     def convert(self, trace: ArrayLike) -> TraceArray:
-        """Return a trace as float32, shape (channels, samples), converted as the trace contract
-        demands.
+        """Return a trace as float32 (channels, samples), converted as the `TraceSpec` demands.
 
-        Where none is set, the first trace without a fault sets it, or a contract that peers (other
-        cells of the product) have set is taken. Before the first training the first finite trace
-        also has the model prepare itself for such traces. Settings that could not be saved before
-        are saved. Raises TraceError for a wrong shape, or too few samples of a first trace, and
-        SettingError where the force limits do not fit the contract that it sets; a trace with NaN,
-        or another fault, is returned like any other.
+        If no `TraceSpec` is in force, the one that another cell of the product has set is taken, or
+        else the first trace without a fault sets it. Before the first training the first finite
+        trace also lets the model compile its code for such traces. Settings that could not be saved
+        before are saved.
+
+        A trace with NaN, or another fault, is returned like any other. Raises TraceError for a
+        wrong shape, or too few samples of a first trace, and SettingError if the force limits do
+        not fit the `TraceSpec` that the trace sets.
         """
         settings = self._settings.now
         x = as_trace(trace, settings.trace)
@@ -112,11 +115,19 @@ class DecisionMaker:
         return x
 
     def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
-        """Return the decision that a caller's id has already, or None for a new id.
+        """Return the decision that the store already has for an id, or None for a new id.
 
-        An id that cannot be looked up gets a VERIFY, `Reason.NO_STORE`, which is logged and not
-        recorded, since the id may have a decision already. Raises TraceConflictError for an id of
-        another trace, and TraceError for a trace that the contract does not allow.
+        The id comes from the caller. If the store does not answer, the decision returned is a
+        VERIFY for this `part` with `Reason.NO_STORE`: it is logged and not recorded, because the id
+        may have a decision already, and `trace` is not looked at. A report for this id then raises
+        StoreError, until a later call can look the id up.
+
+        Raises
+        ------
+        TraceConflictError
+            If the stored decision was made on another trace.
+        TraceError
+            If the id has a decision, and `trace` does not fit the `TraceSpec` in force.
         """
         try:
             earlier = self._outbox.find_earlier(decision_id)
@@ -149,17 +160,17 @@ class DecisionMaker:
         part : str or None
             Number of the part.
         decision_id : str, optional
-            An id of the caller's; None: a new one.
+            An id that the caller chose; None: a new one.
         verify_reason : Reason, optional
-            Verify for this reason, without asking the model; see `_decide`. Where the store is
-            damaged or its journal cannot be written, it is `Reason.NO_STORE` whatever is passed.
+            Verify for this reason, without asking the model; see `_decide`. If the store is damaged
+            or its journal cannot be written, the reason is `Reason.NO_STORE` whatever is passed.
 
         Returns
         -------
         StoredDecision
-            The record with its number, 0 where it could not be recorded. Before the first training
-            the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault or is outside a
-            force limit.
+            The record with its number, which is 0 if it could not be recorded. Before the first
+            training the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault or is
+            outside a force limit.
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE
@@ -169,9 +180,9 @@ class DecisionMaker:
     def sync(self, stored: StoredDecision) -> StoredDecision:
         """Wait until a decision is on disk, and return the record that counts.
 
-        Where the disk does not answer in time, an ACCEPT or REJECT is replaced among the records
-        that wait for it by VERIFY, `Reason.NO_STORE`, unless it has reached the disk by then.
-        Nothing is raised. A VERIFY stays as it is.
+        If an ACCEPT or REJECT is not on disk within the store's time limit, a VERIFY with
+        `Reason.NO_STORE` replaces it in the outbox and is returned; if it has reached the disk
+        after all, it stays. A VERIFY stays as it is. Nothing is raised.
         """
         decision = stored.decision
         try:
@@ -185,14 +196,16 @@ class DecisionMaker:
         return stored
 
     def record_timeout(self, trace: ArrayLike, part: Any, decision_id: Any) -> Decision:
-        """Record VERIFY, `Reason.LATE`, beside another call of the engine, and return it.
+        """Record VERIFY, `Reason.LATE`, while another thread may use the engine, and return it.
 
-        Any thread may call it. An id that has a decision already gets that one; one that cannot be
-        looked up gets VERIFY, `Reason.NO_STORE`, which is not recorded. It returns once the
-        decision is on disk, or when the store's time limit is over. With a store in memory, and
-        before the first trace, nothing is recorded: only the thread that uses the engine may do
-        that. Raises TraceError for a wrong part's number, an id of another trace, and a trace that
-        the contract does not allow, and ReportError for what is no id.
+        Any thread may call it. It returns once the decision is on disk, or when the store's time
+        limit is over. If the id has a decision already, that decision is returned. If the store
+        cannot look the id up, the result is a VERIFY with `Reason.NO_STORE` that is not recorded.
+        With a store in memory, and before the first trace, the VERIFY is not recorded either: only
+        the thread that uses the engine may do that.
+
+        Raises TraceError for an invalid part number, an id that belongs to another trace, and a
+        trace that does not fit the `TraceSpec` in force, and ReportError for an invalid id.
         """
         id_ = as_id(decision_id)
         number = as_part(part)
@@ -215,13 +228,13 @@ class DecisionMaker:
         verify_reason: Reason | None = None,
         decision_id: str | None = None,
     ) -> StoredDecision:
-        """Decide on one trace by a model and return the record, which is not recorded yet.
+        """Decide on one trace by a model; return the decision as a record that is not stored yet.
 
-        Without a model, and for a `verify_reason`, the decision is VERIFY. With a reason the force
-        limits do not count; a fault of the trace comes before it. If the trace has a fault, the
-        record is quarantined: it is never trained on. A model that raises, or returns impossible
-        bounds, is logged, and the decision is VERIFY with `Reason.MODEL_ERROR`, unless the trace
-        has a fault or is outside a force limit.
+        Without a model, and with a `verify_reason`, the decision is VERIFY. With a `verify_reason`
+        the force limits are not checked, and only a fault of the trace replaces this reason. If the
+        trace has a fault, the record is quarantined: it is never trained on. If the model raises or
+        returns impossible bounds, that is logged, and the decision is VERIFY with
+        `Reason.MODEL_ERROR`, unless the trace has a fault or is outside a force limit.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         # Without a contract the trace has a fault, and is decided all the same.
@@ -282,7 +295,7 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
     TraceConflictError
         For another trace.
     TraceError
-        For a trace that the contract `spec` does not allow.
+        For a trace that does not fit `spec`.
     """
     x = as_trace(trace, spec)
     if not np.array_equal(x, stored.trace, equal_nan=True):
@@ -296,7 +309,8 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
 def verify_decision(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
     """Return a VERIFY decision for which neither model nor trace was looked at.
 
-    It has no labels, the bound (0, 1), no embedding and propensity 1; nothing is recorded.
+    It has no labels, the bound (0, 1), no embedding, and 1 as its `propensity`, the probability of
+    a check. Nothing is recorded.
     """
     return Decision(
         id=decision_id,

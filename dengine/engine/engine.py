@@ -96,7 +96,8 @@ class RunOptions(TypedDict, total=False):
 def _close_forgotten(outbox: Outbox) -> None:
     """Close the outbox of an engine that a program did not close; an error is logged.
 
-    It writes what was left, when the engine is garbage-collected or the program ends.
+    This writes the records that were left. It is called when the engine is garbage-collected or the
+    program ends.
     """
     try:
         outbox.close()
@@ -105,9 +106,9 @@ def _close_forgotten(outbox: Outbox) -> None:
 
 
 class DataEngine(AbstractContextManager["DataEngine"]):
-    """Decides on traces, learns from reports, retrains within its budget, and remembers all of it.
+    """Decides on traces, learns from reports, retrains in a time budget, and remembers all of it.
 
-    One engine belongs to one thread, which it limits to one torch thread.
+    An engine belongs to one thread, in which it lets torch use only one thread.
 
     Parameters
     ----------
@@ -117,25 +118,25 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     policy : Policy, optional
         The error level alpha, the lower bound, and what else the user decides.
     trace : TraceSpec, optional
-        The contract of traces; None: the first sound trace sets it, and does not tell rate and
-        unit.
+        Shape, rate and unit of all traces. None: the first trace without a fault sets the shape,
+        and rate and unit are unknown.
     radius, folds, retrain_every, budget : optional
         As in `Recipe`; None: the recipe decides, or the reducer.
     store : str, path or SqlStore, optional
         A file or a URL (SQLite, PostgreSQL); None remembers in memory. A store that is not empty is
         opened by `DataEngine.open`.
     seed : int
-        The seed of the reducer and of the coin that draws audits.
+        The seed of the reducer and of the draw of audits.
     recipe : Recipe, str or path, optional
-        A recipe, its name or a TOML file, for all settings that are not given as arguments. It
-        names its own reducer.
+        A recipe, its name or a TOML file, for all settings that are not given as arguments. The
+        reducer is part of the recipe: another `reducer` beside it is refused.
     model : Model, optional
         A baseline, which decides by its own rule: of a policy only audit_rate, stops, label_within,
         force_limits and shadow count then.
     executor : concurrent.futures.Executor, optional
         Where retrains run while the cell goes on. None: in the calling thread, between cycles;
-        making the first engine of a process then takes about a second longer, since it loads what
-        a retrain imports.
+        making the first engine of a process then takes about a second longer, since it loads what a
+        retrain imports.
     replaying : bool
         End a retrain by steps alone, never by the clock, so that a seed repeats exactly.
     clock : callable
@@ -156,10 +157,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     Raises
     ------
     SettingError
-        For settings that are out of range or contradict each other, and for force limits in
-        seconds while the rate of the traces is unknown.
+        For settings that are out of range or contradict each other, and for force limits in seconds
+        while the rate of the traces is unknown.
     StoreError
-        For a used store.
+        If the store is used.
     """
 
     def __init__(
@@ -214,13 +215,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         on_safe_mode: Callable[[str], object] | None = None,
         reading: bool = False,
     ) -> None:
-        """Make the engine's objects on an opened store, each from those that it knows.
+        """Make the engine's objects on an opened store, and give each the objects that it uses.
 
         From now on the store is closed when the engine is garbage-collected. The modules that a
-        retrain imports are loaded, with an executor in a thread of their own, and else, unless
-        `reading`, before this returns. Limits this thread to one torch thread. Raises SettingError
-        for force limits in seconds at an unknown rate, and StoreError where another engine owns the
-        cell.
+        retrain imports are loaded: with an executor in a thread that goes on after this returns,
+        without one before this returns, but not for an engine that only reads (`reading`). Limits
+        this thread to one torch thread. Raises SettingError for force limits in seconds at an
+        unknown rate, and StoreError if another engine owns the cell.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -261,10 +262,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _resume(self) -> None:
         """Restore what the store holds: version, references, rule, labels and pending checks.
 
-        The engine then decides bit for bit as before it was closed. In a new cell it decides as the
-        other cells of its product do. It is called once, before the first decision, and waits for
-        the store without a time limit. Where retrains run in the calling thread, it also waits
-        until the first one can begin at once. Raises StoreError where the store cannot be read.
+        The engine then decides bit for bit as before it was closed. A new cell of a product decides
+        as the product's other cells do. It is called once, before the first decision, and waits for
+        the store without a time limit. If retrains run in the calling thread, it also waits until
+        the first retrain can begin without delay. Raises StoreError if the store cannot be read.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -273,11 +274,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._wait_until_warm()
 
     def _wait_until_warm(self) -> None:
-        """Wait until the first retrain can begin at once.
+        """Wait until the first retrain can begin without delay.
 
-        When it returns, the modules that a retrain imports are loaded, and the features of stored
-        traces that a retrain would compute first are computed. If there are labels but no version,
-        the computation begins here, and the code for decisions is compiled where it can be.
+        When it returns, the modules that a retrain imports are loaded, and the features of the
+        stored traces, which a retrain would compute first, are computed. If there are labels and no
+        version yet, this call begins to compute them, and also has the code for decisions compiled
+        if it can be; in other cases `Learner.resume` began.
         """
         self._join_warm_up()
         if self.state.new_labels and not self.version:
@@ -291,9 +293,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @contextmanager
     def _closed_on_failure(self) -> Iterator[None]:
-        """Close the engine's store where the block raises, and raise the error again; else leave it
-        open.
-        """
+        """Close the store and raise the error again if the block raises; else leave it open."""
         try:
             yield
         except BaseException:
@@ -323,18 +323,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         url : str, path or SqlStore
         reducer, model : object, optional
-            The same object again, if the engine had one of yours that the store cannot name.
+            If the engine had an object of yours that the store cannot name: the same object again.
         trace : TraceSpec, optional
-            The stored contract of traces, to state its rate, units or columns if they are
-            unknown.
+            The `TraceSpec` as the store has it, together with a rate, units or columns that were
+            unknown so far.
         wait : float, optional
             Seconds that a call waits for the database, as `SqlStore` takes it.
         allow_import : bool or collection of str
             Whether a `module:Class` that the store names is imported, or which of these classes
             are. A class that `reducer` names is allowed.
         reading : bool
-            Neither decide nor learn, for example to export: such calls raise StoreError. Another
-            engine may own the cell.
+            Open the store only for reading, for example to export: calls that decide or learn raise
+            StoreError. Another engine may own the cell.
         **options
             executor, replaying, clock and on_safe_mode, as `DataEngine` takes them. With an
             executor the ids of all decisions are read before this returns (a second for a million),
@@ -349,8 +349,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             If the store does not exist or is not used, or another engine owns the cell.
         SettingError
-            If an object is missing or differs from the one before, if a `model` is given to an
-            engine that has its own, or if `trace` contradicts the stored contract.
+            If an object of yours is missing or is another one than the engine had, if a `model` is
+            given to an engine that has its own, or if `trace` contradicts the stored `TraceSpec`.
         ImportRefusedError
             A SettingError, if a class would have to be imported that is not allowed.
         """
@@ -448,8 +448,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        A rule that a wrong confirmation updated is put right, too, if the store has answered.
-        Raises NotTakenError after `wait` seconds; None: the store's own limit.
+        If a wrong confirmation has updated the rule, the rule is put right, too, if the store has
+        answered. Raises NotTakenError after `wait` seconds; None: the store's own limit.
         """
         self._outbox.flush(wait)
         self._learner.catch_up()
@@ -470,7 +470,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ----------
         trace : array, shape (samples,) or (channels, samples)
         part : str or int, optional
-            The part's number. A part that comes again has one vote, and none on itself.
+            The part's number. The labels of a part that comes again count less than those of
+            different parts, and not at all for this part itself.
         decision_id : str, optional
             An id that the caller chooses. The same id and trace always have the same decision, and
             an ACCEPT or REJECT is on disk when this returns.
@@ -518,12 +519,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _decide(self, trace: ArrayLike, part: str | None, decision_id: str | None) -> Decision:
         """Decide on one trace by the model, record the decision and return it.
 
-        The steps are in this order because each needs the one before: a wrong trace must confirm
-        nothing; a rule that lacks a correction must not decide; this trace is the next one after
-        parts that nobody reported, which may change the rule; with an id the decision must be on
-        disk before the caller acts on it; and what the disk did not take is another decision:
-        VERIFY. Raises TraceError for a wrong trace, and SettingError for a first one that the force
-        limits do not fit.
+        The order of the steps has reasons. A wrong trace raises before it could confirm an earlier
+        part. A rule that lacks a correction is put right before it decides. This trace may confirm
+        accepted parts that nobody reported, which may change the rule. With an id the decision must
+        be on disk before the caller acts on it; if the disk does not take it, the decision becomes
+        VERIFY. Raises TraceError for a wrong trace, and SettingError for a first trace that the
+        force limits do not fit.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -539,8 +540,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         After the label, safe mode may begin or end, and a retrain that is due runs in this thread
         or begins in the executor. The label of a trace with a fault is stored, but no retrain
-        follows. If the part was confirmed wrongly before, the call also waits for the store, so
-        that the rule is corrected now; if the store does not answer, this happens later.
+        follows. If the next decision had confirmed the part as good already, the call also waits
+        for the store, so that the rule is corrected now; if the store does not answer, this happens
+        later.
 
         Parameters
         ----------
@@ -548,8 +550,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         success : bool
             The result of the verification; False for a line stop after an accept, True for a part
             known to be good. A line stop that comes after the part was confirmed, however late,
-            takes the confirmation back and counts as a correction. If somebody inspected a
-            rejected part, its label is used for training, but does not update the rule.
+            takes the confirmation back and counts as a correction. If somebody inspected a rejected
+            part, its label is used for training, but does not update the rule.
 
         Returns
         -------
@@ -561,9 +563,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ReportError
             For an unknown id, a second report on the decision, or an invalid label.
         StoreError
-            If it is not certain that the label is on disk: it is learned all the same, and the
-            same report may come again. Also for an engine that is closed, was opened for reading,
-            or is in use by another thread.
+            If it is not certain that the label is on disk: it is learned all the same, and the same
+            report may come again. Also for an engine that is closed, was opened for reading, or is
+            in use by another thread.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -592,9 +594,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         In each cycle the cell inserts a part, the engine decides, and the cell verifies it, lets it
         go on or rejects it. A known outcome is reported, and retrains happen between cycles. When
         the iteration ends, also by an error of the cell, everything known is written. If the cell
-        has a `TraceSpec` as its attribute `spec`, the engine takes from it what it does not know of
-        its traces. Python's garbage collector works between decisions, and only on objects that are
-        newer than the first cycle (`gc.freeze`).
+        has a `TraceSpec` as its attribute `spec`, the engine takes from this spec what it does not
+        know about the traces yet. Python's garbage collector works between decisions, and only on
+        objects that are newer than the first cycle (`gc.freeze`).
 
         Parameters
         ----------
@@ -605,8 +607,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         iterator of Cycle
-            The first part is inserted with its first `next`, after a wait until a retrain could
-            begin at once.
+            The first `next` waits until a retrain could begin without delay, and then inserts the
+            first part.
 
         Raises
         ------
@@ -614,9 +616,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             Before the first part, for a cell that lacks one of its four methods, or whose `spec`
             cannot hold the force limits.
         ReportError
-            Where `verify` returns no label, or `proceed` no `Outcome`.
+            If `verify` returns no label, or `proceed` returns no Outcome.
         NotTakenError
-            At the end, where the disk does not take everything within 10 seconds.
+            At the end, if the disk does not take everything within 10 seconds.
         """
         check_cell(cell)
         return self._run(cell, cycles)
@@ -624,10 +626,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Yield a record of each cycle; at the end, also after an error, write everything to disk.
 
-        The first cycle waits for what would otherwise delay the first retrain, and takes over what
-        the cell's `spec` states of the traces. From then on the garbage collector ignores the
-        objects that exist, until the end. Raises NotTakenError where the disk does not take
-        everything in time.
+        Before the first cycle it waits until a retrain could begin without delay, and takes from
+        the cell's `spec` what the engine does not know about the traces yet. From then until the
+        end the garbage collector ignores the objects that exist at that moment. Raises
+        NotTakenError if the disk does not take everything in time.
         """
         self._wait_until_warm()
         spec = getattr(cell, "spec", None)
@@ -642,12 +644,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 yield self._cycle(cell, index)
 
     def _cycle(self, cell: Cell, index: int) -> Cycle:
-        """Have the cell insert one part, decide, do what the decision says, and report its outcome.
+        """Have the cell insert one part, decide, do what the decision says, and report the outcome.
 
-        An ACCEPT of which the cell learns nothing is not reported, nor is a REJECT. A label that
-        cannot be written is logged and waits. A retrain that is due is begun or done. What the cell
-        raises passes, and ReportError is raised where it returns no label or outcome. Returns the
-        record of the cycle; its `decide_seconds` is the duration of the decision alone.
+        A REJECT is not reported, nor is an ACCEPT if the cell does not know its outcome. A label
+        that cannot be written is logged and waits. A retrain that is due is begun or done. An
+        exception of the cell is raised unchanged, and ReportError if the cell returns no label or
+        outcome. Returns the record of the cycle; its `decide_seconds` is the duration of the
+        decision alone.
         """
         trace = cell.insert()
         with uncollected():
@@ -687,23 +690,24 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def retrain(self, wait: bool = True) -> RetrainReport | None:
         """Retrain now, in this thread, and return the report.
 
-        A pinned version is released first, like by `release`. A version that fails, or cannot be
-        stored, is dropped: the report has `accepted` False then. Raises StoreError if the labels
-        that came before cannot be stored, and for an engine that is closed, was opened for reading,
-        or is in use by another thread.
+        A version that is pinned by a rollback is released first. A retrain that fails, has no label
+        to train on, or cannot be stored, is dropped: the report has `accepted` False then. Raises
+        StoreError if the labels that came before cannot be stored, and for an engine that is
+        closed, was opened for reading, or is in use by another thread.
 
         Parameters
         ----------
         wait : bool, default True
             False: begin to retrain in the executor, and return None, also if a retrain is under
-            way; `poll` brings it to its end. Without an executor it retrains in this thread.
-            True: a version that is trained is first brought to its end, and a training that is not
-            done is discarded. In the first two seconds of an engine the call also waits for the
-            modules that a retrain imports.
+            way; `poll` brings it to its end. Without an executor it retrains in this thread. True:
+            a version that is already trained is first put in force or dropped, and a training that
+            is not done is discarded. In the first two seconds of an engine the call also waits for
+            the modules that a retrain imports.
 
         Returns
         -------
         RetrainReport or None
+            None only with `wait` False.
         """
         if self._live.pinned:
             self.release()
@@ -720,16 +724,16 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
 
         `run` does so after each part. In a loop of your own, `decide` and `report` do the same. But
-        each of their calls takes a version that the executor has trained only one step further.
+        if the executor has trained a version, each of their calls takes it only one step further.
         Without an executor a retrain that is due runs here, also with `brief`.
 
         Parameters
         ----------
         brief : bool, default False
-            True: bring a version that the executor has trained only one step further, which takes a
-            few milliseconds. False: bring it to its end, so that it answers or is dropped. In a
-            cell of a product, whose cells share labels and versions, it is always brought to its
-            end.
+            True: if the executor has trained a version, take it only one step further, in a few
+            milliseconds. False: take it through all steps, until it is in force or is dropped. In a
+            cell of a product, whose cells share labels and versions, it is always taken through all
+            steps.
 
         Returns
         -------
@@ -761,7 +765,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._corrections.forget(*decision_ids, author=author, reason=reason)
 
     def rollback(self, version: int, author: str = "") -> Changed:
-        """Let an earlier version answer again until `release`; see `Corrections.rollback`."""
+        """Put an earlier version in force again until `release`; see `Corrections.rollback`."""
         return self._corrections.rollback(version, author)
 
     def release(self, author: str = "") -> Changed:
@@ -804,20 +808,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def trace(self) -> TraceSpec | None:
-        """The contract of traces; None before the first sound trace."""
+        """The `TraceSpec` in force; None before the first trace without a fault."""
         return self._settings.now.trace
 
     @property
     def model(self) -> Any:
-        """The model that answers (of a baseline, the user's own object); None before a first
-        retrain.
-        """
+        """The model in force (of a baseline, the user's object); None before the first retrain."""
         answering = self._live.answering
         return None if answering is None else answering.user_model
 
     @property
     def version(self) -> int:
-        """Number of the version that answers; 0 before the first retrain."""
+        """Number of the version in force; 0 before the first retrain."""
         return self._live.version
 
     @property
@@ -875,10 +877,11 @@ def _new_settings(
 ) -> tuple[EngineSettings, EngineModel]:
     """Return the settings of a new engine, and the untrained model that they describe.
 
-    `given` are the settings that stand beside the recipe, by name. For a handed-in `model` without
-    a recipe they are those of the default recipe, but for `retrain_every`. Raises SettingError for
-    settings that are out of range, contradict each other or have no effect on the model, and for a
-    window below the model's `min_traces`.
+    `given` holds the settings that the caller passed beside the recipe, by name; None is not given.
+    For a handed-in `model` without a recipe, the other settings are those of the default recipe,
+    except `retrain_every`, which is the one for any reducer. Raises SettingError for settings that
+    are out of range, contradict each other or have no effect on the model, and if the training
+    window is smaller than the model's `min_traces`.
     """
     if model is not None:
         check_model_settings(reducer, given)

@@ -39,9 +39,7 @@ class ExclusiveUse:
         self._handlers.append(handler)
 
     def _delay(self, number: int, frame: FrameType | None) -> None:
-        """Remember a SIGINT; `__exit__` passes the first to the handler that was set before the
-        block.
-        """
+        """Remember a SIGINT; `__exit__` passes the first to the handler set before the block."""
         self._delayed.append((number, frame))
 
     def __exit__(self, *exception: object) -> None:

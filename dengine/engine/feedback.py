@@ -63,7 +63,8 @@ class Feedback:
     Attributes
     ----------
     remedy : Remedy or None
-        What waits until the store has every label; `learner.Learner` does it.
+        What must be done after a wrong label was learned, as soon as the store has every label;
+        `learner.Learner` does it.
     """
 
     def __init__(
@@ -98,13 +99,13 @@ class Feedback:
         return self._settings.now.recipe.policy.stops == "all"
 
     def resume(self) -> None:
-        """Restore from the store which checks are pending, and which accepted parts have no
-        outcome.
+        """Restore from the store the pending checks, and the accepted parts without an outcome.
 
-        The live model must be restored before. A safe mode that it is in is not announced again.
-        With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
-        "some" they are only counted, as unreported since the last label. Raises StoreError where
-        the store cannot be read.
+        The live model must be restored before. Overdue checks and checks from before the present
+        rule are left out, as are accepted parts from before the present policy. With `stops="all"`
+        the accepted parts are kept, so that the next trace confirms them. With "some" they are only
+        counted, as unreported since the last label. If the live model is in a safe mode, this is
+        not announced again. Raises StoreError if the store cannot be read.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -124,10 +125,10 @@ class Feedback:
     def record_decision(self, stored: StoredDecision) -> None:
         """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
 
-        A VERIFY of a trace with a fault, or that was not recorded, is not pending. The rule counts
-        as wrong each check that has become overdue: not reported within `Policy.label_within`
-        decisions. When nearly all recent decisions are `Reason.NOVEL`, an event is recorded; the
-        next one only after their share has fallen to one half.
+        A VERIFY of a trace with a fault is not pending, nor is a VERIFY that was not recorded. The
+        rule counts each check that has become overdue as a wrong decision (`_count_overdue`). When
+        nearly all recent decisions have `Reason.NOVEL`, an event is recorded, and the next such
+        event only after their share has fallen to one half.
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -146,9 +147,9 @@ class Feedback:
     def confirm_unreported(self) -> None:
         """Settle accepted parts without an outcome, because the next trace has come.
 
-        With `Policy(stops="all")`, under which a bad part would have stopped the line, each is a
-        success: rule and references learn it at once, and its label, CONFIRMED, is recorded. With
-        "some" the parts are only counted, and nothing is learned.
+        With `Policy(stops="all")`, under which a bad part would have stopped the line, each part
+        counts as good: rule and references learn it at once, and its label, CONFIRMED, is recorded.
+        With "some" the parts are only counted, and nothing is learned.
         """
         while self._unreported:
             _, stored = self._unreported.popitem(last=False)
@@ -158,12 +159,13 @@ class Feedback:
                 self._n_unreported += 1
 
     def take_in(self, stored: StoredDecision, success: bool) -> None:
-        """Learn a reported label and have it recorded, without waiting for the disk.
+        """Learn a reported label and hand it to the outbox, without waiting for the disk.
 
-        The same report once more, before `note_synced`, does nothing. Raises ReportError if the
-        decision has a label already, except that a line stop may follow a confirmation by the next
-        decision (`Policy(stops="all")`): it is recorded here, and learned later, as a correction.
-        `remedy` is set where the rule must be rebuilt, which is not done here.
+        If the same report comes again before `note_synced`, nothing is done. If the outbox has a
+        label of the decision already, ReportError is raised, with one exception: a line stop may
+        follow the confirmation of a part by the next decision (`Policy(stops="all")`). Such a line
+        stop is learned later, as a correction. `remedy` is set if the rule must be rebuilt, which
+        is not done here.
         """
         id_ = stored.decision.id
         if self._unsynced.get(id_) is not success:
@@ -175,11 +177,12 @@ class Feedback:
         del self._unsynced[decision_id]
 
     def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
-        """Learn a label that is no repetition and hand it to the outbox.
+        """Learn a label that is no repetition, and hand it to the outbox.
 
-        The outbox is the queue of records for the store. A line stop that follows a confirmation is
-        handed to it, but is not learned yet: `remedy` is set to CORRECT. It is set to REBUILD_RULE
-        for a check that the rule counted as overdue. Raises ReportError for any other second label.
+        If the next decision had confirmed the part as good, a line stop is recorded but not learned
+        yet, and `remedy` is set to CORRECT. It is set to REBUILD_RULE if the rule had counted the
+        part's check as overdue. Raises ReportError if the outbox has any other label of the
+        decision.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -201,12 +204,15 @@ class Feedback:
     def _learn_and_record(self, stored: StoredDecision, success: bool, source: Source) -> None:
         """Update rule and references with the outcome of a part, and have its label recorded.
 
-        A trace with a fault updates neither, but its label takes a number. A rejected part that was
-        inspected becomes a reference and does not update the rule: which parts are inspected is
-        somebody's choice, and no sample. Any other label takes over the count of unreported parts,
-        which begins again at 0, also if the decision is from before the present rule. If this part
-        was itself counted as unreported it is subtracted, so a late report may give -1. The label
-        of a usable trace enters the training window, in a product once it is numbered.
+        A trace with a fault updates neither. The label of a rejected part that was inspected
+        becomes a reference and does not update the rule: which parts are inspected is somebody's
+        choice, and no sample. Every other label also tells the rule how many accepted parts went on
+        unreported since the last label, and this count begins again at 0, even if the decision is
+        from before the present rule and so does not update it. A part that was counted among them
+        is subtracted from the number that its own label tells, which may make it -1.
+
+        The label takes the next number of the outbox. That of a usable trace enters the training
+        window, in a product once the store has given it a number.
         """
         decision = stored.decision
         version = self._live.version
@@ -246,10 +252,11 @@ class Feedback:
         return decision.id not in self._unreported and is_of_policy
 
     def number_labels(self) -> None:
-        """In a product, give learned labels the numbers that the store has newly assigned.
+        """In a product, give this cell's labels the numbers that the store has newly assigned.
 
-        A product is several cells whose labels have one sequence of numbers in the store. In any
-        cell the rule counts as wrong each check that has become overdue.
+        A product is several cells whose labels have one sequence of numbers in the store. With or
+        without a product, the rule first counts each check that has become overdue as a wrong
+        decision.
         """
         self._count_overdue()
         if isinstance(self._labels, ProductLabels) and self._labels.has_unnumbered:
@@ -259,9 +266,9 @@ class Feedback:
     def _count_overdue(self) -> None:
         """Make the rule count as wrong each decision whose check is overdue.
 
-        A check is overdue if it was not reported while `label_within` later decisions were
-        recorded. Each decision is counted once; one with the bound (0, 1), which says nothing, or
-        from before the present rule began, is not counted.
+        A check is overdue if it has no report within `Policy.label_within` later decisions. Each
+        decision is counted once; a decision with the bound (0, 1), which says nothing, or from
+        before the present rule began, is not counted.
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within
@@ -275,7 +282,7 @@ class Feedback:
             self._live.mark_examined_to(overdue_to)
 
     def take_remedy(self) -> Remedy | None:
-        """Return, once, what must be put right after a wrong label; None where nothing must be."""
+        """Return, once, what must be put right after a wrong label; None if nothing must be."""
         remedy = self.remedy
         self.remedy = None
         return remedy
@@ -290,12 +297,12 @@ class Feedback:
         self._n_unreported = 0
 
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
-        """Record an event and call `on_safe_mode` if a safe mode began or ended since the last
-        call.
+        """Record, and tell `on_safe_mode`, if a safe mode began or ended since the last call.
 
-        `reason_ended` is recorded when one ended. In a safe mode every part is verified after an
-        alarm of the rule. The announcement comes last in every cycle, because either step may fail
-        and must cost no label; a failure is logged and not tried again.
+        In a safe mode every part is verified after an alarm of the rule. `reason_ended` is recorded
+        if one ended. If recording the event or the user's function fails, that is logged and not
+        tried again; callers announce only after labels are stored, so that such a failure costs no
+        label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

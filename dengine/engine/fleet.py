@@ -1,6 +1,6 @@
 """`Peers`: reads from the store what the other cells of a product have learned, labels and the
-newest version of the model, and takes it over: labels become references, a newer version answers.
-`learner.Learner` calls it between two cycles, never within `decide`.
+newest version of the model, and takes it over: labels become references, a newer version is put in
+force. `learner.Learner` calls it between two cycles, never within `decide`.
 
 The cells of a product share one store. A cell whose connection is lost goes on with what it has.
 `Learner._take_in_news` shows the order of the steps.
@@ -27,6 +27,8 @@ ROUNDS = 5  # of them before a retrain: after a long absence it need not know al
 class Peers:
     """The other cells of a product, as the store knows them.
 
+    Their news are the labels, versions and corrections that they stored.
+
     Parameters
     ----------
     outbox : Outbox
@@ -42,7 +44,7 @@ class Peers:
     ----------
     labels : ProductLabels
     is_lost : bool
-        The last question for news failed.
+        The last request for news failed.
     """
 
     def __init__(
@@ -72,15 +74,24 @@ class Peers:
         return self._clock() - self._asked >= NEWS_SECONDS
 
     def fetch_news(self) -> tuple[ProductNews, bool]:
-        """Ask the store for what is new in the product, the cells that share labels and versions.
+        """Ask the store for the news of the product: labels, a version and corrections.
 
-        That is labels, a version, corrections.
+        If there is a new version or label, the store is checked against its ledger, which may set
+        the outbox's `integrity_error`.
 
-        Returns the news, with at most `MOST` labels after the training window's newest, this cell's
-        among them, and whether it names a newer version than the one in force; one that could
-        not be taken over does not count. Where there is a new version or label, the store is
-        checked, which may set the outbox's `integrity_error`. Raises StoreError where the store
-        gives no answer in time.
+        Returns
+        -------
+        news : ProductNews
+            It holds at most `MOST` labels, those that follow the newest label of the training
+            window; labels of this cell are among them.
+        has_newer_version : bool
+            Whether the news names a newer version than the one in force. A version that could not
+            be taken over before does not count.
+
+        Raises
+        ------
+        StoreError
+            If the store gives no answer in time.
         """
         store = self._outbox.store
         newest = self._window.newest_seq
@@ -91,7 +102,7 @@ class Peers:
         return news, has_newer_version
 
     def note_loss(self, error: StoreError) -> None:
-        """Note that news cannot be had: set `is_lost`, and ask again after `NEWS_SECONDS`.
+        """Note that a request for news failed: set `is_lost`, and ask again after `NEWS_SECONDS`.
 
         News is what the other cells of the product stored. Only the first of several losses is
         logged.
@@ -107,8 +118,8 @@ class Peers:
     def take_in(self, news: ProductNews) -> None:
         """Add labels that the product's cells stored to the training window, in their order.
 
-        They count for the next retrain. A label of another cell becomes a reference of the
-        answering model, unless it is one already.
+        They count for the next retrain. A label of another cell becomes a reference of the model in
+        force, unless it is one already.
         """
         labelled = news.labelled
         rows = zip(labelled.traces, labelled.labels, labelled.hashes, labelled.seq, strict=True)
@@ -116,10 +127,10 @@ class Peers:
             self.labels.admit(trace, int(label), int(hash_), int(seq))
 
     def note_taken(self, n_labels: int) -> None:
-        """Note that news was had and how many labels were taken in: clear `is_lost`.
+        """Note that news came, with this number of labels: clear `is_lost`.
 
-        It is logged if `is_lost` was set. It is due again after `NEWS_SECONDS`, or at once where as
-        many labels came as a request gives at most.
+        If `is_lost` was set, the return of the news is logged. The next request is due after
+        `NEWS_SECONDS`, or at once if as many labels came as one request gives at most.
         """
         if self.is_lost:
             log.warning("news of product %s comes again", self._outbox.store.product)
@@ -127,13 +138,11 @@ class Peers:
         self._asked = self._clock() if n_labels < MOST else -np.inf
 
     def take_over(self, version: ModelVersion) -> None:
-        """Let a version that another cell of the product trained answer, with the labels since.
+        """Put a version that another cell of the product trained in force, with the labels since.
 
-        Its rule is the one that this cell's model has now, as it is: nothing is rebuilt, and the
-        peer's rule is ignored.
-
-        Where it cannot be restored, that is logged and the present version goes on answering. It is
-        tried again with later news only if the store was the reason. Nothing is raised.
+        It gets this cell's rule as it is: nothing is rebuilt, and the peer's rule is ignored. If
+        the version cannot be restored, that is logged, and the present version stays in force; it
+        is tried again with later news only if the store was the reason. Nothing is raised.
         """
         store = self._outbox.store
         trained_on = TrainedOn.from_state(version.state)

@@ -25,7 +25,10 @@ RULE_MISSED = (
 def guarded(
     consequence: str, call: Callable[P, T], *arguments: P.args, **options: P.kwargs
 ) -> T | None:
-    """Call a function and return its result; log an exception with its consequence, return None."""
+    """Call a function and return its result; if it raises, log the exception and return None.
+
+    `consequence` is the text of the log: it says what follows from the failure.
+    """
     try:
         return call(*arguments, **options)
     except Exception:

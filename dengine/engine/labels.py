@@ -37,7 +37,7 @@ class CellLabels:
         self.new_labels = 0
 
     def resume(self, counts_from: int) -> None:
-        """Set the count to how many labels of the training window have a number above this one."""
+        """Count the labels of the training window with a number above `counts_from` as new."""
         self.new_labels = len(self._window.newer(counts_from))
 
     def recount(self, counts_from: int) -> None:
@@ -67,8 +67,8 @@ class CellLabels:
 class ProductLabels:
     """Labels of all cells of a product, added to the window in the order of the store.
 
-    A label of this cell is a reference at once, and waits for the peers' labels before it until it
-    enters the window.
+    A label of this cell is a reference at once. It enters the window when the store has given it a
+    number and the other cells' labels before it have come.
 
     Parameters
     ----------
@@ -105,9 +105,10 @@ class ProductLabels:
         return bool(self._waiting)
 
     def resume(self, counts_from: int) -> None:
-        """Count the labels of the training window above this number as new, on opening a store.
+        """Count the labels of the training window with a number above `counts_from` as new.
 
-        They count as labels of peers, so that they alone do not make a retrain this cell's turn.
+        This is done when a store is opened. They count as labels of other cells, so they alone
+        never make it this cell's turn to retrain.
         """
         n_new = len(self._window.newer(counts_from))
         numbers = self._window.newer(0)
@@ -116,9 +117,10 @@ class ProductLabels:
         self._updated_to = self._window.newest_seq
 
     def recount(self, counts_from: int) -> None:
-        """Count the new labels again, after the training window was filled without forgotten ones.
+        """Count the new labels again, after forgotten labels were taken out of the window.
 
-        They are those above the number that the newest retrain went to; `counts_from` is not used.
+        New are those above the newest number that the newest retrain had; `counts_from` is not
+        used.
         """
         own_numbers = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
@@ -141,8 +143,8 @@ class ProductLabels:
         """Give a label of this cell, and its reference, the number that the store gave it.
 
         It enters the window at once if its number is the next one, else when the other cells'
-        labels before it have come. Nothing happens for a label that was not added, as of a trace
-        with a fault.
+        labels before it have come. Nothing happens if the label was never added; the label of a
+        trace with a fault is not.
         """
         if decision_id not in self._unnumbered:
             return
@@ -158,9 +160,9 @@ class ProductLabels:
     def admit(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add the product's next label, of this cell or another, to the training window.
 
-        It counts as new unless the newest retrain was trained on it. A peer's label also becomes a
-        reference of the answering model, unless that has it already. One that the model cannot take
-        is logged and skipped.
+        Labels must come in the order of their numbers. A label counts as new unless the newest
+        retrain was trained on it. A peer's label also becomes a reference of the model in force,
+        unless that has it already; if the model cannot take it, that is logged.
         """
         is_own = self._waiting.pop(seq, None) is not None
         self._window.add(trace, label, hash_, seq)
@@ -173,9 +175,9 @@ class ProductLabels:
     def is_due(self, retrain_every: int) -> bool:
         """Return whether a retrain is due and this cell is the one to do it.
 
-        That is so where the label that completes `retrain_every` is this cell's own, or where
-        another cell missed its turn, and this cell's is the label that completes twice as many, or
-        a later one.
+        It is this cell's turn if the new label number `retrain_every` is its own. If another cell
+        missed its turn, it is also this cell's turn once one of its labels is the new label number
+        2 * `retrain_every` or a later one.
         """
         due = self._since[retrain_every - 1 : retrain_every]
         missed = self._since[2 * retrain_every - 1 :]
@@ -190,16 +192,17 @@ class ProductLabels:
         """Make this cell's waiting labels references of a version that it trained.
 
         They wait for labels of other cells that come before them in the store, so the training
-        lacked them. One that the model cannot take is logged and skipped.
+        lacked them. A label that the model cannot take is logged and skipped.
         """
         self._references_to = 0
         self._add_waiting(model)
 
     def take_over(self, model: EngineModel, references_to: int, counts_from: int) -> None:
-        """Prepare another cell's version to answer: add this cell's waiting labels as references.
+        """Add this cell's waiting labels to another cell's version, which is to be put in force.
 
-        Its references hold every label up to the number `references_to` already; later labels of
-        peers are added when they come. Labels after `counts_from` go on counting as new.
+        They become references of `model`, which has every label up to the number `references_to`
+        already; later labels of peers are added when they come. Only labels with a number above
+        `counts_from` still count as new.
         """
         self._references_to = references_to
         self._add_waiting(model)
@@ -207,9 +210,7 @@ class ProductLabels:
         self._since = [(number, is_own) for number, is_own in self._since if number > counts_from]
 
     def _add_waiting(self, model: EngineModel) -> None:
-        """Add this cell's waiting labels to a version as references, except those that it has
-        already.
-        """
+        """Add this cell's waiting labels to a version as references, unless it has them already."""
         for seq, (trace, label, hash_) in self._waiting.items():
             if seq > self._references_to:
                 guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq)

@@ -52,7 +52,7 @@ class Learner:
     labels : CellLabels or ProductLabels
     feedback : Feedback
     peers : Peers or None
-        None where the cell shares no product.
+        None if the cell shares no product.
     retrainer : Retrainer
     clock : callable
         Seconds, of any origin, by which retrains are timed.
@@ -95,13 +95,13 @@ class Learner:
         self._start: tuple[tuple[int, int], EngineModel, str] | None = None
 
     def resume(self, label_within: int, policy_since: int) -> None:
-        """Restore window, version, rule and counts from the store, bit for bit, when an engine
-        opens it.
+        """Restore window, version, rule and counts from the store, bit for bit.
 
-        A check that was not reported within `label_within` later decisions is overdue, and counts
-        as wrong; `policy_since` is the first version under the policy in force. With a version, or
-        with at least `IMPORTED` labels, it also begins in a thread to compute what the next retrain
-        starts with. Raises StoreError where the store cannot be read.
+        It is called when an engine opens the store. `label_within` is the number of later decisions
+        after which a check without a report is overdue, and `policy_since` the first version under
+        the policy in force. If there is a version, or at least `IMPORTED` labels, this also starts
+        a thread that computes in advance for the next retrain (`precompute`). Raises StoreError if
+        the store cannot be read.
         """
         # The version is read before the labels: a peer may store both meanwhile.
         version = self._store.versions.newest()
@@ -119,10 +119,11 @@ class Learner:
             self._peers.resume()
 
     def precompute(self) -> None:
-        """Start a thread that computes what the next retrain begins with; do not wait for it.
+        """Start a thread that computes in advance what the next training needs; do not wait.
 
-        The result is kept in the model that the next training starts from; a failure is logged.
-        While an earlier one has not been waited for, nothing is started. There must be labels.
+        These are above all the features of the window's traces. They are kept in the model that the
+        training starts from; a failure is logged. Nothing is started until `wait_until_precomputed`
+        has waited for an earlier thread. The training window must not be empty.
         """
         if self._precomputed is not None:
             return
@@ -139,12 +140,12 @@ class Learner:
     def catch_up(self) -> None:
         """Give labels the numbers that the store assigned, and do what `Feedback.remedy` asks.
 
-        The store assigns numbers only where cells share a product. The remedy, a rebuild of the
-        rule and perhaps a correction, follows a wrong label that was learned; it is left to a later
-        call while the store lacks records or has a fault. A correction first ends a retrain under
-        way, as `end_training` does, and retrains a model that cannot change its references. Where
-        the store fails meanwhile, that is logged, and a later call tries again. Checks that have
-        become overdue are counted, too.
+        The store assigns numbers only in a product. Checks that have become overdue are counted,
+        too. The remedy follows a wrong label that was learned: the rule is rebuilt, or a correction
+        is applied and the rule is rebuilt. It waits for a later call while the store lacks records
+        or cannot be written. Before a correction a retrain under way is ended (`end_training`); a
+        model that cannot change its references is retrained. If the store fails meanwhile, that is
+        logged and not raised, and a later call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -165,7 +166,7 @@ class Learner:
     def store_labels(self) -> None:
         """Wait until every label is in the store and has its number, then catch up.
 
-        Raises StoreError where the store is unavailable or takes too long.
+        Raises StoreError if the store is unavailable or takes too long.
         """
         if self._outbox.request_label_drain():
             self._outbox.drain()
@@ -174,21 +175,23 @@ class Learner:
     # A retrain
 
     def retrain(self, wait: bool) -> RetrainReport | None:
-        """Train a version here, let it answer and return the report; or begin in the executor.
+        """Train a version and put it in force, in this thread, or begin to in the executor.
 
-        The steps, in this order: every label is stored, since a version is trained on numbered
-        labels alone; what was computed in advance is waited for, and news of peers (what other
-        cells of the product stored) is taken in, since either may change what the training starts
-        from; then new labels count from zero, and the training begins.
+        First every label is stored, since a version is trained only on labels that the store has
+        numbered. Then the call waits for what is computed in advance, and takes in the news of
+        peers (what other cells of the product stored), since either may change what the training
+        starts from. Then new labels count from zero, and the training begins.
 
-        With `wait`, and without an executor that takes work, it is done in this thread. Else None
-        is returned, and `advance` brings the version to its end. Nothing begins while a training is
-        under way. Where the executor still works on one that was discarded, or something is
-        computed in advance, the training begins later, by `retrain_if_due`.
+        With `wait` True, or if no executor takes work, all is done in this thread, and the report
+        is returned. Otherwise None is returned, and `advance` brings the version to its end. With
+        `wait` False, None is also returned if a training is under way already, and then nothing is
+        begun. If the executor still works on a discarded training, or the computing in advance is
+        not done, the training is requested, and `retrain_if_due` begins it later.
 
-        A version that fails or cannot be stored is dropped, and the report says so. A version that
-        is stored, while labels that came since cannot be, answers at a later call; its report is
-        returned all the same. Raises StoreError where the labels before it cannot be stored.
+        A version that fails or cannot be stored is dropped, and the report says so. If the version
+        is stored, but labels that came since cannot be, it is put in force by a later call; its
+        report is returned all the same. Raises StoreError if the labels before the training cannot
+        be stored.
         """
         if not wait:
             if self.is_at_work:
@@ -214,17 +217,32 @@ class Learner:
         return self._report or candidate.report
 
     def retrain_if_due(self, retrain_every: int, once: bool = False) -> RetrainReport | None:
-        """Retrain, or begin to, if enough new labels came or the version lacks training steps.
+        """Retrain, or begin to, if there is a reason for it.
 
-        There must be as many labels as the model's `min_traces`, unless a retrain was asked for and
-        could not begin then. News of peers (what other cells of the product stored) is taken in
-        first, so another version may answer even if none is trained here. A version lacks steps if
-        its training ended by the budget; that counts only in a cell that shares no product, and
-        after a retrain that was accepted. A pinned version, which somebody rolled back to, stays.
-        With `once` a version that lacks steps is not trained on until the report of its last
-        retrain was taken. Returns the report of a retrain in this thread; else None: none is due,
-        the store is unavailable, a training or its preparation is under way, or it was begun in the
-        executor.
+        There are three reasons. First, `retrain_every` labels are new, and there are as many labels
+        as the model's `min_traces`. Second, the time budget ended the training of the version in
+        force before its last step; this is a reason only in a cell without a product, and only if
+        the last retrain was not dropped. Third, a retrain was requested earlier and could not begin
+        then, or a training was discarded and is to begin again. A pinned version is not replaced,
+        and such a request is withdrawn.
+
+        The news of peers is taken in first, so a peer's version may be in force afterwards, even if
+        nothing is trained here.
+
+        Parameters
+        ----------
+        retrain_every : int
+            Number of new labels after which a retrain is due.
+        once : bool, default False
+            If True, the second reason does not count while the report of the last retrain waits for
+            `take_report`.
+
+        Returns
+        -------
+        RetrainReport or None
+            The report of a retrain that was done in this thread. None if there is no reason, if the
+            store is unavailable, if a training or its preparation is under way, or if the executor
+            now trains.
         """
         is_due = self._is_due_after_news(retrain_every)
         if self.live.pinned:
@@ -262,11 +280,11 @@ class Learner:
         return self.is_at_work or self._is_requested
 
     def end_training(self) -> None:
-        """End what is under way without waiting for a training, before a change that it lacks.
+        """End what is under way, before a change that a running training would lack.
 
-        A version that is trained answers, or is dropped; for that it waits for the store. A
-        training that is not done is discarded, and another begins as soon as it can, after the
-        change.
+        A version that is trained is put in force or dropped; for that the call waits for the store,
+        but it never waits for a training. A training that is not done is discarded, and another
+        begins as soon as it can, after the change.
         """
         self.advance(to_the_end=True)
         self._discard_training()
@@ -278,15 +296,16 @@ class Learner:
             self._is_requested = True
 
     def advance(self, to_the_end: bool = False, wait: float = 0.0) -> None:
-        """Take a training's outcome from the executor, or bring its version a step further.
+        """Take a training's outcome from the executor, or bring its version one step further.
 
-        Taking the outcome is a step. With `to_the_end` it does all steps of a training that is
-        done, and blocks for the store. So it does always in a cell that shares labels and versions
-        with peers, the other cells of a product; there it first takes in what these have stored,
-        and a correction or a rollback among that discards the training. A version that cannot be
-        stored is dropped, and nothing is raised. `wait` is how many seconds to wait for a training
-        that is not done; then it is given up, as is one that hangs. Nothing happens while one is
-        not done, or where there is none.
+        Taking the outcome is a step. With `to_the_end` all steps of a training that is done are
+        taken, and the call waits for the store. Nothing happens if no training is under way, or
+        while it is not done. A version that cannot be stored is dropped, and nothing is raised.
+
+        `wait` is the number of seconds to wait for a training that is not done; after that it is
+        given up, and so is a training that hangs. In a product (cells that share labels and
+        versions) all steps are taken in any case. When the training is done, the news of the other
+        cells is taken in first; a correction or a rollback in it discards the training.
         """
         if self._candidate is None and self._retrainer.future is None:
             return
@@ -305,10 +324,10 @@ class Learner:
         self._advance(candidate, to_the_end)
 
     def _make_candidate(self, trained: Trained) -> Candidate:
-        """Make the outcome of a training the candidate, the version on its way to answer.
+        """Make the outcome of a training the candidate, the version on its way to be put in force.
 
-        It will take over the answering model's rule. Its reason says what the training started
-        from, where that was not the answering model.
+        It will take over the rule of the model in force. If the training started from another
+        model, the reason in its report says from which.
         """
         note = self._start[2] if self._start is not None else ""
         if note:
@@ -320,9 +339,10 @@ class Learner:
     def _choose_start(self) -> EngineModel:
         """Return the model that the next training starts from: one that saw no forgotten label.
 
-        That is the present model, unless a correction has come; then `find_clean_start` searches
-        the store, once for an answering version and the corrections that it has. Where the store
-        fails meanwhile, that is logged, and the training starts from initial weights.
+        Without any correction it is the model in force, or the untrained template before the first
+        retrain. Otherwise `find_clean_start` chooses it from the store, and the choice is kept
+        until another version is in force or another correction comes. If the store fails, that is
+        logged, and the training starts from initial weights.
         """
         live = self.live
         if not live.corrected_to:  # nothing was ever forgotten, so the store need not be read
@@ -341,10 +361,10 @@ class Learner:
         return self._start[1]
 
     def wait_until_precomputed(self) -> None:
-        """Wait until what the next retrain needs of the stored labels' traces is computed.
+        """Wait until the thread that `precompute` started is done.
 
-        `precompute` began it. Where nothing was begun, or it was waited for before, this returns at
-        once. There is no time limit.
+        If no thread was started, or it was waited for before, this returns at once. There is no
+        time limit.
         """
         if self._precomputed is not None:
             self._precomputed.result()
@@ -353,7 +373,7 @@ class Learner:
     # A candidate
 
     def _advance(self, candidate: Candidate, to_the_end: bool) -> None:
-        """Bring the candidate, a trained version that does not answer yet, a step further.
+        """Bring the candidate, a trained version that is not in force yet, one step further.
 
         With `to_the_end` it takes all steps of `_see_through`. A candidate that cannot be stored is
         dropped. A candidate that is stored waits for a later call if the newest labels cannot be
@@ -377,14 +397,14 @@ class Learner:
         candidate.end_work()
 
     def _see_through(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
-        """See a candidate through from its training to its first answer.
+        """Generate the steps of a candidate from its training until it is in force.
 
-        A model that does not answer as it was trained costs no commit, so it is compared first. A
-        version is stored with every label that came until then. It is stored before it answers:
-        else a killed process would leave decisions of a version that nobody has. While it is stored
-        more labels may come, so it catches up once more.
+        It is tested first, so that a model that fails the test is never written to the store. It is
+        stored with every label that came until then, and before it is in force: else a killed
+        process would leave decisions of a version that nobody has. More labels may come while it is
+        stored, so it learns these before it is put in force.
 
-        Yields after each step: None, or, where the store has not done its part yet, a function that
+        Yields after each step: None, or, if the store has not done its part yet, a function that
         waits for it. Raises StoreError if the version cannot be stored. The functions that it
         yields raise StoreError if the labels cannot.
         """
@@ -401,9 +421,9 @@ class Learner:
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
         """Make all labels that came references of the candidate, one a step, and have them stored.
 
-        Overdue checks are counted before each look. Yields as `_see_through` does. It ends when no
+        Each round first counts overdue checks. It yields like `_see_through`, and ends when no
         label is missing or waits to be stored. In a cell that never pauses some label always waits,
-        so every `PATIENCE`-th time this call waits for the store itself; a StoreError there is
+        so in every `PATIENCE`-th round this call waits for the store itself; a StoreError there is
         ignored.
         """
         for n_waits in count(1):
@@ -419,12 +439,11 @@ class Learner:
                     self._outbox.drain()
 
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
-        """Complete the candidate's report, and submit report and model to the thread that stores
-        them.
+        """Complete the candidate's report; hand report and model to the thread that stores them.
 
         Returns a future of the version's number: the report's, or a higher one if another cell of
         the product stored a version first. Without a model only the report is stored, and the
-        number is the report's. Raises StoreError where the store is unavailable.
+        number is the report's. Raises StoreError if the store is unavailable.
         """
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
@@ -439,11 +458,11 @@ class Learner:
         return state if self._peers is None else state | self._peers.labels.get_state()
 
     def _swap(self, candidate: Candidate) -> None:
-        """Let a stored candidate answer with the present rule; keep its report for `take_report`.
+        """Put a stored candidate in force with the present rule; keep its report for `take_report`.
 
         In a product, labels of this cell that still wait for those of other cells become its
-        references. Without a model, when the training was dropped, the old version goes on
-        answering; the report is kept, and its reason added to `dropped`.
+        references. If the training was dropped, there is no model: the previous version stays in
+        force, the report is kept, and its reason is added to `dropped`.
         """
         self._candidate = None
         self._report = candidate.report
@@ -458,10 +477,9 @@ class Learner:
                 self._peers.labels.add_missing_references(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
-        """Drop a candidate that could not be stored, and keep a report that says so, in memory
-        only.
+        """Drop a candidate that could not be stored, and keep a report of this in memory only.
 
-        It is logged, and the previous version goes on answering. In a cell that learns alone the
+        It is logged, and the previous version stays in force. In a cell that learns alone the
         labels count as new again, so that the next retrain is soon.
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
@@ -482,7 +500,7 @@ class Learner:
         self.dropped = [] if report.accepted else [*self.dropped, report.reason]
 
     def take_report(self) -> RetrainReport | None:
-        """Return the report of the newest retrain, once; None where it was taken."""
+        """Return the report of the newest retrain, once; None if it was taken."""
         report = self._report
         self._report = None
         return report
@@ -490,11 +508,12 @@ class Learner:
     # News of a product
 
     def _is_due_after_news(self, retrain_every: int) -> bool:
-        """Return whether a retrain is due by the number of new labels, and this cell's to do.
+        """Return whether there are enough new labels for a retrain, and this cell is to do it.
 
-        Where cells share a product, news (what the other cells stored) is taken in first, unless
-        that was done within a second: a peer's version may answer afterwards. If a retrain is due
-        then, all news is taken in, and it is counted again.
+        In a product, some of the news, what the other cells stored, is taken in first, unless that
+        was done within the last second; a peer's version may be in force afterwards. If a retrain
+        is due then, the rest of the news is taken in, and it is checked once more whether one is
+        due.
         """
         if self._peers is not None and self._peers.is_news_due:
             self._take_in_news(self._peers)
@@ -504,9 +523,9 @@ class Learner:
         return self.labels.is_due(retrain_every)
 
     def _take_in_all_news(self) -> None:
-        """Take in all news, what the product's other cells stored, but at most `ROUNDS` times.
+        """Take in all news, what the product's other cells stored, with at most `ROUNDS` requests.
 
-        Where the store is unavailable it stops, `Peers.is_lost` is set, and nothing is raised.
+        If the store is unavailable, it stops, `Peers.is_lost` is set, and nothing is raised.
         Without peers it does nothing.
         """
         peers = self._peers
@@ -519,8 +538,8 @@ class Learner:
     def _take_in_news(self, peers: Peers) -> int:
         """Take in the newest version, at most `MOST` labels, and corrections of the product.
 
-        Before, it waits until this cell's recorded labels are in the store. Returns the number of
-        labels; 0 also where the store is unavailable, which is noted in `peers` and not raised. A
+        First it waits until this cell's recorded labels are in the store. Returns the number of
+        labels; 0 also if the store is unavailable, which sets `Peers.is_lost` and is not raised. A
         pinned version or a correction among the news discards a training under way in the executor.
         Corrections that cannot be read come with the next news.
         """
@@ -554,10 +573,10 @@ class Learner:
     def bring_up_to_date(self) -> None:
         """Finish what is under way before a person's change: a training, labels, news of peers.
 
-        A trained version answers, and a training that is not done is discarded and begins again
-        later (`end_training`). News is what the product's other cells stored; at most `ROUNDS`
-        times `MOST` labels of it are taken in. Raises StoreError where the store is unavailable, or
-        where labels of peers before one of this cell's are missing.
+        A trained version is put in force or dropped, and a training that is not done is discarded
+        and begins again later (`end_training`). News is what the product's other cells stored; at
+        most `ROUNDS` times `MOST` labels of it are taken in. Raises StoreError if the store is
+        unavailable, or if labels of peers before a label of this cell are missing.
         """
         self.end_training()
         self.store_labels()
@@ -571,11 +590,12 @@ class Learner:
     def apply_corrections(self, may_retrain: bool = True) -> None:
         """Apply the store's newest corrections to window, references, count of new labels and rule.
 
-        A model that cannot change a reference is retrained, or a pinned one fitted again, if
-        `may_retrain`: only the cell that corrected does so. Where labels were forgotten, what the
-        next training starts from is prepared in a thread, and without an executor waited for. The
-        store is checked against its ledger, which may set the outbox's `integrity_error`. Raises
-        StoreError where the store is unavailable.
+        If the model cannot change a reference and `may_retrain` is True, it is retrained in this
+        thread, or, if it is pinned, fitted again as a new version; only the cell that corrected
+        does so. If the next training does not start from the model in force, because labels were
+        forgotten, its features are computed in advance (`_precompute_other_start`). The store is
+        checked against its ledger, which may set the outbox's `integrity_error`. Raises StoreError
+        if the store is unavailable.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         # In a product, labels after the window's newest come as news.
@@ -584,7 +604,7 @@ class Learner:
         is_done = self.live.apply_corrections()
         self.labels.recount(self.live.trained_on.counts_from)
         self.live.rebuild_rule()
-        self._prepare_start()
+        self._precompute_other_start()
         if is_done or not may_retrain:
             return
         if self.live.pinned:
@@ -594,11 +614,13 @@ class Learner:
         else:
             self.retrain(wait=True)
 
-    def _prepare_start(self) -> None:
-        """Compute in advance for the next training, where it does not start from what answers.
+    def _precompute_other_start(self) -> None:
+        """Begin to precompute for the next training if it does not start from the model in force.
 
-        It is computed in a thread. Without an executor it is waited for now, so that the retrain
-        keeps its budget. Nothing is done without labels.
+        This can be so after a label was forgotten: the training then starts from an earlier version
+        or from initial weights. A thread computes what that model needs of the traces in the
+        training window. Without an executor this call waits for the thread, so that the work does
+        not use up the time budget of the retrain. Without labels nothing is done.
         """
         if self._choose_start() is self.live.newest or not len(self._window):
             return
@@ -611,7 +633,7 @@ class Learner:
     def release(self, author: str) -> Change:
         """Let retrains replace a version again that a rollback pinned, and return the stored event.
 
-        The same model goes on as a new version. Raises StoreError where it cannot be stored: then
+        The same model goes on as a new version. If that cannot be stored, StoreError is raised and
         nothing changes.
         """
         live = self.live
@@ -622,17 +644,16 @@ class Learner:
         return event
 
     def roll_back(self, number: int, event: Change) -> None:
-        """Let the earlier version `number` answer again, as a new version that is pinned, and store
-        it with `event`.
+        """Put the earlier version `number` in force again, as a new version that is pinned.
 
-        Until the version is stored nothing changes, so all that can fail comes before: reading it,
-        restoring it, and adding the later labels, up to the training window's capacity, as its
-        references. Once it answers, news of peers is taken in, which become its references as well,
-        and only then new labels count from zero: none that it knows is new. A training that was
-        asked for is not begun.
+        It is stored together with `event`. Until then nothing changes, so all that can fail comes
+        before: reading it, restoring it, and adding the later labels, up to the training window's
+        capacity, as its references. Once it is in force, news of peers is taken in, which become
+        its references as well. Only then new labels count from zero, since the version knows all
+        labels until now. A retrain that was requested before is not begun any more.
 
-        Raises StoreError for a version that is not kept, where a trace is damaged that the model
-        must be fitted on again, and where it cannot be stored.
+        Raises StoreError if the version is not kept, if a trace is damaged that the model must be
+        fitted on again, and if the version cannot be stored.
         """
         begin = self._clock()
         self._outbox.check_integrity()
@@ -645,15 +666,15 @@ class Learner:
         self._is_requested = False  # what was asked for was to replace another version
         self._take_in_all_news()
         self.labels.begin_retrain()
-        self._prepare_start()
+        self._precompute_other_start()
 
     def _restore_with_rule_in_force(self, version: ModelVersion) -> tuple[EngineModel, TrainedOn]:
         """Return the model of a stored version with the rule in force, and what it was trained on.
 
-        A model that is stored by its traces is fitted on them again, a baseline with the labels as
-        they count now, since it cannot take a label back. Nothing answers by it yet. Raises
-        StoreError where one of these traces has changed, or this dengine cannot restore the
-        version.
+        A model that is stored by its traces is fitted on them again, with the labels that they had
+        then. A baseline is fitted on its traces with the labels as they count now, since it cannot
+        take a label back. The model is not put in force. Raises StoreError if one of these traces
+        has changed, or if this dengine cannot restore the version.
         """
         state = without_rule(version.state)
         trained_on = TrainedOn.from_state(version.state)
@@ -671,13 +692,13 @@ class Learner:
         return model, trained_on
 
     def set_policy(self, policy: Policy | None, evidence: EvidenceWindow, event: Change) -> None:
-        """Go on under another policy, as a new version of the same model, and store it with
-        `event`.
+        """Go on under another policy, as a new version of the same model.
 
-        With `policy` the decision rule starts anew and counts the decisions that `evidence` names.
-        With None only settings outside the model have changed, and its rule goes on. Before the
-        first retrain only the event is stored. Raises SettingError for a rule that cannot be made,
-        and StoreError where the event cannot be stored: then nothing changes.
+        The version is stored with `event`. With `policy` the decision rule starts anew and counts
+        the decisions that `evidence` names. With None only settings outside the model have changed,
+        and its rule goes on. Before the first retrain only the event is stored. Raises SettingError
+        if the rule cannot be made, and StoreError if the event cannot be stored: then nothing
+        changes.
         """
         live = self.live
         template = live.template
@@ -695,11 +716,10 @@ class Learner:
     def _store_and_swap_in(
         self, event: Change, model: EngineModel, trained_on: TrainedOn, reason: str, seconds: float
     ) -> None:
-        """Store a model as the next version, together with the event of a person, and let it
-        answer.
+        """Store a model as the next version, with the event of a person, and put it in force.
 
-        Its report, accepted after `seconds` for this reason, becomes the newest. StoreError where
-        it cannot be stored: then nothing changes.
+        Its report, accepted after `seconds` for this reason, becomes the newest. If the version
+        cannot be stored, StoreError is raised and nothing changes.
         """
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)

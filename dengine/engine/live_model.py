@@ -1,5 +1,6 @@
-"""`LiveModel`: the model that answers, and how its references and its rule learn from outcomes.
-Outcomes come from `feedback.Feedback`; `learner.Learner` says which version answers, and when.
+"""`LiveModel`: the model in force, and how its references and its rule learn from outcomes.
+Outcomes come from `feedback.Feedback`; `learner.Learner` says which version is put in force, and
+when.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Point = NDArray[np.float32]
 
 
 class LiveModel:
-    """The model that answers, with its decision rule and its references.
+    """The model in force, with its decision rule and its references.
 
     Parameters
     ----------
@@ -44,19 +45,19 @@ class LiveModel:
     Attributes
     ----------
     answering : EngineModel or None
-        None before the first retrain.
+        The model in force; None before the first retrain.
     version : int
-        Number of the answering version, from 1; 0 before the first retrain.
+        Number of the version in force, from 1; 0 before the first retrain.
     newest_version : int
-        Largest number that a version ever had; after damage an earlier version may answer.
+        Largest number that a version ever had; after damage an earlier version may be in force.
     trained_on : TrainedOn
-        Labels that the answering version was trained on.
+        Labels that the version in force was trained on.
     lacks_steps : bool
-        Whether the answering version's training took steps and has some left.
+        Whether the training of the version in force made some of its steps and not all of them.
     corrected_to : int
         Number of the newest correction that the references have.
     overdue : set of str
-        Decisions that the rule counts as wrong because their checks were not reported in time.
+        Decisions that the rule counts as wrong because their checks are overdue.
     overdue_to : int
         Number of the newest decision that was examined for an overdue check.
     """
@@ -83,12 +84,12 @@ class LiveModel:
 
     @property
     def newest(self) -> EngineModel:
-        """The answering model, or the template before the first retrain."""
+        """The model in force, or the template before the first retrain."""
         return self.answering or self.template
 
     @property
     def pinned(self) -> int:
-        """Number of the version that a rollback pinned, and that answers; 0: none."""
+        """Number of the earlier version that a rollback put in force again and pinned; 0: none."""
         return self.trained_on.pinned
 
     @property
@@ -106,8 +107,8 @@ class LiveModel:
         """Restore a stored version and learn the outcomes that came after it.
 
         A model that is stored by its traces is trained on them again; any other is restored bit for
-        bit, with its reference points. Without a version, or where one of those traces is damaged
-        or missing, the untrained template stays, and its rule is updated with the stored outcomes
+        bit, with its reference points. Without a version, or if one of those traces is damaged or
+        missing, the untrained template stays, and its rule is updated with the stored outcomes
         since it began. The outcomes that update the rule are checked against the store's ledger,
         which may set the outbox's `integrity_error`.
 
@@ -118,14 +119,14 @@ class LiveModel:
         newest_version : int
             Largest number that a version ever had.
         label_within : int
-            After how many later decisions a verification without a report is overdue.
+            After how many later decisions a check without a report is overdue.
         policy_since : int
             First version under the policy in force.
 
         Raises
         ------
         StoreError
-            Where the store cannot be read, and for a model that this dengine cannot restore.
+            If the store cannot be read, or this dengine cannot restore the model.
         """
         store = self.outbox.store
         since = self.evidence.since
@@ -155,7 +156,7 @@ class LiveModel:
             self._rebuild_rule_of(model, self._read_outcomes)
 
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
-        """Let a model answer from now on, as the version of this number; nothing is stored.
+        """Put a model in force, as the version of this number; nothing is stored.
 
         The caller hands the rule in force over to it (`EngineModel.prepare`), before or after.
         """
@@ -169,14 +170,16 @@ class LiveModel:
     def learn(
         self, stored: StoredDecision, success: bool, number: int, n_unreported: int | None
     ) -> Point | None:
-        """Update the rule with an outcome, and make the trace a reference of the answering model.
+        """Update the rule with an outcome, and make the trace a reference of the model in force.
 
-        An exception of the rule or the model is logged; after one of the rule every part is
-        verified. `number` is that of the label. `n_unreported` is the number of accepted parts
-        without an outcome since the previous update; with None, or for a decision before the
-        present rule began, the rule is not updated. Returns the reference point, float32 of shape
-        (d,), to be stored with the label; None where there is none: no model yet, a failure, or a
-        baseline (a model that the user handed in).
+        An exception of the rule or the model is logged; if the rule raised, it is stale, and every
+        part is verified. `number` is that of the label. `n_unreported` is the number of accepted
+        parts without an outcome since the previous update. If it is None, or the decision is from
+        before the present rule began, the rule is not updated.
+
+        Returns the reference point, float32 of shape (d,), to be stored with the label; None if
+        there is none: before the first retrain, after a failure, and for a baseline (a model that
+        the user handed in).
         """
         decision = stored.decision
         if n_unreported is not None and decision.model_version >= self.evidence.since:
@@ -208,7 +211,7 @@ class LiveModel:
         return point if model.keeps_references else None
 
     def count_overdue(self, decision: Decision) -> None:
-        """Update the rule as if a decision was wrong, because its check was not reported in time.
+        """Update the rule as if a decision was wrong, because its check is overdue.
 
         The decision's id is kept in `overdue`. A failed update is logged. A decision with the bound
         (0, 1), which says nothing, or from before the present rule began, changes nothing.
@@ -224,9 +227,9 @@ class LiveModel:
         self.overdue_to = number
 
     def clear_overdue(self, decision_id: str) -> bool:
-        """Count a decision as overdue no more, because its check was reported.
+        """Stop counting a decision as overdue, because its check was reported.
 
-        Returns whether it was counted so. If True, the rule must be rebuilt; this does not do it.
+        Returns whether it was counted as overdue. If True, the caller must have the rule rebuilt.
         """
         if decision_id not in self.overdue:
             return False
@@ -236,13 +239,15 @@ class LiveModel:
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with all stored outcomes of decisions since it began.
 
-        It is the rule of the answering model, or of the untrained template before the first
-        retrain. It begins in the safe mode that `evidence` names, `began_in`. Checks that are
-        overdue (not reported in time) are among the outcomes, as wrong decisions. Labels that are
-        not in the store yet are not, so the rule forgets them: store them before. A stale rule,
-        which an update failed for, stays so, and a failure here makes it stale and is logged: every
-        part is then verified. The store's ledger (its hash chain) is not checked here. Raises
-        StoreError, and changes nothing, where the store is unavailable.
+        It is the rule of the model in force, or of the untrained template before the first retrain.
+        It begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
+        outcomes, as wrong decisions. Labels that are not in the store yet are not, so the rule
+        forgets them: store them before.
+
+        An update that fails here is logged and makes the rule stale: every part is then verified
+        until the engine is opened again. A rule that was stale before stays so. The store's ledger
+        (its hash chain) is not checked here. Raises StoreError, and changes nothing, if the store
+        is unavailable.
         """
         store = self.outbox.store
         outcomes = self.outbox.call_store(
@@ -272,13 +277,13 @@ class LiveModel:
         return self.outbox.store.labels.outcomes_since(after, self.evidence.since, self.overdue_to)
 
     def apply_corrections(self) -> bool:
-        """Apply the store's newest corrections to the references of the answering model.
+        """Apply the store's newest corrections to the references of the model in force.
 
-        Returns False where the model must be trained again: always for a baseline (a model that the
-        user handed in), and where it cannot change a reference. The caller must retrain then,
-        because each correction is read only once. Returns True before the first retrain;
-        `corrected_to` is set in any case. The rule is left to `rebuild_rule`. Raises StoreError
-        where the store is unavailable.
+        Returns False if the model must be trained again: always for a baseline (a model that the
+        user handed in), and if it cannot change a reference. The caller must retrain then, because
+        each correction is read only once. Returns True before the first retrain; `corrected_to` is
+        set in any case. The rule is left to `rebuild_rule`. Raises StoreError if the store is
+        unavailable.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
@@ -291,11 +296,12 @@ class LiveModel:
     def with_policy(
         self, policy: Policy, evidence: EvidenceWindow
     ) -> tuple[EngineModel, EngineModel | None]:
-        """Return copies of the untrained and the answering model with another policy's new rule.
+        """Return copies of the untrained model and the model in force, under another policy.
 
-        The second is None before the first retrain; it shares the references of the answering
-        model. That it cannot be made ready is logged. Neither is in force yet. Raises SettingError
-        for a rule that cannot be made.
+        Their rule is that of the policy and has learned nothing. The second copy is None before the
+        first retrain; it shares the references of the model in force. If it cannot be made ready to
+        predict, that is logged. Neither is put in force. Raises SettingError if the rule cannot be
+        made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
@@ -317,8 +323,7 @@ class LiveModel:
         """Return the arrays by name with which the store can restore a model as a version.
 
         They hold the model, what it was trained on, and which corrections and overdue checks count.
-        If an overdue check (not reported in time) counts, an engine that opens the store rebuilds
-        the rule.
+        If an overdue check counts, an engine that opens the store rebuilds the rule.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)

@@ -29,10 +29,10 @@ def restore_model(
 ) -> EngineModel | None:
     """Return a new model, made from the untrained template, in the state of a stored version.
 
-    A model that is stored by its traces is trained on them again. Returns None where one of these
-    traces is damaged or missing. The two models share one rule, so the template gets the stored
-    rule, too. Raises StoreError for a state that this dengine cannot restore, for a damaged label,
-    and where the store cannot be read.
+    A model that is stored by its traces is trained on them again. Returns None if one of these
+    traces is damaged or missing. The new model and the template share one rule, so the template
+    gets the stored rule, too. Raises StoreError for a state that this dengine cannot restore, for a
+    damaged label, and if the store cannot be read.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -45,7 +45,7 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
 
     Labels are first checked against the ledger, the store's hash chain, which may set the outbox's
     `integrity_error`; the model is trained nevertheless. Returns False, with the model untrained,
-    where a trace is damaged or missing. A label that was forgotten by then is left out, and is not
+    if a trace is damaged or missing. A label that was forgotten by then is left out, and is not
     missing. Raises StoreError for a damaged label, or if the store does not answer.
     """
     store = outbox.store
@@ -72,13 +72,23 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
 def find_clean_start(
     store: SqlStore, template: EngineModel, newest: EngineModel, trained_on: TrainedOn
 ) -> tuple[EngineModel, str]:
-    """Return a model to train on from that never saw a label which is forgotten now, and a note.
+    """Return a model for the next training to start from, which saw no label that is forgotten now.
 
-    That is `newest`, whose weights learned from `trained_on`, unless it saw one. Then it is the
-    newest version that is stored and did not, without its rule, and else `template`, the untrained
-    model, with initial weights; the note says so. A model that begins anew with each training
-    stays. Versions that are damaged or not kept are passed over. Raises StoreError where the store
-    cannot be read.
+    If `newest`, whose weights learned from `trained_on`, saw no such label, it is returned. It is
+    also returned if it begins anew with each training. Otherwise the newest stored version that saw
+    no such label is returned, without its rule; versions that are damaged or not kept are passed
+    over. If there is none, it is `template`, the untrained model with its initial weights.
+
+    Returns
+    -------
+    start : EngineModel
+    note : str
+        Says which of these it is; "" for `newest`.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
     """
     corrections = {correction.seq: correction for correction in store.corrections.after()}
 
@@ -111,7 +121,7 @@ def find_clean_start(
 def newest_reference(version: ModelVersion) -> int:
     """Return the sequence number of the newest label among the references of a stored version.
 
-    Of a model whose references are not stored it is the newest label that it was trained on.
+    For a model whose references are not stored, it is the newest label that it was trained on.
     """
     # Stored references include the labels that came during the retrain. A baseline has no stored
     # references: it was trained again, without those labels.
@@ -129,8 +139,7 @@ def add_labels_since(
     that came meanwhile are applied between the labels, where they came, so that the model is the
     same bit for bit. A baseline (a model that the user handed in), which cannot be corrected, gets
     the labels as they count now. A label that the model cannot take is logged and skipped. Returns
-    the number of the newest correction in the store. Raises StoreError where the store cannot be
-    read.
+    the number of the newest correction in the store. Raises StoreError if the store cannot be read.
     """
     corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
@@ -165,11 +174,21 @@ def add_labels_since(
 def apply_correction(model: EngineModel, store: SqlStore, correction: Correction) -> bool:
     """Change the reference of a corrected label: relabel it, remove it or add it again.
 
-    Returns False, and changes nothing, where the model has references and cannot change that one:
-    it must be trained again. Otherwise True, also where nothing is changed: for a reference that is
-    not there, for a quarantined part, whose trace has a fault, for a damaged trace that would have
-    to be added again, and for a baseline, a model of the user's without references. One that the
-    model cannot take is logged. Raises StoreError where the store cannot be read.
+    If the model cannot take a reference that is added again, the error is logged, and the next
+    version learns the label from the store.
+
+    Returns
+    -------
+    bool
+        False if the model keeps references and cannot change this one: nothing is changed, and the
+        model must be trained again. True in all other cases, even if there was nothing to change:
+        the model is a baseline, which keeps no references; the reference has left the model; the
+        trace of the part has a fault; or the trace is damaged and would have to be added again.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
     """
     if not model.keeps_references:
         return True

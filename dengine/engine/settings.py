@@ -65,14 +65,14 @@ class EngineSettings:
     recipe : Recipe
         As it is in force.
     seed : int
-        Of the reducer, and of the coin that draws audits; 0 or more.
+        Of the reducer, and of the draw of audits; 0 or more.
     model : str or None
         Name of a baseline that was handed in; None: the recipe describes the model.
     described : str or None
         Description, with its settings, of an object that was handed in and has no name in TOML: a
         baseline or a reducer.
     trace : TraceSpec or None
-        The trace contract; None until the first sound trace.
+        Shape, rate and unit of all traces; None until the first trace without a fault.
     policy_since : int
         First model version under the policy in force; 0: every one.
     evidence : EvidenceWindow
@@ -80,7 +80,7 @@ class EngineSettings:
     Raises
     ------
     SettingError
-        For a seed that is no seed, and force limits that the traces cannot hold.
+        For an invalid seed, and for force limits that do not fit the traces.
     """
 
     recipe: Recipe
@@ -155,10 +155,10 @@ class EngineSettings:
         StoreError
             For an unused store, a damaged number, and a recipe that lacks settings.
         SettingError
-            For a text that is no recipe; where an object is missing or another than the engine was
-            made with, or a `model` is passed to an engine that has its own.
+            If the stored text is no recipe, if an object is missing or differs from the one that
+            the engine was made with, or if a `model` is passed to an engine that has its own.
         ImportRefusedError
-            Where the recipe names a class that may not be imported.
+            If the recipe names a class that may not be imported.
         """
         if "recipe" not in texts:
             raise StoreError(
@@ -192,13 +192,12 @@ class EngineSettings:
         )
 
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
-        """Return the settings in force and an untrained model: the recipe's, or `model` if handed
-        in.
+        """Return the settings in force and an untrained model: the recipe's, or `model` if given.
 
-        The settings are a copy that describes the object that was handed in, and whose recipe has
-        that model's own numbers in place of those without effect. The recipe's reducer is made, and
-        a class of the user's imported for it. Raises SettingError where that fails, and for an
-        object that lacks a method of `Model`.
+        If an object was handed in, the settings are a copy that describes it. For a `model`,
+        settings of the recipe that have no effect on it are replaced by the model's own. Without a
+        `model` the recipe's reducer is made, for which a class of the user's is imported. Raises
+        SettingError if that fails, and for a `model` that lacks a method of `Model`.
         """
         if model is None:
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
@@ -216,15 +215,17 @@ class EngineSettings:
         return settings, template
 
     def check_request(self, request: Settings) -> None:
-        """Raise SettingError where settings that a program gives are not the ones that are set.
+        """Raise SettingError if settings that a program gives are not the settings in force.
 
-        `request` holds settings by name, as `DataEngine` takes them; None asks for nothing. All
-        settings of a recipe in it are compared. The shadow mode is not, nor are force limits that
-        the program leaves out, because an operator sets both while the cell runs. Nor is a reducer
-        that is an object, with its parameters, nor a trace contract where none is set, nor what a
-        trace contract leaves unknown. Beside a baseline, a model that was handed in, only
-        `LOOP_SETTINGS`, which have an effect on any model, are compared. An unknown name is an
-        error, too.
+        `request` holds settings by name, as `DataEngine` takes them; None is a setting that was not
+        given. All settings of a recipe in it are compared. An unknown name is an error, too. For a
+        baseline, a model that was handed in, only `LOOP_SETTINGS`, which have an effect on any
+        model, are compared.
+
+        Not compared are the shadow mode, and force limits that the program leaves out, because an
+        operator sets both while the cell runs. Nor is a reducer that is an object, with its
+        parameters. A `trace` is compared only if a `TraceSpec` is in force, and only in what both
+        state.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -269,10 +270,10 @@ def _with_objects(
 ) -> Recipe:
     """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
-    `texts` are the store's settings, `name` is the store's, for errors. An object equal to the
-    reducer that the recipe names is accepted and not used, as is any reducer beside a model. Raises
-    SettingError where an object is missing, a `model` is passed to an engine that has its own, or
-    an object is another than the store was made with.
+    `texts` are the store's settings, and `name` is the name of the store for messages. An object
+    equal to the reducer that the recipe names is accepted and not used, as is any reducer beside a
+    model. Raises SettingError if an object is missing or differs from the one that the store was
+    made with, or if a `model` is passed to an engine that has its own.
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -305,9 +306,10 @@ def _with_objects(
 
 
 def _check_description(texts: Mapping[str, str], name: str, description: str) -> None:
-    """Raise SettingError where an object that is handed in again has other settings than before.
+    """Raise SettingError if an object that is handed in again has other settings than before.
 
-    `texts` are the settings of the store, whose "described" is compared, if there is one.
+    `description` is that of the object. It is compared with the setting "described" of the store,
+    among `texts`, if there is one.
     """
     made_with = texts.get("described")
     if made_with is not None and description != made_with:
@@ -320,9 +322,10 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
 def choose_recipe(reducer: Any, recipe: Any, given: Settings) -> Recipe:
     """Return the recipe that is asked for, with the settings of `given` in place of its own.
 
-    `recipe` is a Recipe, a name or a TOML file; without one it is the default recipe of `reducer`,
-    or of conv. A setting of None keeps the recipe's own. Raises SettingError where `recipe` names
-    another reducer than `reducer`, for what is no recipe, and for a setting out of range.
+    `recipe` is a Recipe, a name or a TOML file. If it is None, the default recipe of `reducer` is
+    taken, or that of conv. A setting of None keeps the recipe's own. Raises SettingError if
+    `recipe` names another reducer than `reducer`, for a `recipe` that is none, and for a setting
+    out of range.
     """
     source = recipe
     if source is None:
@@ -342,7 +345,7 @@ def named_classes(
     """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them.
 
     A name may stand in reducer, recipe (whose file is read) or policy; other settings are ignored.
-    Nothing is imported. Raises SettingError for what is no recipe.
+    Nothing is imported. Raises SettingError if no recipe can be read from one of these.
     """
     recipes = [Recipe.load(source) for source in (reducer, recipe) if source is not None]
     recipes.append(Recipe(policy=policy or Policy()))
@@ -350,11 +353,11 @@ def named_classes(
 
 
 def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[str]) -> None:
-    """Raise ImportRefusedError where a stored recipe names a class that may not be imported.
+    """Raise ImportRefusedError if a stored recipe names a class that may not be imported.
 
     Whoever writes to the store could otherwise run code here. With `allow_import` True any class is
-    allowed, with False none; else it holds the names of those that are. `store` is the store's name
-    in the message.
+    allowed, with False none; else it holds the names of the allowed classes. `store` is the store's
+    name in the message.
     """
     if allow_import is True:
         return
@@ -368,20 +371,20 @@ def check_imports(recipe: Recipe, store: str, allow_import: bool | Collection[st
 
 
 def read_peers_trace_spec(store: "SqlStore") -> TraceSpec | None:
-    """Return the trace contract of a product's other cells; None if there is none, or no product.
+    """Return the `TraceSpec` of a product's other cells; None if there is none, or no product.
 
-    It is that of the first cell that has one. Raises StoreError where it is damaged.
+    It is that of the first cell that has one. Raises StoreError if it is damaged.
     """
     specs = map(stored_trace_spec, store.settings.of_peers().values())
     return next(filter(None, specs), None)
 
 
 def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec | None:
-    """Return the trace contract of a store, completed by a stated one.
+    """Return the `TraceSpec` of a store, completed by a stated one.
 
     It is the store's own, else that of the product's other cells, else the stated one. A stated one
-    adds rate, units and columns, and only to a contract of its shape. Raises StoreError where one
-    is damaged.
+    adds rate, units and columns, and only to a `TraceSpec` of its shape. Raises StoreError if a
+    stored one is damaged.
     """
     agreed = stored_trace_spec(store.settings.read()) or read_peers_trace_spec(store)
     return stated if agreed is None else agreed.completed(stated)
@@ -390,12 +393,12 @@ def agreed_trace_spec(store: "SqlStore", stated: TraceSpec | None) -> TraceSpec 
 def fill_from_peers(
     request: Settings, store: "SqlStore", allow_import: bool | Collection[str]
 ) -> dict[str, Any]:
-    """Return a copy of the settings for a new engine, with what is open taken from a peer.
+    """Return a copy of a new engine's settings, in which a peer's replace some that were not given.
 
-    A peer is another cell of the store's product. Taken are its seed if `request` has none (0
-    without a peer), and its recipe if `request` names neither reducer, recipe nor model. A peer
-    that was given an object without a name has no recipe to take. Raises ImportRefusedError where
-    the recipe names a class that may not be imported.
+    A peer is another cell of the store's product; the first one is taken. Its seed is taken if
+    `request` has none (0 without a peer), and its recipe if `request` names neither reducer, recipe
+    nor model. A peer that was given an object without a name has no recipe to take. Raises
+    ImportRefusedError if the recipe names a class that may not be imported.
     """
     peer = next(iter(store.settings.of_peers().values()), {})
     filled = dict(request)
@@ -412,10 +415,10 @@ def fill_from_peers(
 def check_model_settings(reducer: Any, given: Settings) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
-    The caller has such a model. `reducer` is the setting of that name, and `given` holds the other
-    settings by name; None is a setting that was not given. Without effect are reducer, radius,
-    folds, and a policy that differs from the default in more than `BASELINE_SETTINGS`: audit_rate,
-    stops, label_within, force_limits and shadow.
+    `reducer` is the setting of that name, and `given` holds the other settings by name; None is a
+    setting that was not given. Without effect are reducer, radius, folds, and a policy that differs
+    from the default in more than `BASELINE_SETTINGS`: audit_rate, stops, label_within, force_limits
+    and shadow.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:
@@ -454,7 +457,7 @@ class SettingsInForce:
     ----------
     now : EngineSettings
     conditions : DecisionConditions or None
-        What a decision depends on beside the model; None before the first sound trace.
+        What a decision depends on beside the model; None before the first trace without a fault.
     is_unsaved : bool
         Whether the store lacks the present settings, so that `save` must be called again.
     """
@@ -477,7 +480,7 @@ class SettingsInForce:
     def save(self) -> None:
         """Write the settings to the store, within its time limit.
 
-        Where that fails, the error is logged and `is_unsaved` is set, which a later success clears;
+        If that fails, the error is logged and `is_unsaved` is set, which a later success clears;
         nothing is raised.
         """
         texts = self.now.to_store()

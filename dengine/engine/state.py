@@ -45,14 +45,12 @@ class EngineState:
 
     @property
     def integrity_error(self) -> str:
-        """What in the store is not as it was written, so that every part is verified; "" if
-        nothing is.
-        """
+        """What was changed in the store, so that every part is verified; "" if nothing was."""
         return self._outbox.integrity_error
 
     @property
     def store_fault(self) -> str:
-        """Why the store, or its journal, cannot be written at present; "" where both can."""
+        """Why the store, or its journal, cannot be written at present; "" if both can be."""
         return self._outbox.fault
 
     @property
@@ -61,7 +59,7 @@ class EngineState:
         return self._outbox.lag
 
     def complete(self, status: Status) -> Status:
-        """Return a copy of a status read from the store, with what only the engine knows put in.
+        """Return a copy of a status from the store, completed by what only the engine knows.
 
         That is version, safe mode, new labels, the store's fault and lag, and whether it retrains.
         """

@@ -41,8 +41,8 @@ class TrainingWindow:
     Work on it does not grow with the store.
 
     The traces lie in one block that is filled from its front and never overwritten, so a snapshot
-    is a view of it. When the block is full, the window goes on in another, half as long again, and
-    the old one stays with those who hold a snapshot.
+    is a view of it. When the block is full, the window goes on in another one, which has room for
+    half as many rows again, and the old one stays with those who hold a snapshot.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ class TrainingWindow:
     def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
-        `label` is 1 or 0, `hash_` the hash of part or content, `seq` the label's number, larger
-        than any before, which is not checked.
+        `label` is 1 or 0, `hash_` the hash of part or content, and `seq` the label's number. It
+        must be larger than any before, which is not checked.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
@@ -82,11 +82,10 @@ class TrainingWindow:
         self._first = max(self._first, self._end - self.capacity)
 
     def _enlarge(self, trace_shape: tuple[int, ...]) -> None:
-        """Copy the window to the front of a new block that is half as long again, at least 64 rows
-        longer.
+        """Copy the window to the front of a new block that has room for half as many rows again.
 
-        `trace_shape` is the shape of one trace, which an empty window does not know. The old block
-        is not changed.
+        There is room for at least 64 more rows. `trace_shape` is the shape of one trace, which an
+        empty window does not know. The old block is not changed.
         """
         n = len(self)
         columns = [column[self._first :] for column in self._block]
@@ -143,9 +142,9 @@ class TrainedOn:
     corrected_to : int
         Number of the newest correction that they had.
     counts_from : int
-        Number of the newest label that the next retrain does not wait for.
+        Only labels with a larger number count as new for the next retrain.
     pinned : int
-        Number of the earlier version that answers again by a rollback, and that no automatic
+        Number of the earlier version that a rollback put in force again, and that no automatic
         retrain replaces; 0: the version is not pinned.
     """
 
@@ -162,9 +161,10 @@ class TrainedOn:
         return bool(len(self.seq)) and (seq < self.seq[0] or seq in self.seq)
 
     def to_state(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays "trained_on", "trained_as", "counts_from" and "pinned", for the store.
+        """Return the four attributes as arrays by name, for the store; `from_state` reads them.
 
-        `from_state` reads them.
+        Their names are "trained_on" (`seq`), "trained_as" (`corrected_to`), "counts_from" and
+        "pinned".
         """
         return {
             "trained_on": self.seq,
@@ -199,10 +199,10 @@ class Limits:
     reserve: float = 0.0
 
     def deadline(self, begin: float) -> float | None:
-        """Return after when a training begins no step, if it began at `begin`; None without budget.
+        """Return the time after which a training begins no step, if it began at `begin`.
 
         That is after 70 % of the budget, or when `reserve` seconds of it are left if that is
-        earlier, but not before 30 %.
+        earlier, but not before 30 %. None without a budget.
         """
         if self.budget is None:
             return None
@@ -217,7 +217,7 @@ class Trained:
     Attributes
     ----------
     model : EngineModel or None
-        To be swapped in; None where the training is dropped.
+        To be put in force; None if the training is dropped.
     reason : str
         Why it is accepted or dropped, in words.
     n_steps : int
@@ -265,8 +265,8 @@ class Retrainer:
     window : TrainingWindow
     limits : Limits
     executor : concurrent.futures.Executor or None
-        A `RestartableExecutor` that died or hangs is started again. Another is set to None when it
-        died or takes no more work.
+        A `RestartableExecutor` that died or hangs is started again. Any other one is set to None
+        when it died or takes no more work.
     clock : callable
         Seconds, of any origin; it must pickle for a process executor.
 
@@ -300,8 +300,8 @@ class Retrainer:
     def train(self, current: EngineModel, begin: float) -> Trained:
         """Train a successor of the current model in this thread, and return the outcome.
 
-        `begin` is when work on the retrain began, by the clock. The current model is not changed; a
-        failure is an outcome without a model.
+        `begin` is when work on the retrain began, by the clock. The current model is not changed.
+        If the training fails, the outcome has no model, and nothing is raised.
         """
         data = self.window.snapshot()
         trained = train_candidate(current.successor(), data, self._limits(), self.clock)
@@ -312,9 +312,8 @@ class Retrainer:
         """Begin to train a successor of the current model in the executor, on the labels as of now.
 
         `collect` returns the outcome; no other training may be under way. Returns False, and begins
-        nothing, without an executor that takes work, and while it still works on a training that
-        was discarded. An executor that refuses work is started again or given up, and that is
-        logged.
+        nothing, if there is no executor, if it refuses work, or while it still works on a discarded
+        training. An executor that refuses work is started again or given up, and that is logged.
         """
         executor = self.executor
         if executor is None or self._left is not None:
@@ -353,8 +352,8 @@ class Retrainer:
     def is_occupied(self) -> bool:
         """Whether the executor still works on a training that was discarded.
 
-        One that hangs, by `HUNG`, is given up and does not count any more; the executor is then
-        started again, or not used until it is done.
+        A training that hangs, by `HUNG`, does not count: reading this then starts the executor
+        again, or if that cannot be done, leaves it unused until the training is done.
         """
         left = self._left
         if left is None or left.done():
@@ -368,8 +367,8 @@ class Retrainer:
     def _count_seconds_left(self) -> float:
         """Return how many seconds the executor's training has left, before it counts as hung.
 
-        It has `HUNG` of them from when the executor could begin: while a process still imports, the
-        count starts anew.
+        It has `HUNG` seconds from when the executor could begin with it: while the executor's
+        process still imports, the count starts anew.
         """
         now = time.monotonic()
         executor = self.executor
@@ -380,10 +379,11 @@ class Retrainer:
     def collect(self, wait: float = 0.0) -> Trained | None:
         """Return the outcome of the training in the executor, once.
 
-        Returns None where there is none or it is not done. With `wait` above 0 it blocks for at
-        most so many seconds; a training that is not done then is given up, and so is one that
-        hangs, or whose executor died: the outcome has no model and says why. An executor that died
-        or hangs is started again if it can be, or not used.
+        Returns None if there is none or it is not done. With `wait` above 0 it blocks for at most
+        `wait` seconds, and a training that is not done then is given up. So is, whatever `wait` is,
+        a training that hangs, or whose executor died. The outcome of a training that was given up
+        or failed has no model and says why. An executor that died or hangs is started again if it
+        can be, or not used.
         """
         future = self.future
         left = self._count_seconds_left()
@@ -400,9 +400,9 @@ class Retrainer:
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
-        A training that is not done, of an executor that lives, is discarded: the executor is
-        occupied by it until it is done. An executor that died, or in which a training hangs, is
-        started again if it can be, or not used.
+        If the training is not done and its executor lives, it is discarded: the executor is
+        occupied until it is done. An executor that died, or in which a training hangs, is started
+        again if it can be, or not used.
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken
@@ -419,11 +419,11 @@ class Retrainer:
         return f"dropped: RuntimeError: {failure}"
 
     def _replace_executor(self) -> None:
-        """Start the executor again, or where that cannot be done do without it.
+        """Start the executor again, or go on without it if it cannot be started.
 
-        A `RestartableExecutor` is restarted; where that fails, it is logged. Any other is set to
-        None, which is logged, but if it still works on a discarded training it is kept, and used
-        again once it is done.
+        A `RestartableExecutor` is restarted; if that fails, it is logged. Any other executor is set
+        to None, which is logged. But if it still works on a discarded training, it is kept, and
+        used again once that is done.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):
@@ -442,10 +442,10 @@ def train_candidate(
 ) -> Trained:
     """Train a successor, which this changes, on labelled traces and return the outcome.
 
-    Any exception, no trace at all, and a defect of the trained model give an outcome without a
-    model, whose reason begins with "dropped: ". A training that reaches a limit ends early and is
-    accepted. Sets the present thread to one torch thread. It is a plain function, so that any
-    executor can run it.
+    Any exception, a window without traces, and a defect of the trained model give an outcome
+    without a model, whose reason begins with "dropped: ". A training that reaches a limit ends
+    early and is accepted. Sets the present thread to one torch thread. It is a plain function, so
+    that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     begin = clock()
