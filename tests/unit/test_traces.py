@@ -238,7 +238,7 @@ def test_what_cannot_honestly_be_fitted_is_refused_and_nothing_else_is(
     spec = TraceSpec(samples, channels=2, fit=FITS[fit])
     honest = have >= samples if fit == 1 else samples <= 2 * have <= 4 * samples
     assert can_fit_length(have, samples, fit) == honest
-    with nullcontext() if honest else pytest.raises(TraceError, match=f"samples, got {have}; "):
+    with nullcontext() if honest else pytest.raises(TraceError, match=f"samples, got {have}, "):
         fitted = as_trace(x, spec)
         assert fitted.shape == (2, samples)
         assert np.isfinite(fitted).all()
