@@ -192,7 +192,7 @@ class StoreError(DengineError, RuntimeError):
 
 
 class NotTakenError(StoreError):
-    """A label of which it is unknown whether it is on disk. Report it again: it counts once."""
+    """A label that may not be on disk. Report it again: it counts once."""
 
 
 class BusyError(DengineError, RuntimeError):

@@ -83,7 +83,7 @@ class ForceLimits:
 
     @classmethod
     def parse(cls, text: str) -> ForceLimits:
-        """Return the limits that a text as START:END:LOW:HIGH describes, as `str` writes it.
+        """Return the limits that a text like START:END:LOW:HIGH describes; `str` writes this text.
 
         An empty LOW or HIGH is no limit. `:channel=1`, `:along=2` and `:reject` may follow. Only
         digits name a channel by its index. Raises SettingError for any other text, and for values

@@ -98,7 +98,7 @@ class Recipe:
     reducer : str or estimator, default "conv"
         A name in `REDUCERS`, `module:Class` of your own, or a scikit-learn transformer.
     params : mapping, default {}
-        Parameters of the reducer, where it is a name. The reducer checks them when it is made.
+        Parameters of the reducer, if it is given by name. The reducer checks them when it is made.
     policy : Policy
         Error level, lower bound, interval, decision rule, audit rate.
     radius : float, optional
@@ -114,11 +114,12 @@ class Recipe:
         Optimiser steps of a retrain at most. None: the reducer's own limit. A replay stops on
         steps alone, so that it repeats exactly.
     window : int, default 10_000
-        Labelled traces that train and are counted: the newest ones, of either label.
+        Number of the newest labelled traces, good or bad, that are used in training and counted.
     novelty : float, default 1.5
-        A trace is novel if its squared distance to the nearest learned trace, by any of four
-        measures, is more than this many times the distance that 99.5 % of the learned traces keep
-        to their nearest. 0: no trace is novel.
+        Factor of the limits of novelty. A trace is novel if its squared distance to the nearest
+        learned trace is above a limit, by any of four measures. The limit is this factor times the
+        99.5 % quantile of the squared distances from the learned traces to the nearest other ones.
+        0: no trace is novel.
 
     Raises
     ------
@@ -172,7 +173,7 @@ class Recipe:
 
     @property
     def user_classes(self) -> list[str]:
-        """The `module:Class` of its reducer and of its rule, where they are not of this package."""
+        """The `module:Class` of its reducer and of its rule, if they are not of this package."""
         names = (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
         return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
 
@@ -185,7 +186,8 @@ class Recipe:
         recipe : str, path, Recipe or estimator
             A name in `RECIPES`, the path of a TOML file, a Recipe, which is returned unchanged, or
             a reducer of your own, `module:Class` (not imported here) or a scikit-learn transformer,
-            which gets the default settings. A text is tried in this order.
+            which gets the default settings. A text is first taken as a name, then as a path, then
+            as `module:Class`.
 
         Raises
         ------
@@ -214,10 +216,10 @@ class Recipe:
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
         """Parse the text that `to_toml` writes, and return the recipe.
 
-        Settings that are missing get their defaults, "none" is read as None, and the policy's
-        "windows", its name in earlier versions, as "force_limits". No class is imported. Raises
-        SettingError, which names `where`, for text that is not TOML, an unknown key or a value out
-        of range.
+        Settings that are missing get their defaults, and "none" is read as None. In earlier
+        versions the policy's "force_limits" had the name "windows", which is read, too. No class is
+        imported. Raises SettingError, which names `where`, for text that is not TOML, an unknown
+        key or a value out of range.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
@@ -262,9 +264,9 @@ class Recipe:
 
         `radius` and `retrain_every` are written as values also where the reducer's class gives
         them; it is imported for that. Of a named reducer only the `params` given are written, not
-        its defaults. A reducer object is written as `module:Class` and its parameters. Where these
-        are no plain values, as in a pipeline, it is written as "object Class", and the object must
-        be handed in again.
+        its defaults. A reducer object is written as `module:Class` and its parameters. If these are
+        no plain values, for example in a pipeline, it is written as "object Class", and the object
+        must be handed in again.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
@@ -284,11 +286,11 @@ class Recipe:
         return replace(self, policy=self.policy.changed(**changes))
 
     def make_reducer(self, seed: int) -> Any:
-        """Return the reducer: the object that was given, uncopied, or a new one of the name.
+        """Return the reducer: the object itself if one was given, or a new one, made by name.
 
-        Its class is imported. A new one gets the seed as `random_state`, and `folds`, where it
-        takes them, and then the recipe's `params`, which win. Raises SettingError if there is no
-        such reducer, or it does not take these `params`.
+        Its class is imported. A new reducer gets the seed as `random_state`, and `folds`, if it has
+        these parameters. The recipe's `params` come last and replace them. Raises SettingError if
+        there is no such reducer, or it does not take these `params`.
         """
         if not isinstance(self.reducer, str):
             return self.reducer

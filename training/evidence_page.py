@@ -64,8 +64,8 @@ VARIANTS = {
         'with `stops="all"`: the engine counts an accepted part as good if the line did not stop'
     ),
     "conv, every stop known, dishonest": (
-        "as before, but all members of the network learn from all labels and are then counted with "
-        "them; it shows what honest counting costs, and must not be used"
+        "as before, but each copy of the network learns from all labels, and the same labels are "
+        "then counted in its space; it shows what honest counting costs, and must not be used"
     ),
     "conv, pooled": 'with `guarantee="pooled"` and `stops="all"`',
     "conv, pooled, 2 % audits": "as before, and 2 % of the parts are checked at random",
@@ -371,7 +371,8 @@ def verdict_lines(rows: pd.DataFrame) -> list[str]:
     if not table:
         return [TOO_FEW, ""]
     return [
-        f"Number of sets on which `{REFERENCE}` is ahead / not different beyond chance / behind.",
+        f"Number of sets on which `{REFERENCE}` is ahead / the interval of the difference contains "
+        f"zero / `{REFERENCE}` is behind.",
         "",
         *table_lines(["method", "sets", "certain decisions", "net seconds"], table),
     ]
@@ -454,9 +455,9 @@ def figure_lines() -> list[str]:
         "",
         "![Learning curves of each method on each set](curves.png)",
         "",
-        f"Each point is the certain share of the parts, at {policy}, between one number of labels "
-        f"and {LABELS_PER_POINT} labels more. If a curve ends further left, the method needed "
-        "fewer labels for all parts of the set.",
+        f"Each point is the share of the parts that were decided without a check, at {policy}, "
+        f"while the engine got its next {LABELS_PER_POINT} labels. If a curve ends further left, "
+        "the method needed fewer labels for all parts of the set.",
         "",
         f"### Net seconds beside {REFERENCE}",
         "",
@@ -486,8 +487,8 @@ def loss_lines(rows: pd.DataFrame) -> list[str]:
         cells = [difference_cell(row, name) for name in MEASURES]
         table.append([row["set"], row["recipe"], *cells])
     return [
-        "These methods have more certain decisions or net seconds, beyond chance. The entries say "
-        "how much more.",
+        f"These methods have more certain decisions or net seconds than `{REFERENCE}`, by more "
+        "than chance explains. The entries say how much more.",
         "",
         *table_lines(["set", "method", *(measure.title for measure in MEASURES.values())], table),
     ]
@@ -511,7 +512,11 @@ def paper_lines(replays: pd.DataFrame) -> list[str]:
         if len(played):
             lines += [f"**{reducer}, {interval} interval**", ""]
             lines += [paper_table(played, reducer, interval), ""]
-    lines += ["The replays check the paper's findings:", ""]
+    lines += [
+        "The replays check the paper's findings. In this list, a *cell* is a cell of the tables, "
+        "that is a combination of alpha and LB.",
+        "",
+    ]
     return [*lines, *(f"- {line}" for line in findings(rows)), ""]
 
 
@@ -554,7 +559,7 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
         "## What each guarantee saves",
         "",
         "The table shows `conv` if every bad accepted part stops the line and is known "
-        '(`stops="all"`). `python training/evidence_guarantees.py` played it at commit '
+        '(`stops="all"`). `python training/evidence_guarantees.py` played its replays at commit '
         f"{commits}. The numbers are means over "
         f"{counted(played['seed'].nunique(), 'shuffle')}. An entry is: **net seconds** / certain "
         "decisions / share of the accepted parts that were bad. The two columns on the right are "

@@ -45,7 +45,7 @@ class ReplayCell:
 
     @property
     def truth(self) -> bool:
-        """Whether the newest part is good, by its label; that of the last before any `insert`."""
+        """Whether the newest part (before any `insert`: the last part) is good, by its label."""
         return bool(self.data.y[self.order[self.position]])
 
     @property

@@ -60,9 +60,10 @@ def data(
     """Describe recordings, and list what is wrong with them.
 
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
-    .npz, .ts or .mcap. Shown are the saved description or, without one, a proposal, in which ? is
-    what you have to state with --set; then what was read by it, and drift; --out draws the traces.
-    Look at them, and write the description with --save: every other verb reads by it.
+    .npz, .ts or .mcap. The verb shows the saved description or, without one, a proposal, in which ?
+    marks what you have to state with --set. Below, it shows what was read by the description, and
+    drift. --out draws the traces. Look at them, and write the description with --save: every other
+    verb reads by it.
 
     DATA may also be what needs no description: a bundled set, the file of a store, or an .npz file
     with X (traces, samples) and y (1 success, 0 failure).
@@ -244,11 +245,11 @@ def train(
 
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
     is stored, but never trained on. A store that has been used has its own recipe and seed: leave
-    them out, others are refused. Files are brought to the length of its traces. If nothing is new
-    and a version answers, nothing is trained. If training needs more time than the recipe's budget,
-    several retrains follow each other. If the new version is not used, or steps are missing at the
-    end since the budget is too short for one, the exit code is 1. Ctrl-C keeps what was imported;
-    the same command continues there.
+    these options out, because other values are refused. Recordings are brought to the length of the
+    store's traces. If nothing is new and a version answers, nothing is trained. If training needs
+    more time than the recipe's budget, several retrains follow each other. The exit code is 1 if
+    the new version is not used, or if steps are missing at the end, because the budget is too short
+    for a single step. Ctrl-C keeps what was imported; the same command continues there.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

@@ -62,14 +62,14 @@ def export(
     """Write an engine's decision to a file for the controller.
 
     FILE.sha256, the checksum, is written beside it, and with a key also FILE.sig, the signature; an
-    older FILE is replaced only with --force, a key never. --cpp writes the C and C++ sources that
-    run such a file.
+    existing FILE is replaced only with --force, and an existing key is never replaced. --cpp writes
+    the C and C++ sources that run such a file.
 
     STORE is the engine's store, as given to `dengine train` or `dengine run`; the cell may run
     meanwhile, and an event records the export. Before the first retrain there is nothing to export,
-    and the exit code is 1. --make-key and --cpp need neither STORE nor --out; with these, the new
-    key signs FILE too, so that --key is refused beside --make-key. Whoever has the key can check an
-    exported file, and can also sign one.
+    and the exit code is 1. --make-key and --cpp need neither STORE nor --out. If --make-key is
+    given together with STORE and --out, the new key also signs FILE; so --key and --make-key
+    exclude each other. Whoever has the key can check an exported file, and can also sign one.
     """
     if (store is None) is not (out is None) or not (store or new_key or cpp):
         raise click.UsageError(

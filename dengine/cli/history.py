@@ -100,10 +100,10 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
     STORE is the file or URL of an engine's store. The options choose which decisions; --events adds
-    the retrains and events since the first of them, or since --since. In the table good and bad are
-    the labels that were counted, bound is the interval of the success rate that follows from them,
-    v is the version of the model, and label is what the part turned out to be. `dengine explain`
-    tells more about one decision.
+    the retrains and events since the first of these decisions, or since --since. In the table good
+    and bad are the labels that were counted, bound is the interval of the success rate that follows
+    from them, v is the version of the model, and label is what the part turned out to be. `dengine
+    explain` tells more about one decision.
     """
     from ..history.status import history as read_history
     from ..representation import to_jsonable
@@ -224,10 +224,11 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     """Explain why a decision came out as it did.
 
     The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
-    by the word last. The number of a part with several decisions beside rejects is refused, with
-    their ids and exit code 1. Counts, bound and action are shown as they were recorded. Neighbours
-    are searched again with the version that decided, if the store still has it. The picture shows
-    the trace with its neighbours and with the band that holds 95 % of the known successes.
+    by the word last. If a part has several decisions that are no rejects, its number is refused
+    with exit code 1; the message has their ids. Counts, bound and action are shown as they were
+    recorded. Neighbours are searched again with the version that decided, if the store still has
+    it. The picture shows the trace with its neighbours and with the band that holds 95 % of the
+    known successes.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture

@@ -197,7 +197,7 @@ def _address(store: str | None, cell_id: str | None, product: str | None = None)
     return None if store is None else address(store, cell_id, product)
 
 
-_CELL_ID = "The cell, where the store holds several; `dengine status` lists them.  [default: cell]"
+_CELL_ID = "The cell, if the store holds several; `dengine status` lists them.  [default: cell]"
 
 
 def existing_store(store: Option) -> Option:
@@ -327,10 +327,9 @@ POLICY = {
         "--guarantee",
         type=NameChoice("guarantee", OWN_RULE),
         help=(
-            "What must keep to LB: the neighbourhood of each part, at one look (local), "
-            "or all accepted parts together (pooled). With cost, a part passes where "
-            "that is expected to be cheaper than a check, by --prices. Or a rule of your "
-            "own."
+            "local: LB applies to the neighbourhood of each part. pooled: it applies to all "
+            "parts together that reach the rule's threshold. cost: accept if that should cost "
+            "less than a check, by --prices. Or a rule of your own."
         ),
     ),
     "stops": click.option(
@@ -354,9 +353,9 @@ POLICY = {
         "--prices",
         type=CommaList(click.FloatRange(0.0)),
         help=(
-            "Of a check, of a bad part accepted and of a good part rejected, in one "
-            "unit, as in 0.5,200,5. Alone they imply --guarantee cost and --audit-rate "
-            "0.05.  [default: 5,120,47.5]"
+            "The prices of a check, of a bad accepted part and of a good rejected part, in "
+            "one unit, like 0.5,200,5. Without --guarantee they imply --guarantee cost and "
+            "--audit-rate 0.05.  [default: 5,120,47.5]"
         ),
     ),
     "force_limits": click.option(
@@ -378,8 +377,8 @@ SETTINGS = POLICY | {
         type=click.FloatRange(0.0),
         metavar="FACTOR",
         help=(
-            "Verify a trace that is this many times less like the learned traces than "
-            "they are like each other; 0: off."
+            "Margin of the novelty test, which verifies traces unlike the learned ones: with "
+            "a larger margin more traces pass; 0: off."
         ),
     )
 }
@@ -501,7 +500,7 @@ CHOICE = {
     "samples": click.option(
         "--samples",
         type=COUNT,
-        help="Samples of a trace: the first so many, which decides earlier.  [default: all]",
+        help="Use only this many samples from the start of each trace, which decides earlier.",
     ),
     "channel": click.option(
         "--channels",

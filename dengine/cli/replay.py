@@ -199,7 +199,7 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
             metavar="FOLDER",
             help=(
                 "Folder of finished replays, which are not played again: an interrupted run "
-                "continues, and other costs are computed at once."
+                "continues, and the costs at other prices take no new replays."
             ),
         ),
     }
@@ -209,17 +209,19 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
 
 
 GRID_LISTS = {
-    "alphas": click.option("--alphas", type=CommaList(ALPHA), help="To try, as in 0.5,0.1,0.05."),
+    "alphas": click.option(
+        "--alphas", type=CommaList(ALPHA), help="Values to try, like 0.5,0.1,0.05."
+    ),
     "lower_bounds": click.option(
-        "--lower-bounds", type=CommaList(LOWER_BOUND), help="To try, as in 0.8,0.9,0.95."
+        "--lower-bounds", type=CommaList(LOWER_BOUND), help="Values to try, like 0.8,0.9,0.95."
     ),
 }
 POLICY_LISTS = GRID_LISTS | {
     "intervals": click.option(
-        "--intervals", type=CommaList(NameChoice("interval")), help="To try."
+        "--intervals", type=CommaList(NameChoice("interval")), help="Names to try."
     ),
     "guarantees": click.option(
-        "--guarantees", type=CommaList(NameChoice("guarantee", OWN_RULE)), help="To try."
+        "--guarantees", type=CommaList(NameChoice("guarantee", OWN_RULE)), help="Names to try."
     ),
 }
 
@@ -267,8 +269,8 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     show_default=True,
     metavar="LIST",
     help=(
-        f"What the engine learns about accepted parts, of {','.join(CONFIRM_BY_FEEDBACK)}: only "
-        "their stops, or also which are good."
+        "What the engine learns about accepted parts. stops: only line stops. confirmed: also "
+        "which parts are good."
     ),
 )
 @stream_options(30, 1, 1, _SHUFFLES)
@@ -286,9 +288,9 @@ def compare(
     """Replay the same streams through several methods.
 
     Methods are reducers and baselines, under one policy or a grid of policies: a setting is given
-    as one value, such as --alpha, or as a list to try, such as --alphas, not both. Each is shown as
-    by `dengine replay`. umap-learn takes much longer than the others. Ctrl-C, or an error in a
-    replay, ends it and shows the replays that were finished.
+    as one value, such as --alpha, or as a list to try, such as --alphas, not both. For each method
+    the output is that of `dengine replay`. umap-learn takes much longer than the others. Ctrl-C, or
+    an error in a replay, ends it and shows the replays that were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -500,7 +502,10 @@ PRICES = {
 @options.recipe_options
 @options.bundle_options("lists", options.drop_none, GRID_LISTS)
 @stream_options(
-    4, 2, -1, "Number of shuffles that the last two policies play; earlier ones choose these."
+    4,
+    2,
+    -1,
+    "Number of shuffles that the last two policies play; earlier shuffles choose these policies.",
 )
 @explain_option
 @options.out_option
@@ -513,15 +518,15 @@ def costs(
     stream: Stream,
     out: Out | None,
 ) -> None:
-    """Find the policy that pays by three prices.
+    """Find out, by three prices, which policy pays.
 
-    Shows what a part of your recordings costs under the policies that pay most, and where
-    everything is verified; and says how certain that is, and how to set the policy. If none pays,
-    or may pay, the choice is to verify everything, and no policy to set is named. It tries levels
-    of LB, the --lower-bound, around break-even, where accepting costs as much as verifying, and the
-    guarantees pooled and cost. All costs are in one unit, such as seconds of production or money.
-    Ctrl-C, or an error in a replay, ends it and shows what was finished, if at least two shuffles
-    were.
+    Shows what a part of your recordings costs under the policies that pay most, and what it costs
+    if everything is verified. Says how certain these costs are, and how to set the policy. If no
+    policy pays or may pay, the choice is to verify everything, and the output names no policy. It
+    tries levels of LB, the --lower-bound, around break-even, where accepting costs as much as
+    verifying, and the guarantees pooled and cost. All costs are in one unit, such as seconds of
+    production or money. Ctrl-C, or an error in a replay, ends it and shows what was finished, if at
+    least two shuffles are finished.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of

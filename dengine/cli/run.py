@@ -116,12 +116,13 @@ def run(
     With a store that exists the engine continues where it was. The simulated cell then makes new
     parts, and a recording continues after its last part that was labelled or accepted: no part is
     learned from twice. A robot runs dengine/cells/ur/ur_cell.script, or a program with the same
-    handshake; --trigger and --samples say what is recorded of it. If too much goes wrong, or if
-    traces look like nothing known, every part is verified until fresh evidence shows otherwise:
-    safe mode. --shadow stays in force in the store, until `dengine policy STORE --shadow off`. At
-    the end a table shows what was decided, what was wrong and what was saved. Ctrl-C or SIGTERM
-    ends the run after the current cycle and shows what was done; a second one ends it at once. If
-    the cell fails, what was done is shown, too, and the exit code is 1.
+    handshake; --trigger and --samples say what is recorded of it. If too many decisions are wrong,
+    or too many traces are unlike all known ones, the engine enters safe mode: every part is
+    verified until fresh evidence shows recovery. --shadow stays in force in the store, until
+    `dengine policy STORE --shadow off`. At the end a table shows what was decided, what was wrong
+    and what was saved. Ctrl-C or SIGTERM ends the run after the current cycle and shows what was
+    done; a second one ends it at once. If the cell fails, what was done is shown, too, and the exit
+    code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")

@@ -45,7 +45,7 @@ DEMO_DEADLINE = 5.0
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address to listen on; any but this machine's own needs a token.",
+    help="Address to listen on; any other address than this machine's own needs a token.",
 )
 @click.option(
     "--port",
@@ -145,12 +145,12 @@ def serve(
     Continues with its store, or starts a new one, and retrains in a separate process. It runs until
     SIGTERM or Ctrl-C, which end it in order, with exit code 0: requests in line are answered, and
     everything known is written. --shadow stays in force in the store, until `dengine policy STORE
-    --shadow off`. --demo plays recorded parts as a robot would, in a new --store, or without one in
-    a store that is forgotten, with a deadline of 5 s or more. Without --token-file, programs on the
-    same machine need no token. Other machines reach it only with --host, which needs --token-file,
-    and should have --cert and --key. --samples, --rate-hz, --unit, --channels and --fit are the
-    contract of traces; without them a new store takes the form of its first trace, whose rate and
-    unit are unknown, or with --robot 1000 samples at 500 Hz.
+    --shadow off`. --demo plays recorded parts as a robot would, with a deadline of 5 s or more. It
+    keeps them in a new --store, or without --store forgets them at the end. Without --token-file,
+    programs on the same machine need no token. Other machines reach it only with --host, which
+    needs --token-file, and should have --cert and --key. --samples, --rate-hz, --unit, --channels
+    and --fit are the contract of traces. Without them a new store takes the form of its first
+    trace, and rate and unit are unknown; with --robot, it takes 1000 samples at 500 Hz.
     """
     if deploy is not None:
         from shutil import copytree

@@ -56,9 +56,9 @@ def status(store: str, last: int, check_seconds: float) -> None:
 
     STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`. If
     it holds several cells and none is named, they are listed; cells of one product share labels and
-    versions. The interval of bad accepted parts holds for one look; the certificate holds however
-    often one looks. If the model was certain of parts that were verified, as in shadow mode, a line
-    says how much time it would have saved, by `--check-seconds`.
+    versions. The interval of bad accepted parts is valid if you read it once, the certificate
+    however often you read it. If the model was certain of parts that were verified, as in shadow
+    mode, a line says how much time it would have saved, by `--check-seconds`.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable

@@ -96,12 +96,13 @@ def _change_and_print(
 def report(part: str, label: str, **changing: Any) -> None:
     """Report whether a part was good or bad.
 
-    The part is named by its number, if it has one decision beside rejects, or by that decision's
-    id. An accepted part that was bad is a line stop; a rejected one that was examined afterwards is
-    an inspection, and the engine trains on its label. An event records it. The same label again
-    changes nothing. Another label than the reported one is refused with exit code 1, unless it is a
-    line stop; `dengine correct` puts a wrong one right. The verb is refused while an engine runs on
-    the cell. A store that names a reducer or rule of your own, module:Class, needs --allow-import.
+    Name the part by its number, or by the id of its decision. The number is enough if the part has
+    one decision, or one that is no reject. An accepted part that was bad is a line stop; a rejected
+    one that was examined afterwards is an inspection, and the engine trains on its label. An event
+    records it. The same label again changes nothing. Another label than the reported one is refused
+    with exit code 1, unless it is a line stop; `dengine correct` puts a wrong label right. The verb
+    is refused while an engine runs on the cell. A store that names a reducer or rule of your own,
+    module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -134,9 +135,9 @@ def correct(part: str, label: str, **changing: Any) -> None:
 
     The part is named as for `dengine report`. From now on its decision counts with the corrected
     label. The label as it was reported stays in the store, and so does the decision; the correction
-    is a later row. A correction makes a forgotten label count again. If the label that counts
-    is this one already, nothing changes. A decision without a label is refused. The verb is refused
-    while an engine runs on the cell.
+    is a later row. A correction makes a forgotten label count again. If this label counts already,
+    nothing changes. A decision without a label is refused. The verb is refused while an engine runs
+    on the cell.
     """
     from ..history.explain import find_decision_id
 
@@ -173,8 +174,8 @@ def rollback(version: int, **changing: Any) -> None:
 
     Labels that came since are among its references, and corrections count. It is pinned: no
     automatic retrain replaces it, until `dengine release` or `dengine retrain`, or until a label
-    that it was trained with is forgotten. A version that is not kept is refused with the numbers of
-    those that are. The verb is refused while an engine runs on the cell.
+    that it was trained with is forgotten. A version that is not kept is refused; the message has
+    the numbers of the versions that are kept. The verb is refused while an engine runs on the cell.
     """
     _change_and_print(lambda engine, author: engine.rollback(version, author), **changing)
 
@@ -201,10 +202,10 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 
     Without options it is shown, while an engine may run; a change is refused while an engine runs
     on the cell. What is not given stays as it is. Earlier decisions keep their bounds. The
-    certificate starts again after any change; the rule forgets what it learned after one of the
-    tolerance, such as --alpha, for one that is chosen after the data was seen needs fresh evidence.
-    Shadow mode lasts over restarts; `dengine status` counts what the model would have done, and how
-    much was wrong.
+    certificate starts again after any change. After a change of the tolerance, such as --alpha, the
+    rule also forgets what it learned, because a tolerance that is chosen after the data was seen
+    needs fresh evidence. Shadow mode lasts over restarts; `dengine status` counts what the model
+    would have done, and how much was wrong.
     """
     if settings:
         _change_and_print(
@@ -228,11 +229,11 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 @verb("dengine retrain engine.db")
 @store_options
 def retrain(store: str, author: str, allow_import: bool) -> None:
-    """Train now, on the store's labels as they count.
+    """Train now, on the store's labels with all corrections.
 
-    An event records it. The new version replaces a pinned one, too. A candidate that fails its gate
-    is dropped, the previous version stays in use, and the exit code is 1. The verb is refused while
-    an engine runs on the cell.
+    An event records it. The new version replaces a pinned one, too. If the new version fails its
+    tests, it is dropped, the previous version stays in use, and the exit code is 1. The verb is
+    refused while an engine runs on the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -284,9 +285,9 @@ def verify(
     """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
-    the rows, with its rows. What was changed, is missing or is in no entry is listed, with exit
-    code 1, and so is data that was lost. Nothing is written but for --acknowledge, and engines may
-    run meanwhile.
+    the rows, with its rows. The verb lists what was changed, what is missing and what is in no
+    entry, and data that was lost; the exit code is then 1. It writes only with --acknowledge, and
+    engines may run meanwhile.
     """
     from ..store.sql import SqlStore
     from ..store.verification import verify_history
@@ -386,8 +387,8 @@ def restore(copy: str, store: Path) -> None:
 
     COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if it is
     not as it was written, or --store exists, it is refused with exit code 1. Beside the store each
-    cell gets a journal that knows its newest entry; one that is there stays, and the first engine
-    takes from it what the copy lacks.
+    cell gets a journal that names the newest entry of its ledger. A journal that is there already
+    stays, and the first engine takes from it what the copy lacks.
     """
     from ..store.backup import restore_store
 

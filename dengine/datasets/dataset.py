@@ -151,10 +151,11 @@ class Dataset:
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each trace.
 
-        Its columns are `label`, `part` and `cause` where known, and one for each sample of each
-        channel, `FZ_0`, `FZ_1`, ..., or without names `x_0`, of several channels `x0_0`. Its
-        metadata has the channels, the rate, the unit and the fit, so that `load_dataset` reads what
-        `data.to_frame().to_parquet("data.parquet")` writes, without a description.
+        Its columns are `label`, `part` and `cause` if known, and one for each sample of each
+        channel: `FZ_0`, `FZ_1`, ... Without channel names they are `x_0`, `x_1`, ... or, if there
+        are several channels, `x0_0`, `x0_1`, ... Its metadata has the channels, the rate, the unit
+        and the fit, so that `load_dataset` reads what `data.to_frame().to_parquet("data.parquet")`
+        writes, without a description.
         """
         import pandas as pd
 
@@ -188,7 +189,7 @@ class Dataset:
     def cut(self, samples: int) -> "Dataset":
         """Return a data set of the first `samples` samples of every trace, to decide earlier.
 
-        Its `fit` is "cut" where it was "pad" and the traces became shorter. Raises DataError if the
+        Its `fit` is "cut" if it was "pad" and the traces became shorter. Raises DataError if the
         traces are shorter, or were resampled, so that their first samples are not the first of the
         recordings.
         """

@@ -50,7 +50,8 @@ class TextForm:
     data
         Line of the first samples; counted from the header if that is a text.
     names
-        Names of the columns, in place of a header; a last `x*` names all that remain.
+        Names of the columns, in place of a header. If the last name is like `x*`, it names all
+        remaining columns.
     missing
         Words that stand for a lost sample, which is read as NaN; other words are faults.
     drop
@@ -141,9 +142,10 @@ class PartSource:
     """Where the number of a part stands: `[part]`. Without it each recording is of another part.
 
     column
-        Column, or columns that tell the part together.
+        Column with the part's number, or several columns that identify the part together.
     path
-        Regular expression, whose one group is found in the path without suffix.
+        Regular expression with one group, searched in the path without suffix; the text of the
+        group is the value.
     line
         Beginning of a line above the header, in front of the part's number.
     """
@@ -160,7 +162,8 @@ class LabelSource:
     column
         Column, or array, with the label.
     path
-        Regular expression, whose one group is found in the path without suffix.
+        Regular expression with one group, searched in the path without suffix; the text of the
+        group is the value.
     line
         Beginning of a line above the header, in front of the label.
     topic
@@ -270,8 +273,8 @@ class Description:
         `files`: a file for each part. `long`: a row for each sample. `wide`: a row for each part.
         `columns`: a column for each part. `npz`: arrays with all parts. `mcap`: bags.
     order
-        The order in which the parts were made: `name`, by file name, with numbers by their size;
-        `time`, by the first time of each; or the name of a column.
+        The order in which the parts were made. `name`: by file name, with the numbers in it sorted
+        by value. `time`: by the first time of each recording. Or the name of a column.
     """
 
     version: int = VERSION
@@ -297,8 +300,8 @@ class Description:
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
         """Return the description that nested dicts of TOML's types state; `?` passes for any value.
 
-        Raises DataError for a key that does not exist, with the nearest that does, for a value of
-        the wrong type, and for a newer version of this form.
+        Raises DataError for a key that does not exist (the message names the most similar key), for
+        a value of the wrong type, and for a newer version of this form.
 
         where : what the description is called in errors.
         """
@@ -394,8 +397,8 @@ class Description:
     def open_keys(self) -> Words:
         """The keys whose value is still `?`, like `label.column`; `channels` if there is none.
 
-        Not among them is a `?` in `[ignored]`, or in `[[check]]`: as a word it fits no recording,
-        so it makes no label, and recordings with other words become faults.
+        Not among them is a `?` in `[ignored]`, or in `[[check]]`: there, `?` is a word that no
+        recording has, so it makes no label, and recordings with other words become faults.
         """
         values = self.to_dict()
         values.pop("ignored", None)

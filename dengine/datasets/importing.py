@@ -135,7 +135,7 @@ def import_labelled(
 ) -> ImportReport:
     """Put every labelled trace of a data set into a store, in order; nothing is trained.
 
-    Chunks of them are stored all or none: an import that was interrupted continues where it
+    They are stored in chunks, each as a whole: an import that was interrupted continues where it
     stopped. The same file twice counts no label twice.
 
     Parameters
@@ -145,8 +145,8 @@ def import_labelled(
     dataset : object
         Anything `load_dataset` takes. Described recordings get the form of the store's traces.
     recipe, seed : optional
-        Of a new store's engine, by default conv and 0. A used store has its own; others are a
-        SettingError.
+        For the engine of a new store; by default recipe conv and seed 0. A used store has its own
+        recipe and seed; other values raise SettingError.
     on_traces : callable, optional
         Called with the number of traces that were just imported.
     allow_import : bool

@@ -33,23 +33,25 @@ def load_dataset(
     samples: int | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Read a data set: what is ours as it is, and recordings exactly by a description.
+    """Read a data set: a set of dengine's own form, or recordings exactly by a description.
 
     Parameters
     ----------
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
-        The name of a bundled set; a folder, file or DataFrame of recordings, which a description
-        describes. Without one: a `Dataset`; arrays X (n, T) or (n, C, T) and y (n,); an .npz file
-        of ours with X, y, and perhaps scale, rate_hz, unit, cause, channels and part; a Parquet
-        file that `Dataset.to_frame` made; the SQLite file of a store, for its labelled traces.
+        A folder, file or DataFrame of recordings, which a description describes. Or a source that
+        needs no description: the name of a bundled set; a `Dataset`; arrays X (n, T) or (n, C, T)
+        and y (n,); an .npz file of ours with X, y, and perhaps scale, rate_hz, unit, cause,
+        channels and part; a Parquet file that `Dataset.to_frame` made; the SQLite file of a store,
+        for its labelled traces.
     description : Description, dict or path, optional
         None: the one that was saved, `recordings.toml` in a folder, `FILE.toml` beside a file.
     channels : str or sequence of str, optional
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description
         names. None: all that it reads.
     samples : int, optional
-        Samples of each trace: the first so many. If the description has fewer, or resamples, the
-        recordings are read as if it said this number. None: as it says.
+        Number of samples to keep from the start of each trace. If the description has fewer, or
+        resamples, the recordings are read as if it stated this number. None: as the description
+        states.
     progress : callable, optional
         Called with 1 after each file.
 
@@ -62,7 +64,8 @@ def load_dataset(
     Raises
     ------
     DataError
-        If there is no description, or an open one, with what to type; or if no recording is left.
+        If there is no description, or a value in it is open (the message says what to type); or if
+        no recording is left.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     """

@@ -103,8 +103,8 @@ def wald_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.0
     """Compute the Wald interval, the normal approximation; the paper's baseline, Eq. 1.
 
     A single neighbour already gives [1, 1], so it is not a bound to rely on. The paper calls it the
-    binomial interval; `binomial_interval` and the setting "binomial" are the same function. Errors
-    as of `wilson_interval`.
+    binomial interval; `binomial_interval` and the setting "binomial" are the same function. Raises
+    the errors of `wilson_interval`.
 
     Parameters
     ----------
@@ -136,7 +136,7 @@ def clopper_pearson_interval(
 ) -> Bounds:
     """Compute the Clopper-Pearson interval, which never covers with less than 1 - alpha.
 
-    Errors as of `wilson_interval`.
+    Raises the errors of `wilson_interval`.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def clopper_pearson_interval(
 def jeffreys_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0.05) -> Bounds:
     """Compute the Jeffreys interval: equal-tailed credible interval under a Beta(1/2, 1/2) prior.
 
-    The lower end is 0 without a success, the upper end 1 without a failure. Errors as of
+    The lower end is 0 without a success, the upper end 1 without a failure. Raises the errors of
     `wilson_interval`.
 
     Parameters

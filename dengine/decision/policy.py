@@ -57,8 +57,8 @@ class Policy:
         The rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a
         subclass of `DecisionRule`. "local", the paper's rule, is about the neighbourhood of one
         trace. "pooled" is about all parts together. "cost" is about what all parts cost by
-        `prices`; `lower_bound` has no effect then, and `alpha` has one only on the safe mode. None:
-        "local", or "cost" if `prices` are given.
+        `prices`; then `lower_bound` does not influence decisions, and `alpha` influences only the
+        safe mode. None: "local", or "cost" if `prices` are given.
     stops : {"some", "all"}, default "some"
         "all": every bad accepted part stops the line and is reported before the next decision. If
         nothing is reported until then, the part is confirmed. "some": a missing report says
@@ -246,8 +246,8 @@ class Policy:
     def rule(self) -> DecisionRule:
         """Make a decision rule that has learned nothing yet.
 
-        It is the class that `RULES` names for `guarantee` and `stops`, or the user's
-        `module:Class`, which is imported, made with alpha, lower_bound and interval. `PooledRule`,
+        `RULES` names its class for `guarantee` and `stops`; or it is the user's `module:Class`,
+        which is imported. The class gets alpha, lower_bound and interval. `PooledRule`,
         `PricedRule` and their subclasses also get `inclusion_probability`, priced ones `tolerances`
         as well.
 
@@ -295,8 +295,8 @@ class Policy:
         Returns
         -------
         Certificate
-            For accepted and for rejected parts, as of `certify`; with the prices if the guarantee
-            is "cost".
+            For accepted and for rejected parts, as `certify` returns it; with the prices if the
+            guarantee is "cost".
         """
         if self.stops == "all":
             bad = outcomes.false_accepts + outcomes.forgotten_accepts

@@ -136,7 +136,7 @@ class DecisionRule(nn.Module):
         Parameters
         ----------
         n_unreported : int
-            Accepted parts since the last label whose outcome stays unknown.
+            Number of accepted parts since the last label; their outcomes stay unknown.
         novel : bool
             Whether the trace of the part at hand was novel.
         """

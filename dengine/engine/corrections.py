@@ -149,7 +149,7 @@ class Corrections:
         Parameters
         ----------
         *decision_ids : str
-            Labels among them that are forgotten already are left as they are.
+            Labels that are forgotten already stay as they are.
         author, reason : str
             For the record.
 
@@ -188,7 +188,7 @@ class Corrections:
         return self._change_labels(Change("forget", text, data, author, tuple(labels), None))
 
     def release(self, author: str = "") -> Changed:
-        """Let retrains replace a version again that `rollback` pinned.
+        """Let retrains replace again the version that `rollback` pinned.
 
         The same model goes on, stored as a new version. Labels that came meanwhile count for the
         next retrain. A training under way in the executor is discarded, and begins again, even if

@@ -336,7 +336,7 @@ def run_grid(
 ) -> "pd.DataFrame":
     """Replay a data set over recipes x intervals x alphas x lower bounds x seeds.
 
-    Of accepted parts only those that stop the line are known, as in the paper.
+    Of an accepted part the engine only learns whether it stopped the line, as in the paper.
 
     Parameters
     ----------

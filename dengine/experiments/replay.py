@@ -139,8 +139,8 @@ class Replay:
     ----------
     action, reason : array of str, shape (n,)
     truth : array, shape (n,)
-        Whether the part was good: bool in a replay; float in a live run, NaN where the cell does
-        not tell.
+        Whether the part was good: bool in a replay; float in a live run, NaN if the cell does not
+        tell.
     lower, upper : array of float, shape (n,)
         Interval of the success rate.
     n_success, n_failure : array of int, shape (n,)
@@ -162,10 +162,10 @@ class Replay:
     recipe : Recipe
         Of the engine.
     name : str
-        Of who played, for tables.
+        Name of the method that played, for tables.
     index : array of int, shape (n,)
-        Of a replay: position of each cycle's trace in the data set. Empty in a live run, as the
-        following have their defaults there.
+        Of a replay: position of each cycle's trace in the data set. In a live run it is empty, and
+        the fields below have their defaults.
     dataset : str
         Name of the data set.
     seed : int
@@ -333,9 +333,9 @@ class Replay:
         row : dict
             Among others certain, the number of parts that the model accepted or rejected;
             first_certain, the cycle of the first of them, counted from 1; dropped, the reason of
-            the last retrain that was dropped, or ""; saved_s, the seconds of the checks that these
-            parts did without, and net_s, less what the errors cost, in seconds by the defaults of
-            `Costs`.
+            the last retrain that was dropped, or ""; saved_s, the seconds of checks that these
+            parts saved; and net_s, which is saved_s minus the cost of errors, in seconds, by the
+            defaults of `Costs`.
         """
         nan = float("nan")
         policy = self.recipe.policy
@@ -479,8 +479,8 @@ def watch(
     Returns
     -------
     run : Replay
-        Of all `cycles`. An exception of the cell goes on to the caller, and then nothing is
-        returned: `on_cycle` was called with the cycles until there.
+        The run of all `cycles`. An exception of the cell goes on to the caller, and then nothing is
+        returned; only `on_cycle` has got the cycles before the exception.
     """
     observed = []
     for item in observe_cycles(engine, cell, cycles):
@@ -510,7 +510,8 @@ def replay(
         Anything `load_dataset` takes.
     recipe : object
         Anything `Recipe.load` takes, the name of a baseline (`experiments.baselines.BASELINES`), a
-        `Contender`, or a fresh engine, for a model of your own, which then holds what it learned.
+        `Contender`, or, for a model of your own, a fresh engine. Afterwards this engine holds what
+        it learned.
     seed : int, default 0
         Of the shuffle, and of the engine unless one is given; the same seed gives the same
         decisions.
@@ -534,7 +535,7 @@ def replay(
     ------
     SettingError
         A number of cycles that the data set does not have, alpha or lower_bound beside an engine,
-        or a policy with windows in seconds for a data set of an unknown rate.
+        or a policy with force limits in seconds for a data set of an unknown rate.
     DataError
         A data set that cannot be read.
     """

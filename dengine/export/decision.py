@@ -61,7 +61,7 @@ class DecisionModule(nn.Module):
         Its bound.
     pending_embedding : Tensor of float32, shape (K, d)
     n_unreported : int
-        Accepted parts since the last label whose outcome stays unknown.
+        Number of accepted parts since the last label; their outcomes stay unknown.
     """
 
     pending_embedding: Tensor

@@ -198,9 +198,10 @@ class ExportedModel:
     def decide(self, trace: ArrayLike, part: PartNumber = None) -> ExportedDecision:
         """Decide on one trace, which becomes the pending decision, whose outcome `learn` reports.
 
-        A part that was accepted before it, and of which nothing was reported, is settled first: if
-        the description says `stops` "all", it is learned as good and becomes a reference, if
-        "some", it is counted as unreported. After a faulty trace no decision is pending.
+        If the part before it was accepted and nothing was reported about it, that part is settled
+        first. If the description says `stops` "all", it is learned as good and becomes a reference.
+        If it says "some", the part is counted as unreported. After a faulty trace no decision is
+        pending.
 
         Parameters
         ----------
@@ -229,7 +230,7 @@ class ExportedModel:
     def decide_many(self, X: ArrayLike) -> list[ExportedDecision]:
         """Decide on each trace of (n, T) or (n, C, T), one after the other, as `decide` does.
 
-        Each becomes the pending decision in turn, so that accepted ones before the last are
+        Each becomes the pending decision in turn, so accepted parts before the last trace are
         settled.
         """
         return [self.decide(x) for x in as_traces(X, self.trace)]
@@ -238,8 +239,9 @@ class ExportedModel:
         """Learn the outcome of a part, after its `decide` and before the next.
 
         The trace becomes a reference, the rule is updated, and `metadata["references"]` follows.
-        The file is not written; see `save`. A faulty trace is ignored. A trace or part other than
-        the pending decision's is decided on first; that decision stays pending.
+        The file is not written; see `save`. A faulty trace is ignored. If trace or part are not
+        those of the pending decision, the file first decides on them; the earlier decision stays
+        pending.
 
         Parameters
         ----------
@@ -284,7 +286,7 @@ class ExportedModel:
         """Write the model with all that it learned, and the pending decision, to a file.
 
         Parameters, checksum and signature are as in `export_torchscript`; no store records it.
-        Returns the file, which `load_exported` reads; its description lacks the sum of the
+        Returns the file, which `load_exported` reads; its description lacks the checksum of the
         references. Raises OutputError if it cannot be written, ExportError if the key cannot be
         read.
         """

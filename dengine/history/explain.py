@@ -83,11 +83,12 @@ class Explanation:
     sentences : tuple of str
         Why the decision came out as it did.
     notes : tuple of str
-        Whose references the neighbours are, or why there are none.
+        A sentence on whose references the neighbours are, or why none are shown.
     bound : Bound or None
         The bounds and thresholds; None if no bound was computed.
     novelty : Novelty or None
-        How novel a novel trace is; None for any other, and if that is not kept.
+        How novel a novel trace is. None if the trace is not novel, or if the version that decided
+        is not kept.
     neighbours : tuple of Neighbour
         The nearest references of the version that decided, nearest first; empty if it is not kept.
     radius : float or None
@@ -95,7 +96,7 @@ class Explanation:
     envelope : Envelope or None
         The band of the known successes; None while there are too few.
     policy : Policy
-        That was in force when the decision was made.
+        The policy that was in force when the decision was made.
     """
 
     decision: StoredDecision

@@ -202,7 +202,7 @@ class Status:
     new_labels : int
         Labels since the newest retrain; `recipe.retrain_every` of them start the next.
     last : int
-        Number of decisions that `newest` counts at most.
+        Largest number of decisions that `newest` counts.
     newest, ever : Span
         The newest decisions, and all decisions.
     unreported : int
@@ -263,12 +263,12 @@ class Status:
 
     @property
     def alarm(self) -> str:
-        """What somebody should look at, in a sentence, of several the most urgent; "" if nothing.
+        """The most urgent thing that somebody should look at, in a sentence; "" if there is none.
 
         In this order: the store, lost data, safe mode, bad accepts, good rejects, dropped retrains,
         traces that nearly repeat another, shadow mode's errors, novel traces, parts outside limits,
-        errors of the model. Of the decisions only the newest count; novel traces, and parts outside
-        limits, if they are more than half of these.
+        errors of the model. Only the newest decisions count. Novel traces, and parts outside
+        limits, are named if they are more than half of the newest decisions.
         """
         newest = self.newest
         accepts = newest.bad_accepts

@@ -794,7 +794,7 @@ class ModelPrediction(EngineModel):
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """Return an array of `Action`, shape (n,): what the model would do with each trace.
 
-        Force limits, fault checks and audits have no part in it. Raises as `count`.
+        Force limits, fault checks and audits have no part in it. Raises what `count` raises.
         """
         return np.array([prediction.action for prediction in self.predict_many(X)], dtype=object)
 

@@ -177,7 +177,7 @@ class ConvReducer(TorchReducer):
 
     It is `TorchReducer` with `ConvNetwork`; the parameters are those of `TorchReducer`. The logit
     of success is the mean of two: that of the network, and that of a `RocketReducer`, which is
-    better with few labels. Nothing is fitted to mix them.
+    better with few labels. Both have the weight 1/2, which is not fitted.
 
     Attributes
     ----------

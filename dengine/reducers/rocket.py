@@ -257,8 +257,8 @@ def weigh_towers(
 class RocketReducer(Reducer):
     """Embed traces by random convolution kernels and cross-fitted classifier heads.
 
-    The first axis of the embedding is the predicted probability of success. The second is there
-    for pictures.
+    The first axis of the embedding is the predicted probability of success. The second spreads the
+    points in pictures; it is small against the radius.
 
     Parameters
     ----------
@@ -273,7 +273,7 @@ class RocketReducer(Reducer):
     width : int, default 128
         Largest number of principal components of each `Tower`.
     l2 : float, default 0.5
-        Ridge of the heads, in units of one label each.
+        Ridge penalty of each weight of the heads; the loss of each label counts 1.
     max_iter : int, default 20
         Largest number of Newton steps of the heads in one fit.
     random_state : int, RandomState or None, default 0

@@ -81,7 +81,7 @@ class RobotCalls:
     ----------
     service : CellService
     recorder : Recorder, optional
-        Of the traces for `decide_recorded`, which needs it.
+        Records the traces for `decide_recorded`, which needs it.
     """
 
     def __init__(self, service: CellService, recorder: Recorder | None = None) -> None:
@@ -118,7 +118,7 @@ class RobotCalls:
         Raises
         ------
         ReportError
-            For an id that is no id.
+            For an invalid id.
         """
         id_ = uuid.uuid4().hex if request == "" else as_id(request)
         self._pieces.pop(id_, None)
@@ -154,10 +154,10 @@ class RobotCalls:
         Raises
         ------
         TraceError
-            For a part that was not begun, or not lately; a piece that is no samples, or of several
-            channels; more than `MAX_SAMPLES` samples.
+            For a part that was not begun, or not lately; for a piece that has no samples or several
+            channels; and for more than `MAX_SAMPLES` samples.
         ReportError
-            For an id that is no id.
+            For an invalid id.
         """
         pieces = self._pieces.get(as_id(request))
         if pieces is None:
@@ -184,7 +184,8 @@ class RobotCalls:
         Parameters
         ----------
         trace : list of float, list of list of float, or bytes
-            Of one channel, of several, or of one as float32.
+            A list for one channel, a list of lists for several channels, or bytes (float32) for one
+            channel.
         request : str
             The caller's id; "": a new one.
         part : str or int
@@ -209,8 +210,8 @@ class RobotCalls:
 
         A part that has a decision gets it again. A new decision with an id drops the pieces; after
         a VERIFY with an empty id, for instance if the queue is full, they stay, so that the call
-        can be repeated. Raises TraceError without pieces or for a trace, and ReportError for an id,
-        that the engine does not take.
+        can be repeated. Raises TraceError if there are no pieces or the engine does not take the
+        trace, and ReportError if it does not take the id.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -228,9 +229,9 @@ class RobotCalls:
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
         """Decide on the insertion since `begin`, as recorded.
 
-        It waits up to `RECORD_SECONDS` for the recording, which one call uses up, unless its result
-        is "busy", so that the call can be repeated. A part that has a decision gets it again.
-        Without a recording, as for any part but that of the newest `begin`, the result is verify,
+        It waits up to `RECORD_SECONDS` for the recording. One call uses the recording up; but after
+        the result "busy" the call can be repeated. A part that has a decision gets it again. Only
+        the part of the newest `begin` has a recording. Without a recording the result is verify,
         with an id "" and the reason "not_recorded"; nothing is stored then.
 
         Parameters

@@ -218,7 +218,7 @@ class CellService:
             For a wrong shape, a first trace of less than 10 samples, a part's number that is none,
             or an id that belongs to another trace.
         ReportError
-            For an id that is no id.
+            For an invalid id.
         StoreError
             For an engine that is closed or in use by another thread.
         BusyError

@@ -48,9 +48,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     clock : callable
         Returns the time, in seconds since 1970, with which rows are stamped.
     product : str or None
-        What the cell makes. None: as the store says of a known cell; a new one shares nothing.
+        What the cell makes. None: for a known cell, as the store says; a new cell shares nothing.
         Cells of one product share labelled traces for training, versions and corrections, and
-        their numbers. Decisions and their outcomes stay the cell's own.
+        number them together. Decisions and their outcomes stay the cell's own.
     wait : float or None
         Seconds that an engine waits for the disk and the database at most. None: the environment's
         DENGINE_STORE_WAIT, or 0.4.
@@ -71,8 +71,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     Raises
     ------
     StoreError
-        For a setting that is not valid, and as of `Database`. Every method raises it if the
-        database fails.
+        For a setting that is not valid, and for what `Database` refuses. Every method raises it if
+        the database fails.
 
     Notes
     -----
@@ -129,7 +129,7 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         self._journal: Journal | None = None
 
     def flush(self) -> None:
-        """Wait until the outbox's records are in the database, at most its time limit.
+        """Wait until the outbox's records are in the database, but not beyond its time limit.
 
         Nothing is raised if the database does not answer; StoreError only if the store is closed.
         """

@@ -208,8 +208,8 @@ class SimulatedCell:
     seed : int, default 0
         The same seed gives the same insertions, whatever is decided about them.
     cycles : int, default 600
-        Length of the scenario; a change "half way" comes after half of it. The cell can go on after
-        it.
+        Length of the scenario; a change "half way" comes after half of these cycles. The cell can
+        go on after the scenario.
 
     Attributes
     ----------

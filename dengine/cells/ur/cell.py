@@ -152,9 +152,10 @@ class UrCell(AbstractContextManager["UrCell"]):
     def insert(self) -> TraceArray:
         """Have a part inserted, wait for it, and return its trace, (T,) or (C, T).
 
-        Lost samples are NaN; all are if no insertion was seen, as when its start was lost or the
-        trigger is wrong. Set `last`, and count a trace with missing samples in `incomplete`. Raise
-        CellError if the robot does not answer in time, fails, or its program stops.
+        Lost samples are NaN. All samples are NaN if no insertion was seen, for example because its
+        start was lost or the trigger is wrong. Set `last`, and count a trace with missing samples
+        in `incomplete`. Raise CellError if the robot does not answer in time, fails, or its program
+        stops.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong
@@ -165,14 +166,14 @@ class UrCell(AbstractContextManager["UrCell"]):
     def verify(self) -> bool:
         """Have the part measured; return whether it is good. A bad part goes back to the bin.
 
-        Raise CellError as `insert`.
+        Raise CellError like `insert`.
         """
         return self._execute_order(Verb.VERIFY) is ResultCode.GOOD
 
     def proceed(self) -> Outcome:
         """Have the line go on without measuring; return what became known of the part.
 
-        Raise CellError as `insert`.
+        Raise CellError like `insert`.
         """
         return OUTCOMES[self._execute_order(Verb.PROCEED)]
 

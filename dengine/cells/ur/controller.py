@@ -97,7 +97,7 @@ class RobotProgram:
     def restart(self) -> None:
         """Start the program anew at the next control cycle; a waiting order gets the result VOID.
 
-        Parts that were inserted stay so.
+        Parts that were inserted stay inserted.
         """
         self._run = self._run_program()
 
@@ -327,10 +327,10 @@ class FakeController(AbstractContextManager["FakeController"]):
     def respond(self, client: Client, type_: PackageType, payload: bytes) -> None:
         """Carry out one request of a client, and send the response if the protocol has one.
 
-        The caller holds the lock. Text is ignored, and data sets `inputs`; neither has a response.
-        The others are: declare outputs or inputs, start (packages are sent until the next of these
-        requests), pause, and ask for versions. An input of another client is refused. A malformed
-        request raises one of `FOREIGN`.
+        The caller holds the lock. A request with text is ignored, and a request with data writes
+        `inputs`; both have no response. The other requests are: declare outputs or inputs, start
+        (packages are sent until the next of these requests), pause, and ask for versions. An input
+        of another client is refused. A malformed request raises one of `FOREIGN`.
         """
         match type_:
             case PackageType.TEXT:

@@ -88,8 +88,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     CellError
         If the controller cannot be reached.
     SettingError
-        For a trigger that is none, a channel that the controller does not have, and `before` or
-        `samples` out of range.
+        For a text that is no trigger, for a channel that the controller does not have, and if
+        `before` or `samples` is out of range.
     """
 
     def __init__(
@@ -216,7 +216,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def cut(self) -> InsertionRecord:
         """Return the insertion as far as it was received, and forget it.
 
-        Samples that did not come are NaN; all are if its start was lost, or none has begun.
+        Samples that did not come are NaN. All samples are NaN if its start was lost, or if no
+        insertion has begun.
         """
         start = self._start
         first = self._first_time()
