@@ -180,17 +180,15 @@ class Feedback:
         """Learn a label that is no repetition, and hand it to the outbox.
 
         If the next decision had confirmed the part as good, a line stop is recorded but not learned
-        yet, and `remedy` is set to CORRECT; a report that it is good does nothing. `remedy` is set
-        to REBUILD_RULE if the rule had counted the part's check as overdue. Raises ReportError if
-        the outbox has any other label of the decision.
+        yet, and `remedy` is set to CORRECT. It is set to REBUILD_RULE if the rule had counted the
+        part's check as overdue. Raises ReportError if the outbox has any other label of the
+        decision.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
         if stored.source is not None:
             earlier = (bool(stored.success), stored.source)
             reported = (success, source)
-            if self._stops_all and reported == earlier == LATE_STOP[0]:
-                return  # the next decision has confirmed the part before its report
             if (earlier, reported) != LATE_STOP:
                 raise already_reported(decision.id, earlier, reported)
             self.remedy = Remedy.CORRECT

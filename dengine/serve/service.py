@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from numpy.typing import ArrayLike
 
 from ..engine.engine import DataEngine
-from ..errors import BusyError, NotTakenError, log
+from ..errors import BusyError, NotTakenError, ReportConflictError, log
 from ..files import FilePath
 from ..history.status import NEWEST, Status, status
 from ..records import Decision, PartNumber, Reason, RetrainReport, as_id, as_success
@@ -283,7 +283,14 @@ class CellService:
             stored = engine.find(decision_id)
             if stored is not None and stored.success is label:
                 return True, None
-            retrain = engine.report(decision_id, label)
+            try:
+                retrain = engine.report(decision_id, label)
+            except ReportConflictError:
+                engine.flush()  # a confirmation by the next decision may not have been on disk yet
+                stored = engine.find(decision_id)
+                if stored is None or stored.success is not label:
+                    raise
+                return True, None
             if author:
                 engine.store.events.put(
                     "report",

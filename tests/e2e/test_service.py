@@ -56,6 +56,23 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
         assert (service.read_store.decisions.counts()["decisions"], service.late) == (3, 2)
 
 
+def test_a_part_that_the_next_decision_confirms_may_be_reported_as_good(stream: Dataset) -> None:
+    async def cell(service: CellService) -> None:
+        ids = []
+        for i in range(120):
+            decision = (await service.decide(stream.X[i])).decision
+            if decision.action is Action.ACCEPT:
+                ids.append(decision.id)
+            else:
+                await service.report(decision.id, bool(stream.y[i]))
+        await service.decide(stream.X[0])
+        assert ids
+        assert all([(await service.report(id_, True)).repeated for id_ in ids])
+
+    with a_service(recipe=RECIPE.with_policy(stops="all")) as service:
+        asyncio.run(cell(service))
+
+
 def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> None:
     async def cell(service: CellService) -> None:
         for i in range(40):

@@ -91,7 +91,6 @@ def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_pa
     assert source(silent) is None  # nothing is known of it yet
     stopped = accepted(engine, stream)
     assert source(silent) is Source.CONFIRMED
-    engine.report(silent.id, True)  # nothing new
     engine.report(stopped.id, False)
     engine.decide(stream.X[0])
     assert source(stopped) is Source.STOP
