@@ -43,17 +43,9 @@ def without_password(text: str) -> str:
 def shortened(value: Any) -> str:
     """Return the `repr` of a value for a message, its middle cut out beyond some 60 characters.
 
-    A container shows only its first items. Where `repr` raises ValueError, an integer, which then
-    has more digits than Python prints, is described by its number of bits, another value by its
-    type.
+    A container shows only its first items.
     """
-    try:
-        return _REPR.repr(value)
-    except ValueError:  # an integer of more digits than Python prints
-        is_integer = isinstance(value, int)
-        return (
-            f"a number of {value.bit_length()} bits" if is_integer else f"a {type(value).__name__}"
-        )
+    return _REPR.repr(value)
 
 
 def listed(names: Iterable[Any]) -> str:

@@ -187,14 +187,6 @@ class TraceSpec:
         """The name of each channel: the name of its column if known, else "channel 0" and so on."""
         return self.columns or tuple(f"channel {i}" for i in range(self.channels))
 
-    def time_text(self, sample: int) -> str:
-        """Return the time from the first sample to another, "0.060 s" or "30 samples"."""
-        return f"{sample} samples" if self.rate_hz is None else f"{sample / self.rate_hz:.3f} s"
-
-    def value_text(self, value: float, channel: int) -> str:
-        """Return a value of a channel with its unit, if that is known, "200 N" or "200"."""
-        return f"{value:g} {self.units[channel]}".rstrip()
-
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
         """Return a copy that takes the rate, units and columns that it lacks from another contract.
 
@@ -229,7 +221,7 @@ def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
         return TraceSpec(**json.loads(settings["trace"]))
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Decision:
     """What the engine decided on one trace, and on what evidence.
 
@@ -276,13 +268,6 @@ class Decision:
     audit: bool
     propensity: float
     part: str | None = None
-
-    def __repr__(self) -> str:
-        labels = f"{self.n_success} good, {self.n_failure} bad labels around it"
-        bound = f"bound {self.lower:.3f} to {self.upper:.3f}, {labels}"
-        alone = f", alone the model would {self.predicted.value}" if self.audit else ""
-        summary = f"{self.action.value}, {self.reason.value}: {bound}{alone}"
-        return f"<Decision {summary}, version {self.model_version}, id {self.id}>"
 
     @property
     def inclusion_probability(self) -> float:

@@ -33,9 +33,8 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
 
     Parameters
     ----------
-    trace : array, shape (samples,) or (channels, samples), or DataFrame
-        Of any real dtype. A DataFrame has a row for each sample; its channels are the columns that
-        the `TraceSpec` names.
+    trace : array, shape (samples,) or (channels, samples)
+        Of any real dtype.
     trace_spec : TraceSpec or None
         What the trace must look like. Another length is fitted as `trace_spec.fit` says. None: any
         shape with no more channels than samples.
@@ -48,11 +47,10 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
     Raises
     ------
     TraceError
-        For a trace of another shape, for values that are no real numbers, and for a DataFrame
-        without the named columns, or if none are named. NaN and infinities pass; `TraceGate` finds
-        them.
+        For a trace of another shape, and for values that are no real numbers. NaN and infinities
+        pass; `TraceGate` finds them.
     """
-    x = _as_real(_channels_of(trace, trace_spec) if hasattr(trace, "columns") else trace)
+    x = _as_real(trace)
     x = x[None, :] if x.ndim == 1 else x
     if x.ndim != 2 or x.size == 0:
         raise TraceError(
@@ -158,22 +156,6 @@ def can_fit_length(length: int, samples: int, fit: int) -> bool:
     return 2 * length >= samples and length <= 2 * samples
 
 
-def _channels_of(table: Any, trace_spec: TraceSpec | None) -> Any:
-    """Return the columns of a DataFrame that the `TraceSpec` names, as an array (C, T).
-
-    Raises TraceError if it names none, or one is missing.
-    """
-    names = [] if trace_spec is None else list(trace_spec.columns)
-    if not names:
-        raise TraceError(
-            "Expected an array (channels, samples), got a table; name its channels, "
-            "TraceSpec(columns=...), or pass table[CHANNELS].to_numpy().T."
-        )
-    if not set(names) <= set(table.columns):
-        raise TraceError(f"Expected the columns {', '.join(names)}, got {listed(table.columns)}.")
-    return table[names].to_numpy().T
-
-
 def _as_real(values: ArrayLike) -> TraceArray:
     """Convert numbers or booleans to a float32 array; one that is float32 already is not copied.
 
@@ -204,24 +186,18 @@ def _match_spec(x: TraceArray, trace_spec: TraceSpec) -> TraceArray:
     """
     channels, samples = x.shape[-2:]
     if channels != trace_spec.channels:
-        is_transposed = (samples, channels) == (trace_spec.channels, trace_spec.samples)
-        turn = "; it looks transposed: turn it, trace.T" if is_transposed else ""
-        do = f"pass (channels, samples){turn}"
-        raise TraceError(f"Expected {trace_spec.channels} channel(s), got {channels}; {do}.")
+        raise TraceError(
+            f"Expected {trace_spec.channels} channel(s), got {channels}; pass (channels, samples)."
+        )
     n = trace_spec.samples
     if samples == n:
         return x
     fit = FITS.index(trace_spec.fit)
     if not can_fit_length(samples, n, fit):
-        rate = trace_spec.rate_hz
-        form = f"{n} samples" if rate is None else f"{rate:g} Hz x {n / rate:g} s"
-        new = f"TraceSpec(samples={n}, fit='pad')"
-        to_half = f"{-(-n // 2)} to {2 * n}"
-        wanted = (f"{n}", f"at least {n}", to_half, to_half)[fit]
-        do = f"{trace_spec.fit} fits no other length: record a whole insertion, and nothing else"
-        if trace_spec.fit == "strict":
-            do = f"resample the trace to {form}, or start a new store with {new}"
-        raise TraceError(f"Expected {wanted} samples, got {samples}; {do}.")
+        raise TraceError(
+            f"Expected {n} samples, got {samples}, which fit={trace_spec.fit!r} does not allow; "
+            f"resample the trace to {n} samples, or choose another fit for a new store."
+        )
     return np.asarray(fit_length(torch.from_numpy(np.array(x, order="C")), n, fit))
 
 
@@ -426,42 +402,7 @@ class ForceLimitsGate(nn.Module):
         return int(torch.where(kept, self.within, self.action).max().item())
 
 
-def convert_trace(trace: Any, trace_spec: TraceSpec | None, may_start_over: bool) -> TraceArray:
-    """Convert a trace by `as_trace`; where it raises TraceError, explain how to start over.
-
-    Parameters
-    ----------
-    trace, trace_spec
-        As in `as_trace`.
-    may_start_over : bool
-        Whether the `TraceSpec` was inferred from the first trace and no label was reported yet: the
-        error then says that the first trace may have been the wrong one. False: the error of
-        `as_trace` passes unchanged.
-
-    Returns
-    -------
-    array of float32, shape (C, T)
-    """
-    try:
-        return as_trace(trace, trace_spec)
-    except TraceError as error:
-        if not may_start_over or trace_spec is None:
-            raise
-        raise TraceError(
-            f"{error} The contract, {trace_spec.channels} x {trace_spec.samples}, was set by the "
-            "first trace, and nothing was learned by it yet: if that trace was the wrong one, "
-            f"start over with a new store and {_spec_advice(trace)}."
-        ) from error
-
-
-def _spec_advice(trace: Any) -> str:
-    """Return the Python code, for a message, that makes an engine for traces of this shape."""
-    *channels, samples = np.shape(trace)
-    channel_count = channels[0] if channels else 1
-    return f"DataEngine(trace=TraceSpec(samples={samples}, channels={channel_count}))"
-
-
-def infer_trace_spec(x: TraceArray, trace: object) -> tuple[TraceSpec, bool]:
+def infer_trace_spec(x: TraceArray) -> tuple[TraceSpec, bool]:
     """Infer the `TraceSpec` of all traces from the shape of the first one.
 
     All else has the defaults of `TraceSpec`; rate and unit are unknown.
@@ -470,8 +411,6 @@ def infer_trace_spec(x: TraceArray, trace: object) -> tuple[TraceSpec, bool]:
     ----------
     x : array of float32, shape (C, T)
         The trace after `as_trace`.
-    trace : object
-        The trace before it, which is not read.
 
     Returns
     -------
@@ -489,7 +428,8 @@ def infer_trace_spec(x: TraceArray, trace: object) -> tuple[TraceSpec, bool]:
         raise TraceError(
             f"Expected a first trace of {MIN_SAMPLES} samples or more, for it sets the contract of "
             f"all that follow, got {trace_spec.channels} x {trace_spec.samples}; record longer, or "
-            f"start with {_spec_advice(x)} if it is meant."
+            f"start with DataEngine(trace=TraceSpec(samples={trace_spec.samples}, "
+            f"channels={trace_spec.channels})) if it is meant."
         )
     reason, _ = TraceGate(trace_spec)(torch.from_numpy(x))
     return trace_spec, reason == 0

@@ -4,6 +4,7 @@ between them, and `dengine explain`, which says why one decision came out as it 
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -33,7 +34,6 @@ SECONDS_OF = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 TABLE_WIDTH = 120  # columns
 PART_LENGTH = 10  # characters of a part's number that are shown, its last
 SHORT_TIME = "%Y-%m-%d %H:%M:%S"
-MOST_EXCESSES = 5  # that are listed
 NEIGHBOUR_FIELDS = ("decision_id", "part", "success", "source", "distance", "space", "inside")
 
 
@@ -106,7 +106,6 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     explain` tells more about one decision.
     """
     from ..history.status import history as read_history
-    from ..history.status import read_retrains_and_events
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
@@ -115,7 +114,14 @@ def history(store: str, events: bool, **criteria: Any) -> None:
         since = criteria["since"]
         if since is None and decisions:
             since = decisions[0].time
-        others = read_retrains_and_events(opened, since, criteria["until"]) if events else {}
+        others: dict[str, list[Any]] = {}
+        if events:
+            others["retrains"] = opened.versions.all(cell_only=True)
+            others["events"] = opened.events.newest()
+    first = since or 0.0
+    end = math.inf if criteria["until"] is None else criteria["until"]
+    for name, items in others.items():
+        others[name] = [item for item in items if first <= item.time < end]
     rows = [to_jsonable(decision) | {"label": decision.label} for decision in decisions]
     record = {"store": store, "decisions": rows} | others
     in_order = merge(*others.values(), decisions, key=lambda item: item.time)
@@ -244,10 +250,6 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     explained = explanation.decision.decision
     title = f"{explained.id}: {explained.action.value}, {explained.reason.value}"
     tables = [table_of_rows(title, _explanation_rows(explanation))]
-    if explanation.envelope is not None and explanation.envelope.excesses:
-        title = "Where it leaves the band, the farthest first"
-        columns = ("", "from", "to", "in widths")
-        tables.append(table_of_rows(title, _excess_rows(explanation), columns))
     if explanation.neighbours:
         title = (
             f"Nearest references of version {explained.model_version}; the radius of the "
@@ -283,29 +285,5 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     if envelope is None:
         yield "envelope", "too few successes of this shape are known yet"
         return
-    yield (
-        "envelope",
-        f"{percent(envelope.outside, '.0f')} of its samples leave the band of {envelope.n:,} "
-        f"successes; of 95 % of them fewer than {percent(envelope.usual, '.0f')} do",
-    )
-    if envelope.not_finite:
-        yield "", f"{envelope.not_finite} samples are NaN or infinite"
-
-
-def _excess_rows(explanation: Explanation) -> Iterator[tuple[str, ...]]:
-    """Yield table rows of where the trace leaves the envelope, at most 5, the farthest first.
-
-    Each has the channel's name, begin and end, and how far above or below, in widths of the band.
-    There are none without an envelope.
-    """
-    spec = explanation.spec
-    if explanation.envelope is None:
-        return
-    for excess in explanation.envelope.excesses[:MOST_EXCESSES]:
-        side = "above" if excess.above else "below"
-        yield (
-            spec.names[excess.channel],
-            spec.time_text(excess.first),
-            spec.time_text(excess.last),
-            f"{excess.widths:.1f} {side}",
-        )
+    outside = percent(envelope.outside, ".0f")
+    yield "envelope", f"{outside} of its samples leave the band of {envelope.n:,} successes"

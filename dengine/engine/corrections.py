@@ -22,7 +22,6 @@ from ..records import as_success
 from ..store.outbox import Outbox
 from ..store.records import (
     POLICY_CHANGED,
-    SHADOW_CHANGED,
     Change,
     StoredDecision,
     nothing_to_correct,
@@ -36,10 +35,6 @@ from .settings import BASELINE_SETTINGS, EvidenceWindow, Settings, SettingsInFor
 
 # Settings of a policy that make its rule, or that its evidence is measured by.
 SCORING = ("alpha", "lower_bound", "interval", "guarantee", "stops", "prices")
-SHADOW_TEXTS = {
-    True: "shadow mode: every part is verified from now on",
-    False: "the shadow mode ended: the model decides again",
-}
 LABEL_TEXTS = {True: "success", False: "failure"}
 
 
@@ -50,7 +45,7 @@ class Changed:
     Attributes
     ----------
     kind : str
-        "correct", "forget", "rollback", "release", "policy" or "shadow".
+        "correct", "forget", "rollback", "release" or "policy".
     text : str
         A sentence for people.
     event : int or None
@@ -349,15 +344,10 @@ class Corrections:
             evidence = EvidenceWindow(since, SAFE_MODES.index(live.newest.safe_mode))
         recipe = replace(present.recipe, policy=policy)
         settings = replace(present, recipe=recipe, policy_since=since, evidence=evidence)
-        if list(changes) == ["shadow"]:
-            kind = SHADOW_CHANGED
-            text = SHADOW_TEXTS[policy.shadow]
-        else:
-            kind = POLICY_CHANGED
-            steps = [f"{name} {old_values[name]} -> {value}" for name, value in changes.items()]
-            text = f"the policy's {', '.join(steps)}"
+        steps = [f"{name} {old_values[name]} -> {value}" for name, value in changes.items()]
+        text = f"the policy's {', '.join(steps)}"
         data = {"old": old_values, "new": new_values}
-        event = Change(kind, text, data, author, settings=settings.to_store())
+        event = Change(POLICY_CHANGED, text, data, author, settings=settings.to_store())
         self._learner.set_policy(policy if starts_anew else None, evidence, event)
         self._settings.change(settings)
         self._feedback.begin_policy()

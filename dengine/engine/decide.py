@@ -34,9 +34,8 @@ from ..records import (
 )
 from ..store.outbox import Outbox
 from ..store.records import StoredDecision
-from ..traces import convert_trace, infer_trace_spec
+from ..traces import as_trace, infer_trace_spec
 from .guard import NOT_PRECOMPUTED, guarded
-from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce, read_peers_trace_spec
 
@@ -50,34 +49,20 @@ class DecisionMaker:
         Read at each decision; the first trace without a fault sets the `TraceSpec` in them.
     live : LiveModel
         Holds the model that decides.
-    labels : CellLabels or ProductLabels
-        Says whether anything was learned yet.
     outbox : Outbox
         Takes the decisions.
 
-    Attributes
-    ----------
-    has_seen_trace : bool
-        Whether a finite trace came since the engine was made or opened.
     """
 
-    def __init__(
-        self,
-        settings: SettingsInForce,
-        live: LiveModel,
-        labels: CellLabels | ProductLabels,
-        outbox: Outbox,
-    ) -> None:
-        self.has_seen_trace = False
+    def __init__(self, settings: SettingsInForce, live: LiveModel, outbox: Outbox) -> None:
         self._settings = settings
         self._live = live
-        self._labels = labels
         self._outbox = outbox
-        self._first_conditions: DecisionConditions | None = None
+        self._has_seen_trace = False  # a finite one, since the engine was made or opened
         self._run = uuid.uuid4().hex[:12]
         self._count = count(1)
 
-    def set_trace_spec(self, spec: TraceSpec, inferred: bool = False) -> TraceSpec:
+    def set_trace_spec(self, spec: TraceSpec) -> TraceSpec:
         """Set the `TraceSpec` (shape, rate and unit of all traces); return the one in force.
 
         If a `TraceSpec` is in force already, it stays. It only gets from `spec` a rate, units and
@@ -85,9 +70,8 @@ class DecisionMaker:
         another cell of the product has set one, that one is taken in the same way; if it cannot be
         read, that is logged and `spec` is set.
 
-        `inferred` says that `spec` comes from a first trace. The settings are saved in the store;
-        if that fails, they are saved with a later trace. Raises SettingError if the force limits do
-        not fit the `TraceSpec`.
+        The settings are saved in the store; if that fails, they are saved with a later trace.
+        Raises SettingError if the force limits do not fit the `TraceSpec`.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -99,8 +83,7 @@ class DecisionMaker:
             log.exception("the product's contract of traces cannot be had")
         spec = spec if agreed is None else agreed.completed(spec)
         if spec != present.trace:
-            inferred = inferred or present.inferred
-            self._settings.change(replace(present, trace=spec, inferred=inferred))
+            self._settings.change(replace(present, trace=spec))
             self._settings.save()
         return spec
 
@@ -117,32 +100,19 @@ class DecisionMaker:
         not fit the `TraceSpec` that the trace sets.
         """
         settings = self._settings.now
-        has_learned = self._live.version + self._labels.new_labels > 0
-        x = convert_trace(trace, settings.trace, settings.inferred and not has_learned)
-        spec = self._infer_trace_spec(x, trace) if settings.trace is None else None
-        if spec is not None:
-            if self.set_trace_spec(spec, inferred=True) != spec:  # a peer's trace came first
-                return convert_trace(trace, self._settings.now.trace, False)
+        x = as_trace(trace, settings.trace)
+        if settings.trace is None:
+            spec, is_sound = infer_trace_spec(x)
+            if is_sound and self.set_trace_spec(spec) != spec:  # a peer's trace came first
+                return as_trace(trace, self._settings.now.trace)
         elif self._settings.is_unsaved:
             self._settings.save()
         has_contract = self._settings.now.trace is not None
-        if not self.has_seen_trace and has_contract and np.isfinite(x).all():
-            self.has_seen_trace = True
+        if not self._has_seen_trace and has_contract and np.isfinite(x).all():
+            self._has_seen_trace = True
             if not self._live.version:  # what will answer is compiled before there is much to do
                 guarded(NOT_PRECOMPUTED, self._live.template.precompute, x[None])
         return x
-
-    def _infer_trace_spec(self, x: TraceArray, trace: Any) -> TraceSpec | None:
-        """Infer the `TraceSpec` from a first trace; return None if the trace has a fault.
-
-        It is also kept for the conditions of the decision, so that a trace with a fault can be
-        decided, too, although a later trace must set the `TraceSpec`. `trace` is `x` as the caller
-        passed it; a DataFrame names the channels. Raises TraceError for a trace of fewer samples
-        than a first trace must have.
-        """
-        spec, is_sound = infer_trace_spec(x, trace)
-        self._first_conditions = DecisionConditions(spec)
-        return spec if is_sound else None
 
     def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
         """Return the decision that the store already has for an id, or None for a new id.
@@ -181,8 +151,7 @@ class DecisionMaker:
     ) -> StoredDecision:
         """Decide on one trace and hand the decision to the outbox, without waiting for the disk.
 
-        Any thread may call it. A `TraceSpec` must be in force, or `convert` must have been called
-        before.
+        Any thread may call it.
 
         Parameters
         ----------
@@ -236,10 +205,8 @@ class DecisionMaker:
         the thread that uses the engine may do that.
 
         Raises TraceError for an invalid part number, an id that belongs to another trace, and a
-        trace that does not fit the `TraceSpec` in force, ReportError for an invalid id, and
-        StoreError for an engine that is closed or only reads.
+        trace that does not fit the `TraceSpec` in force, and ReportError for an invalid id.
         """
-        self._outbox.check_usable()
         id_ = as_id(decision_id)
         number = as_part(part)
         earlier = self.find_earlier(id_, number, trace)
@@ -248,7 +215,7 @@ class DecisionMaker:
         spec = self._settings.now.trace
         if spec is None or not self._outbox.is_thread_safe:
             return verify_decision(id_, number, self._live.version, Reason.LATE)
-        stored = self.record(convert_trace(trace, spec, False), number, id_, Reason.LATE)
+        stored = self.record(as_trace(trace, spec), number, id_, Reason.LATE)
         with suppress(NotTakenError):
             self._outbox.sync()
         return check_same_trace(stored, trace, spec)
@@ -270,8 +237,10 @@ class DecisionMaker:
         `Reason.MODEL_ERROR`, unless the trace has a fault or is outside a force limit.
         """
         part_hash_ = 0 if part is None else part_hash(part)
-        conditions = self._settings.conditions or self._first_conditions
-        assert conditions is not None  # a trace has come
+        # Without a contract the trace has a fault, and is decided all the same.
+        conditions = self._settings.conditions or DecisionConditions(
+            TraceSpec(samples=x.shape[1], channels=x.shape[0])
+        )
         if verify_reason is not None:
             unlimited = replace(conditions, force_limits=())
             verdict = _verify(x, unlimited, verify_reason)
@@ -311,25 +280,6 @@ class DecisionMaker:
         hash_ = part_hash_ or content
         return StoredDecision(decision, x.copy(), hash_, fault != 0, self._outbox.store.clock())
 
-    def record_lost_accept(
-        self, x: TraceArray, part: str | None, decision_id: str
-    ) -> StoredDecision:
-        """Record an ACCEPT for a line stop whose decision was lost, and return the record.
-
-        The model is not asked: the decision has this id, `Reason.CERTAIN`, no labels and the bound
-        (0, 1). Its `propensity`, the probability of a check, is the present audit rate, or 1 in
-        shadow mode. The call does not wait for the disk.
-        """
-        stored = self._decide(x, part, None, decision_id=decision_id)
-        decision = replace(
-            stored.decision,
-            action=Action.ACCEPT,
-            predicted=Action.ACCEPT,
-            reason=Reason.CERTAIN,
-            propensity=self._settings.audited_share,
-        )
-        return self._outbox.record_decision(replace(stored, decision=decision))
-
 
 def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Verdict:
     """Decide without a model: VERIFY for `reason`, unless a fault or a force limit decides."""
@@ -347,7 +297,7 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
     TraceError
         For a trace that does not fit `spec`.
     """
-    x = convert_trace(trace, spec, False)
+    x = as_trace(trace, spec)
     if not np.array_equal(x, stored.trace, equal_nan=True):
         raise TraceConflictError(
             f"Expected the trace that decision {stored.decision.id!r} was made on, got another; "

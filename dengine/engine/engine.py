@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 from ..cells.base import Cell, check_cell
 from ..decision.certificate import Certificate
 from ..decision.policy import Policy
-from ..errors import NotTakenError, StoreError, UnknownDecisionError, expect, listed, log
+from ..errors import NotTakenError, StoreError, expect, listed, log
 from ..files import FilePath
 from ..history.explain import Explanation, explain
 from ..history.status import NEWEST, Status, as_frame, history, status
@@ -41,7 +41,6 @@ from ..records import (
     Decision,
     Outcome,
     PartNumber,
-    Reason,
     RetrainReport,
     TraceSpec,
     as_id,
@@ -53,12 +52,12 @@ from ..reducers.base import Reducer
 from ..store.journalled import CLOSE_SECONDS
 from ..store.opening import LONG_WAIT, open_outbox, opening
 from ..store.outbox import Outbox
-from ..store.records import StoredDecision
+from ..store.records import StoredDecision, unknown_decision
 from ..traces import check_rate
 from .corrections import Changed, Corrections
 from .decide import DecisionMaker, as_part
 from .exclusive import ExclusiveUse
-from .feedback import Feedback
+from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
 from .labels import CellLabels, ProductLabels
@@ -250,7 +249,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._learner = Learner(
             self._outbox, self._live, window, labels, self._feedback, peers, retrainer, clock
         )
-        self._maker = DecisionMaker(self._settings, self._live, labels, self._outbox)
+        self._maker = DecisionMaker(self._settings, self._live, self._outbox)
         self._corrections = Corrections(
             self._outbox, self._settings, self._live, self._learner, self._feedback
         )
@@ -437,32 +436,26 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. Labels of parts that the next decision confirmed
-        are stored, too. A second call does nothing. Records that the disk does not take are given
-        up, and an error is logged; none of them was acknowledged. Raises StoreError while another
-        thread uses the engine.
+        A retrain that takes longer is dropped. A second call does nothing. Records that the disk
+        does not take are given up, and an error is logged; none of them was acknowledged. Raises
+        StoreError while another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
-                self._feedback.store_confirmations()
                 self._learner.advance(to_the_end=True, wait=CLOSE_SECONDS)
             self._outbox.close()
 
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        Labels of parts that the next decision confirmed, which wait in memory, are recorded first,
-        so that they are among the traces of the next training. If a wrong confirmation has updated
-        the rule, the rule is put right, too, if the store has answered. Raises NotTakenError after
-        `wait` seconds; None: the store's own limit.
+        If a wrong confirmation has updated the rule, the rule is put right, too, if the store has
+        answered. Raises NotTakenError after `wait` seconds; None: the store's own limit.
         """
-        self._feedback.store_confirmations()
         self._outbox.flush(wait)
         self._learner.catch_up()
 
     # Decisions
 
-    @overload
     def decide(
         self,
         trace: ArrayLike,
@@ -470,34 +463,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         *,
         decision_id: str | None = None,
         timed_out: bool = False,
-    ) -> Decision: ...
-
-    @overload
-    def decide(
-        self,
-        trace: ArrayLike,
-        part: PartNumber = None,
-        *,
-        decision_id: str | None = None,
-        timed_out: bool = False,
-        wait: bool,
-    ) -> Decision | None: ...
-
-    def decide(
-        self,
-        trace: ArrayLike,
-        part: PartNumber = None,
-        *,
-        decision_id: str | None = None,
-        timed_out: bool = False,
-        wait: bool = True,
-    ) -> Decision | None:
+    ) -> Decision:
         """Decide on one trace, and record the decision.
 
         Parameters
         ----------
-        trace : array or DataFrame, shape (samples,) or (channels, samples)
-            The rows of a DataFrame are samples.
+        trace : array, shape (samples,) or (channels, samples)
         part : str or int, optional
             The part's number. The labels of a part that comes again count less than those of
             different parts, and not at all for this part itself.
@@ -505,26 +476,17 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             An id that the caller chooses. The same id and trace always have the same decision, and
             an ACCEPT or REJECT is on disk when this returns.
         timed_out : bool, default False
-            The caller, who gave an id, does not wait any more and verifies the part. Record this as
-            VERIFY with `Reason.LATE`, without asking the model. If the trace or the store has a
-            fault, this fault is the reason instead.
-        wait : bool, default True
-            False is for a server that answers by a deadline: the call waits neither for another
-            call of the engine nor for the disk. Any thread may make this call while no other thread
-            uses the engine; torch then uses one thread in it from then on. The call returns None,
-            and changes nothing, if it cannot decide at once. It cannot with an id, before the first
-            trace, and while something must be stored or rebuilt first. Nor can it if the model is a
-            baseline (handed in as `model`), uses classes of the user's or is not compiled. Only a
-            later `poll` puts a trained version in force, and calls `on_safe_mode`. With `timed_out`
-            another thread may use the engine meanwhile. The VERIFY is recorded beside that thread's
-            call, and this call waits for the disk. With a store in memory, and before the first
-            trace, it is not recorded: call again with `wait`, in the engine's thread.
+            The caller, who gave an id, does not wait any more and verifies the part. Record this
+            as VERIFY with `Reason.LATE`, without asking the model. If the trace or the store has a
+            fault, this fault is the reason instead. Any thread may make this call, also while
+            another thread uses the engine; it waits for the disk, but not for that thread. With a
+            store in memory, and before the first trace, the VERIFY is not recorded.
 
         Returns
         -------
-        Decision or None
-            None only with wait=False. If anything fails that is not an error below, the decision is
-            VERIFY. If an id cannot be looked up, this VERIFY is not recorded.
+        Decision
+            If anything fails that is not an error below, the decision is VERIFY. If an id cannot be
+            looked up, this VERIFY is not recorded.
 
         Raises
         ------
@@ -536,13 +498,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ReportError
             For an invalid id.
         StoreError
-            For an engine that is closed, was opened for reading, or is in use by another thread.
+            For an engine that is closed or was opened for reading, and, unless `timed_out`, for one
+            that is in use by another thread.
         """
-        if not wait and timed_out:
-            return self._maker.record_timeout(trace, part, decision_id)
-        if not wait:
-            return self._decide_at_once(trace, part, decision_id)
         self._outbox.check_usable()
+        if timed_out:
+            return self._maker.record_timeout(trace, part, decision_id)
         with self._exclusive:
             id_ = None if decision_id is None else as_id(decision_id)
             number = as_part(part)
@@ -551,14 +512,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 if earlier is not None:
                     return earlier
             self._learner.advance()  # the newest version is to answer
-            decision = self._decide(trace, number, id_, Reason.LATE if timed_out else None)
+            decision = self._decide(trace, number, id_)
             self._feedback.announce_safe_mode()  # last: a user's function may fail
         return decision
 
-    def _decide(
-        self, trace: ArrayLike, part: str | None, decision_id: str | None, reason: Reason | None
-    ) -> Decision:
-        """Decide on one trace by the model, or verify for a reason; record and return the decision.
+    def _decide(self, trace: ArrayLike, part: str | None, decision_id: str | None) -> Decision:
+        """Decide on one trace by the model, record the decision and return it.
 
         The order of the steps has reasons. A wrong trace raises before it could confirm an earlier
         part. A rule that lacks a correction is put right before it decides. This trace may confirm
@@ -570,43 +529,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         x = self._maker.convert(trace)
         self._learner.catch_up()
         self._feedback.confirm_unreported()
-        stored = self._maker.record(x, part, decision_id, reason)
+        stored = self._maker.record(x, part, decision_id)
         if decision_id is not None:
             stored = self._maker.sync(stored)
         self._feedback.record_decision(stored)
         return stored.decision
 
-    def _decide_at_once(
-        self, trace: ArrayLike, part: PartNumber, decision_id: str | None
-    ) -> Decision | None:
-        """Decide if nothing has to be waited for, in any thread; else return None.
-
-        It returns None, and changes nothing, with an id, before the first trace since the engine
-        was opened, while settings or a correction wait for the store, or while another call holds
-        the outbox's lock. It does so as well if the model is a baseline, uses classes of the user's
-        or is not compiled. While it decides it holds the lock, so that nothing that it records has
-        to wait. It sets the present thread to one torch thread. Raises StoreError if another thread
-        uses the engine or it is closed, and TraceError for a wrong trace or part number.
-        """
-        self._outbox.check_usable()
-        with self._outbox.try_lock() as is_free, self._exclusive:
-            newest = self._live.newest
-            is_own_code = newest.keeps_references and not self.recipe.user_classes
-            is_quick = newest.is_compiled or not self.version
-            has_work = self._settings.is_unsaved or self._feedback.remedy is not None
-            has_work = has_work or not self._maker.has_seen_trace
-            if has_work or decision_id is not None or not (is_free and is_own_code and is_quick):
-                return None
-            torch.set_num_threads(1)  # it holds for the present thread only
-            return self._decide(trace, as_part(part), None, None)
-
-    def report(
-        self,
-        decision_id: str,
-        success: bool,
-        trace: ArrayLike | None = None,
-        part: PartNumber = None,
-    ) -> RetrainReport | None:
+    def report(self, decision_id: str, success: bool) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
 
         After the label, safe mode may begin or end, and a retrain that is due runs in this thread
@@ -623,8 +552,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             known to be good. A line stop that comes after the part was confirmed, however late,
             takes the confirmation back and counts as a correction. If somebody inspected a rejected
             part, its label is used for training, but does not update the rule.
-        trace, part : optional
-            Only for a line stop whose decision was lost: it is then stored with this trace.
 
         Returns
         -------
@@ -635,8 +562,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ------
         ReportError
             For an unknown id, a second report on the decision, or an invalid label.
-        TraceError
-            For an invalid trace or part number of a lost decision.
         StoreError
             If it is not certain that the label is on disk: it is learned all the same, and the same
             report may come again. Also for an engine that is closed, was opened for reading, or is
@@ -649,11 +574,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             self._learner.advance()  # so that a version that is ready learns the label as well
             stored = self._outbox.find_decision(id_, unsynced=True)
             if stored is None:
-                stored = self._record_lost_accept(id_, label, trace, part)
-            confirmed_wrongly = self._feedback.take_in(stored, label)
+                raise unknown_decision(id_)
+            self._feedback.take_in(stored, label)
             self._outbox.sync()  # before anything else: nobody may hear of a label that can be lost
             self._feedback.note_synced(id_)
-            if confirmed_wrongly:
+            if self._feedback.remedy is Remedy.CORRECT:
                 with suppress(StoreError):  # then the rule is put right when the store is back
                     self._outbox.drain()
             self._learner.catch_up()  # the rule is put right, the label enters the window
@@ -662,24 +587,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
                 return None
             # Last, since it may take its budget.
             return self._learner.retrain_if_due(self._settings.now.recipe.retrain_every)
-
-    def _record_lost_accept(
-        self, decision_id: str, success: bool, trace: ArrayLike | None, part: Any
-    ) -> StoredDecision:
-        """Record an ACCEPT under this id for a line stop whose decision was lost; return it.
-
-        Raises UnknownDecisionError if `trace` is None or `success` is True, and TraceError for a
-        wrong trace or part number; then nothing is recorded.
-        """
-        if trace is None or success:
-            raise UnknownDecisionError(
-                f"Expected the id of a decision of this cell, got {decision_id!r}, which is "
-                "unknown; a system stop whose decision was lost can be reported with its trace."
-            )
-        x = self._maker.convert(trace)
-        stored = self._maker.record_lost_accept(x, as_part(part), decision_id)
-        self._feedback.record_decision(stored)
-        return stored
 
     def run(self, cell: Cell, cycles: int) -> Iterator[Cycle]:
         """Drive a cell, and yield a record of each cycle as it happens.
@@ -955,19 +862,6 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises ReportError for an unknown id.
         """
         return explain(self.store, decision_id, neighbours)
-
-    def __repr__(self) -> str:
-        parts = [f"version {self.version}", self.policy.summary]
-        if self.trace is None:
-            parts.append("no trace yet")
-        else:
-            parts.append(f"traces {self.trace.channels} x {self.trace.samples}")
-        parts.append(f"{self.state.new_labels} new labels")
-        if self.safe_mode:
-            parts.append("safe mode")
-        elif self.policy.shadow:
-            parts.append("shadow mode")
-        return f"<DataEngine {self.recipe.name}: {', '.join(parts)}>"
 
     def __exit__(self, *exception: object) -> None:
         self.close()

@@ -4,13 +4,12 @@ decision, `learner.Learner` for each report.
 
 With `Policy(stops="all")` a bad part stops the system before the next decision, so the next
 decision confirms an accepted part: the rule is updated, the trace becomes a reference, and its
-label, CONFIRMED, is stored with the next report, before the next retrain, or when 100 of them wait.
-A line stop that comes later takes the confirmation back, in the store as a correction. With "some"
-the part counts as unreported, which is no success.
+label, CONFIRMED, is recorded. A line stop that comes later takes the confirmation back as a
+correction. With "some" the part counts as unreported, which is no success.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from enum import Enum
 
 from ..errors import log
@@ -28,7 +27,6 @@ from .labels import CellLabels, ProductLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
 
-MOST_CONFIRMED = 100  # labels of confirmed parts that wait for a report
 RECENT = 50  # decisions that the share of novel ones fades over
 NEARLY_ALL = 0.8  # of them, and somebody should look
 ALL_NOVEL = (
@@ -85,8 +83,6 @@ class Feedback:
         self.remedy: Remedy | None = None
         # Accepted parts without an outcome yet.
         self._unreported: OrderedDict[str, StoredDecision] = OrderedDict()
-        # Labels of confirmed parts that were not handed to the outbox.
-        self._confirmations: dict[str, tuple[StoredDecision, NewLabel]] = {}
         # Reports that were learned and are not known to be on disk.
         self._unsynced: dict[str, bool] = {}
         # Decisions whose check was asked for, not reported and not overdue, oldest first.
@@ -152,59 +148,41 @@ class Feedback:
         """Settle accepted parts without an outcome, because the next trace has come.
 
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each part
-        counts as good: rule and references learn it at once, and its label, CONFIRMED, waits in
-        memory. When `MOST_CONFIRMED` labels wait, all are handed to the outbox, the queue of
-        records for the store. With "some" the parts are only counted, and nothing is learned.
+        counts as good: rule and references learn it at once, and its label, CONFIRMED, is recorded.
+        With "some" the parts are only counted, and nothing is learned.
         """
-        if not self._unreported:
-            return
         while self._unreported:
-            id_, stored = self._unreported.popitem(last=False)
+            _, stored = self._unreported.popitem(last=False)
             if self._stops_all:
-                self._confirmations[id_] = stored, self._learn(stored, True, Source.CONFIRMED)
+                self._learn_and_record(stored, True, Source.CONFIRMED)
             else:
                 self._n_unreported += 1
-        if len(self._confirmations) >= MOST_CONFIRMED:
-            self.store_confirmations()
 
-    def take_in(self, stored: StoredDecision, success: bool) -> bool:
+    def take_in(self, stored: StoredDecision, success: bool) -> None:
         """Learn a reported label and hand it to the outbox, without waiting for the disk.
 
-        If the same report comes again before `note_synced`, nothing is done and False is returned.
-        If the outbox has a label of the decision already, ReportError is raised, with one
-        exception: a line stop may follow the confirmation of a part by the next decision
-        (`Policy(stops="all")`). Such a line stop is learned later, as a correction. `remedy` is set
-        if the rule must be rebuilt, which is not done here.
-
-        Returns
-        -------
-        bool
-            True if the next decision had confirmed the part before this report, whatever the new
-            label is.
+        If the same report comes again before `note_synced`, nothing is done. If the outbox has a
+        label of the decision already, ReportError is raised, with one exception: a line stop may
+        follow the confirmation of a part by the next decision (`Policy(stops="all")`). Such a line
+        stop is learned later, as a correction. `remedy` is set if the rule must be rebuilt, which
+        is not done here.
         """
         id_ = stored.decision.id
-        was_confirmed = False
         if self._unsynced.get(id_) is not success:
-            was_confirmed = self._take_in_new(stored, success)
+            self._take_in_new(stored, success)
         self._unsynced[id_] = success
-        return was_confirmed
 
     def note_synced(self, decision_id: str) -> None:
         """Note that the label of this decision is on disk: another report is now an error."""
         del self._unsynced[decision_id]
 
-    def _take_in_new(self, stored: StoredDecision, success: bool) -> bool:
+    def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
         """Learn a label that is no repetition, and hand it to the outbox.
 
-        Labels that wait in memory are handed over before it. If the next decision had confirmed the
-        part as good, this confirmation is taken back. If the outbox has its label already, the new
-        label is recorded but not learned yet, and `remedy` is set to CORRECT. If its label only
-        waits in memory, that label and its reference are removed, the new label is learned, and
-        `remedy` is set to REBUILD_RULE. REBUILD_RULE is also set if the rule had counted the part's
-        check as overdue.
-
-        Returns whether there was such a confirmation, whatever the new label is. Raises ReportError
-        if the outbox has any other label of the decision.
+        If the next decision had confirmed the part as good, a line stop is recorded but not learned
+        yet, and `remedy` is set to CORRECT. It is set to REBUILD_RULE if the rule had counted the
+        part's check as overdue. Raises ReportError if the outbox has any other label of the
+        decision.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -213,26 +191,18 @@ class Feedback:
             reported = (success, source)
             if (earlier, reported) != LATE_STOP:
                 raise already_reported(decision.id, earlier, reported)
-            self.store_confirmations()
             self.remedy = Remedy.CORRECT
             label = NewLabel(decision.id, False, source, self._live.version, None)
             self._outbox.record_labels([(stored, label)])
-            return True
-        confirmation = self._confirmations.pop(decision.id, None)
-        was_confirmed = confirmation is not None
-        self.store_confirmations()
-        if confirmation is not None:
-            self._live.unlearn(stored, confirmation[1].seq)
-            self._labels.count_learned(-1)
-        self._record([(stored, self._learn(stored, success, source))])
+            return
+        self._learn_and_record(stored, success, source)
         self._unreported.pop(decision.id, None)
         self._awaiting_check.pop(decision.id, None)
-        if self._live.clear_overdue(decision.id) or was_confirmed:
+        if self._live.clear_overdue(decision.id):
             self.remedy = self.remedy or Remedy.REBUILD_RULE
-        return was_confirmed
 
-    def _learn(self, stored: StoredDecision, success: bool, source: Source) -> NewLabel:
-        """Update rule and references with the outcome of a part; return its label for the store.
+    def _learn_and_record(self, stored: StoredDecision, success: bool, source: Source) -> None:
+        """Update rule and references with the outcome of a part, and have its label recorded.
 
         A trace with a fault updates neither. The label of a rejected part that was inspected
         becomes a reference and does not update the rule: which parts are inspected is somebody's
@@ -241,7 +211,8 @@ class Feedback:
         from before the present rule and so does not update it. A part that was counted among them
         is subtracted from the number that its own label tells, which may make it -1.
 
-        The label takes the next number of the outbox; nothing is recorded here.
+        The label takes the next number of the outbox. That of a usable trace enters the training
+        window, in a product once the store has given it a number.
         """
         decision = stored.decision
         version = self._live.version
@@ -253,9 +224,8 @@ class Feedback:
                 n_unreported = self._n_unreported - self._was_unreported(stored)
                 self._n_unreported = 0
             point = self._live.learn(stored, success, number, n_unreported)
-            self._labels.count_learned(1)
         overdue_to = self._live.overdue_to
-        return NewLabel(
+        label = NewLabel(
             decision.id,
             success,
             source,
@@ -265,17 +235,9 @@ class Feedback:
             overdue_to=overdue_to,
             seq=number,
         )
-
-    def _record(self, labels: Collection[tuple[StoredDecision, NewLabel]]) -> None:
-        """Hand learned labels to the outbox, those of usable traces also to the training window.
-
-        A trace with a fault is not usable. In a product labels enter the window once the store has
-        given them numbers.
-        """
-        self._outbox.record_labels(labels)
-        for stored, label in labels:
-            if not stored.quarantined:
-                self._labels.add(stored, label)
+        self._outbox.record_labels([(stored, label)])
+        if not stored.quarantined:
+            self._labels.add(stored, label)
 
     def _was_unreported(self, stored: StoredDecision) -> bool:
         """Return whether this part is one of those counted as unreported.
@@ -288,25 +250,6 @@ class Feedback:
             return False
         is_of_policy = decision.model_version >= self._settings.now.policy_since
         return decision.id not in self._unreported and is_of_policy
-
-    def store_confirmations(self) -> bool:
-        """Hand the labels of confirmed parts to the outbox; do not wait until they are stored.
-
-        These are accepted parts that are known to be good because the next decision came. Their
-        labels enter the training window: at once, or in a product as soon as the store has given
-        them numbers. The rule then also counts the checks that have become overdue.
-
-        Returns
-        -------
-        bool
-            False if there was no such label; then nothing is done.
-        """
-        if not self._confirmations:
-            return False
-        self._record(self._confirmations.values())
-        self._confirmations.clear()
-        self.number_labels()
-        return True
 
     def number_labels(self) -> None:
         """In a product, give this cell's labels the numbers that the store has newly assigned.

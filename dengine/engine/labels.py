@@ -44,12 +44,9 @@ class CellLabels:
         """Count again, after the training window was filled anew because labels were corrected."""
         self.resume(counts_from)
 
-    def count_learned(self, n: int) -> None:
-        """Change the count: by 1 for a label just learned, by -1 for one taken back unstored."""
-        self.new_labels += n
-
     def add(self, stored: StoredDecision, label: NewLabel) -> None:
-        """Add a learned label, which is recorded, to the window."""
+        """Add a learned label, which is recorded, to the window, and count it."""
+        self.new_labels += 1
         self._window.add(stored.trace, int(label.success), stored.content_hash, label.seq)
 
     def is_due(self, retrain_every: int) -> bool:
@@ -128,9 +125,6 @@ class ProductLabels:
         own_numbers = {number for number, is_own in self._since if is_own}
         newer = self._window.newer(self._trained_to)
         self._since = [(number, number in own_numbers) for number in newer]
-
-    def count_learned(self, n: int) -> None:
-        """Do nothing: a label counts when it enters the window."""
 
     @property
     def has_unnumbered(self) -> bool:

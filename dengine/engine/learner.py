@@ -150,9 +150,6 @@ class Learner:
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
             return
-        # A rule that is rebuilt from the store would forget labels that wait in memory.
-        if self._feedback.store_confirmations() and not self._outbox.is_drained:
-            return
         remedy = self._feedback.take_remedy()
         if remedy is None:
             return
@@ -167,16 +164,7 @@ class Learner:
             log.exception("the rule is rebuilt when the store is back")
 
     def store_labels(self) -> None:
-        """Wait until every label is in the store and has its number.
-
-        That includes labels of parts that the next decision confirmed. Then `catch_up` is called.
-        Raises StoreError if the store is unavailable or takes too long.
-        """
-        self._feedback.store_confirmations()
-        self._drain_labels()
-
-    def _drain_labels(self) -> None:
-        """Wait until the store has the labels that are in the journal, then catch up.
+        """Wait until every label is in the store and has its number, then catch up.
 
         Raises StoreError if the store is unavailable or takes too long.
         """
@@ -433,13 +421,12 @@ class Learner:
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
         """Make all labels that came references of the candidate, one a step, and have them stored.
 
-        Each round first records the labels of parts that the next decision confirmed, and counts
-        overdue checks. It yields like `_see_through`, and ends when no label is missing or waits to
-        be stored. In a cell that never pauses some label always waits, so in every `PATIENCE`-th
-        round this call waits for the store itself; a StoreError there is ignored.
+        Each round first counts overdue checks. It yields like `_see_through`, and ends when no
+        label is missing or waits to be stored. In a cell that never pauses some label always waits,
+        so in every `PATIENCE`-th round this call waits for the store itself; a StoreError there is
+        ignored.
         """
         for n_waits in count(1):
-            self._feedback.store_confirmations()
             self._feedback.number_labels()
             while candidate.learn_next(self._window):
                 yield None
@@ -558,10 +545,9 @@ class Learner:
         """
         version = None
         try:
-            self._drain_labels()  # one of the news may be a label of this cell
+            self.store_labels()  # one of the news may be a label of this cell
             news, has_newer_version = peers.fetch_news()
             if has_newer_version:
-                self.store_labels()  # the peers' version is to have them among its references
                 version = self._outbox.call_store(self._store.versions.newest)
         except StoreError as error:
             peers.note_loss(error)

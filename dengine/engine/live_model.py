@@ -210,16 +210,6 @@ class LiveModel:
         )
         return point if model.keeps_references else None
 
-    def unlearn(self, stored: StoredDecision, number: int) -> None:
-        """Remove the reference of a part that was confirmed wrongly, before the store has its
-        label, which has this number.
-
-        Nothing happens without a trained model. The rule keeps the outcome, so the caller must have
-        it rebuilt.
-        """
-        if self.answering is not None:
-            self.answering.change_reference(number, stored.content_hash, None)
-
     def count_overdue(self, decision: Decision) -> None:
         """Update the rule as if a decision was wrong, because its check is overdue.
 

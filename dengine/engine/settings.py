@@ -73,8 +73,6 @@ class EngineSettings:
         baseline or a reducer.
     trace : TraceSpec or None
         Shape, rate and unit of all traces; None until the first trace without a fault.
-    inferred : bool
-        Whether the first trace set `trace`.
     policy_since : int
         First model version under the policy in force; 0: every one.
     evidence : EvidenceWindow
@@ -90,7 +88,6 @@ class EngineSettings:
     model: str | None = None
     described: str | None = None
     trace: TraceSpec | None = None
-    inferred: bool = False
     policy_since: int = 0
     evidence: EvidenceWindow = EvidenceWindow()
 
@@ -119,8 +116,6 @@ class EngineSettings:
             texts["described"] = self.described
         if self.trace is not None:
             texts["trace"] = json.dumps(asdict(self.trace))
-        if self.inferred:
-            texts["inferred"] = "true"
         numbers = {
             "policy_since": self.policy_since,
             "evidence_since": self.evidence.since,
@@ -192,7 +187,6 @@ class EngineSettings:
             texts.get("model"),
             texts.get("described"),
             stored_trace_spec(texts),
-            "inferred" in texts,
             numbers[1],
             EvidenceWindow(*numbers[2:]),
         )
@@ -462,8 +456,6 @@ class SettingsInForce:
     Attributes
     ----------
     now : EngineSettings
-    audited_share : float
-        Share of the certain decisions that are verified as audits.
     conditions : DecisionConditions or None
         What a decision depends on beside the model; None before the first trace without a fault.
     is_unsaved : bool
@@ -476,13 +468,9 @@ class SettingsInForce:
         self._outbox = outbox
 
     def change(self, settings: EngineSettings) -> None:
-        """Use other settings from now on, without saving them.
-
-        `audited_share` and `conditions` are computed from them.
-        """
+        """Use other settings from now on, without saving them; they give new `conditions`."""
         policy = settings.recipe.policy
         self.now = settings
-        self.audited_share = policy.audited_share
         self.conditions: DecisionConditions | None = None
         if settings.trace is not None:
             self.conditions = DecisionConditions(

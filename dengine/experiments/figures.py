@@ -403,7 +403,7 @@ def _times(spec: TraceSpec, samples: int) -> tuple[Floats, str]:
 def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
-    It has a panel for each channel, of at most four, those that leave the envelope farthest. The
+    It has a panel for each channel, of at most four, those that leave the envelope most. The
     envelope is the band in which 95 % of the successes lie at each sample. Stretches in which the
     trace leaves it by more than a tenth of its width are shaded. Without an envelope only the
     traces are drawn.
@@ -411,11 +411,12 @@ def explained_picture(explanation: Explanation) -> Figure:
     stored = explanation.decision
     decision = stored.decision
     envelope = explanation.envelope
-    excesses = [] if envelope is None else envelope.excesses
-    widest = np.zeros(len(explanation.trace))
-    for excess in excesses:
-        widest[excess.channel] = max(widest[excess.channel], excess.widths)
-    channels = sorted(np.argsort(-widest, kind="stable")[:4].tolist())
+    trace = explanation.trace
+    is_outside = np.zeros(trace.shape, dtype=bool)
+    if envelope is not None:
+        margin = CLEAR * (envelope.high - envelope.low)
+        is_outside = (trace < envelope.low - margin) | (trace > envelope.high + margin)
+    channels = sorted(np.argsort(-is_outside.sum(axis=1), kind="stable")[:4].tolist())
     version = f"version {decision.model_version}" if decision.model_version else "no model yet"
     title = (
         f"{decision.id}: {decision.action.value}, {decision.reason.value} ({version}); label: "
@@ -424,18 +425,18 @@ def explained_picture(explanation: Explanation) -> Figure:
     figure = blank(10.0, 1.5 + 2.3 * len(channels), title)
     panels = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     labels = _axis_labels(explanation.spec)
-    x, x_label = _times(explanation.spec, explanation.trace.shape[1])
+    x, x_label = _times(explanation.spec, trace.shape[1])
     for i, (axes, channel) in enumerate(zip(panels, channels, strict=True)):
         if envelope is not None:
             band = (envelope.low[channel], envelope.median[channel], envelope.high[channel])
             _draw_band(axes, x, band, GREEN, "-", f"95 % of {envelope.n:,} successes, median")
         _draw_neighbours(axes, x, explanation, channel)
-        axes.plot(x, explanation.trace[channel], color=BLACK, linewidth=1.6, label="this trace")
-        clear = [e for e in excesses if e.channel == channel and e.widths >= CLEAR]
-        for j, excess in enumerate(clear):
-            label = "_" if j else "outside the band"
-            ends = (x[excess.first], x[excess.last])
-            axes.axvspan(*ends, color=ORANGE, alpha=0.3, zorder=0, label=label)
+        axes.plot(x, trace[channel], color=BLACK, linewidth=1.6, label="this trace")
+        if is_outside[channel].any():
+            height = axes.get_xaxis_transform()
+            where = is_outside[channel]
+            shade: Style = {"color": ORANGE, "alpha": 0.3, "label": "outside the band"}
+            axes.fill_between(x, 0.0, 1.0, where=where, transform=height, zorder=0, **shade)
         finish(axes, legend=0 if i else 3, ylabel=labels[channel])
     panels[-1].set(xlabel=x_label)
     return figure

@@ -26,35 +26,16 @@ from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
 from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
-from ..store.records import SAFE_MODE_BEGAN, StoredDecision, unknown_decision
+from ..store.records import POLICY_KINDS, SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from .envelope import Envelope, envelope_of
 from .past_versions import Novelty, PastVersion, load_past_version
-from .sentences import Bound, Circumstances, bound_of, explain_in_words, is_score
+from .sentences import Bound, Circumstances, bound_of, explain_in_words
 
 if TYPE_CHECKING:
     from ..store.sql import SqlStore
 
 MAX_ENVELOPE_LABELS = 1000  # newest labels, whose successes make the band
-
-
-@dataclass(frozen=True)
-class Neighbourhood:
-    """The references around a trace.
-
-    Attributes
-    ----------
-    distances : array of float64, shape (n,)
-        To every reference, in the order of the index; infinite to those of the trace's own part.
-    radius : float
-    n_success, n_failure : int
-        Labels within the radius, counted again.
-    """
-
-    distances: NDArray[np.float64]
-    radius: float
-    n_success: int
-    n_failure: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +70,7 @@ class Neighbour:
     trace: TraceArray | None = field(metadata={"apart": True})
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Explanation:
     """A decision and its evidence.
 
@@ -102,7 +83,7 @@ class Explanation:
     sentences : tuple of str
         Why the decision came out as it did.
     notes : tuple of str
-        Sentences about what was computed again.
+        A sentence on whose references the neighbours are, or why none are shown.
     bound : Bound or None
         The bounds and thresholds; None if no bound was computed.
     novelty : Novelty or None
@@ -129,11 +110,6 @@ class Explanation:
     radius: float | None
     envelope: Envelope | None
     policy: Policy
-
-    def __repr__(self) -> str:
-        decision = self.decision.decision
-        result = f"{decision.action.value}, {decision.reason.value}"
-        return f"<Explanation of {decision.id}: {result}, {len(self.neighbours)} neighbours>"
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:
@@ -216,9 +192,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         raise unknown_decision(decision_id)
     decision = item.decision
     recipe = Recipe.from_store(settings)
-    change = store.events.policy_change_after(decision.id)
-    if change is not None and change.data is not None:  # the policy that was in force then
-        recipe = replace(recipe, policy=Policy.from_values(change.data["old"]))
+    recipe = replace(recipe, policy=_find_policy(store, item.time, recipe.policy))
     channels, samples = item.trace.shape
     version = None
     if decision.model_version:
@@ -227,26 +201,36 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         recipe=recipe,
         spec=stored_trace_spec(settings) or TraceSpec(samples=samples, channels=channels),
         model=settings.get("model"),
-        seed=int(settings.get("seed", "0")),
         thresholds=None if version is None else version.thresholds,
         novelty=None if version is None else version.novelty,
         safe_mode=_find_safe_mode(store, item),
     )
-    neighbourhood = _find_neighbourhood(item, version, recipe)
+    distances = _measure_distances(item, version)
     bound = bound_of(decision, circumstances)
     return Explanation(
         decision=item,
         trace=item.trace,
         spec=circumstances.spec,
         sentences=tuple(explain_in_words(item, bound, circumstances)),
-        notes=tuple(_note_sentences(item, neighbourhood, bound, circumstances)),
+        notes=(_note_of(item, distances is not None),),
         bound=bound,
         novelty=circumstances.novelty,
-        neighbours=tuple(_find_neighbours(store, neighbourhood, version, neighbours)),
-        radius=None if neighbourhood is None else neighbourhood.radius,
+        neighbours=tuple(_find_neighbours(store, version, distances, recipe.radius, neighbours)),
+        radius=None if distances is None else recipe.radius,
         envelope=_find_envelope(store, item, version),
         policy=recipe.policy,
     )
+
+
+def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
+    """Return the policy that was in force at a time: the old one of the first change after it.
+
+    `present` is the policy in force now.
+    """
+    for event in store.events.newest():
+        if event.kind in POLICY_KINDS and event.time > time and event.data is not None:
+            return Policy.from_values(event.data["old"])
+    return present
 
 
 def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
@@ -265,36 +249,38 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     return next(began, "")
 
 
-def _find_neighbourhood(
-    item: StoredDecision, version: PastVersion | None, recipe: Recipe
-) -> Neighbourhood | None:
-    """Measure the distances from a decision's embedding to the references of a version.
+def _measure_distances(
+    item: StoredDecision, version: PastVersion | None
+) -> NDArray[np.float64] | None:
+    """Return the distances from a decision's embedding to the references of a version, shape (n,).
 
-    Return them with the successes and failures within the radius, counted again. References of the
-    decision's own part are infinitely far. None if the trace was not embedded, or the version is
-    not kept.
+    They are in the order of the index; infinite to references of the decision's own part. None if
+    the trace was not embedded, or the version is not kept.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:
         return None
     query = torch.tensor(embedding, dtype=torch.float32)
     squared = version.index.squared_distances(query, item.content_hash)
-    counts = version.index.count_near(squared, recipe.radius)
-    return Neighbourhood(np.sqrt(squared.double().numpy()), recipe.radius, *counts)
+    distances: NDArray[np.float64] = np.sqrt(squared.double().numpy())
+    return distances
 
 
 def _find_neighbours(
-    store: SqlStore, neighbourhood: Neighbourhood | None, version: PastVersion | None, n: int
+    store: SqlStore,
+    version: PastVersion | None,
+    distances: NDArray[np.float64] | None,
+    radius: float,
+    n: int,
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    Yields nothing without a neighbourhood or version. A neighbour may lie outside of the radius.
-    What is not known of a reference is None. Raise StoreError for a damaged trace.
+    Yields nothing without distances or version. A neighbour may lie outside of the radius. What is
+    not known of a reference is None. Raise StoreError for a damaged trace.
     """
-    if neighbourhood is None or version is None:
+    if distances is None or version is None:
         return
     index = version.index
-    distances = neighbourhood.distances
     for slot in np.argsort(distances, kind="stable")[:n]:
         if not np.isfinite(distances[slot]):
             return
@@ -308,7 +294,7 @@ def _find_neighbours(
             source=None if label is None else label.source,
             distance=float(distances[slot]),
             space=int(index.column("spaces")[slot]),
-            inside=bool(distances[slot] <= neighbourhood.radius),
+            inside=bool(distances[slot] <= radius),
             trace=None if stored is None else stored.trace,
         )
 
@@ -332,47 +318,17 @@ def _find_envelope(
     return None
 
 
-def _note_sentences(
-    item: StoredDecision,
-    neighbourhood: Neighbourhood | None,
-    bound: Bound | None,
-    circumstances: Circumstances,
-) -> Iterator[str]:
-    """Yield sentences on what was computed again, and where it differs from what was recorded.
-
-    If no neighbours are shown, a sentence says why. Counts are compared, and bounds by the present
-    policy if they follow from counts.
-    """
+def _note_of(item: StoredDecision, has_neighbours: bool) -> str:
+    """Return a sentence on whose references the neighbours are, or why none are shown."""
     decision = item.decision
-    policy = circumstances.recipe.policy
+    version = f"version {decision.model_version}, which answered,"
+    if has_neighbours:
+        return f"Neighbours: the references of {version} as they stood then."
     if item.quarantined:
-        yield (
+        return (
             "The trace is quarantined: it was not embedded, is never trained on, and has no "
             "neighbours."
         )
-    elif neighbourhood is None:
-        why = f"version {decision.model_version}, which answered, is not kept any more"
-        if decision.embedding is None:
-            why = "the trace was not embedded"
-        yield f"No neighbours are shown: {why}."
-    else:
-        recorded = (decision.n_success, decision.n_failure)
-        again = (neighbourhood.n_success, neighbourhood.n_failure)
-        yield (
-            f"Neighbours: the references of version {decision.model_version}, which "
-            "answered, as they stood then."
-        )
-        if decision.reason not in (Reason.NOVEL, Reason.OUTSIDE) and again != recorded:
-            counts = (
-                f"{again[0]} successes and {again[1]} failures; recorded were "
-                f"{recorded[0]} and {recorded[1]}"
-            )
-            why = "a label was corrected since, or came while this part was being decided on"
-            yield f"Counted again, the neighbourhood holds {counts}: {why}."
-    if bound is not None and circumstances.model is None and not is_score(policy, decision):
-        interval = policy.bound(decision.n_success, decision.n_failure)
-        if not np.allclose(interval, (decision.lower, decision.upper), atol=1e-6):
-            yield (
-                "By the store's present settings these counts give another bound; the "
-                "recorded one is shown."
-            )
+    if decision.embedding is None:
+        return "No neighbours are shown: the trace was not embedded."
+    return f"No neighbours are shown: {version} is not kept any more."

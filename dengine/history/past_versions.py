@@ -98,8 +98,7 @@ def load_past_version(
     last = min([*later_retrains[:1], stored.last_seq + MAX_LABELS])
     later = store.labels.past(stored.last_seq, last)
     if item is not None:
-        stops_all = recipe.policy.stops == "all"
-        later = [label for label in later if _was_known(label, item, stops_all)]
+        later = [label for label in later if _was_known(label, item)]
     before = store.labels.past(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
     by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
     added = [label for label in later if label.model_version == version]
@@ -113,14 +112,8 @@ def load_past_version(
     )
 
 
-def _was_known(label: PastLabel, item: StoredDecision, stops_all: bool) -> bool:
-    """Return whether the engine knew a label when it made the decision `item`; never its own label.
-
-    A label is known from its time on. Under `stops="all"` a label from silence is known from the
-    next decision on, before it is stored.
-    """
-    if stops_all and label.source is Source.CONFIRMED:
-        return label.decided < item.time
+def _was_known(label: PastLabel, item: StoredDecision) -> bool:
+    """Return whether the engine knew a label when it made the decision `item`; never its own."""
     return label.time <= item.time and label.decision_id != item.decision.id
 
 

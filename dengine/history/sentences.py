@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -15,14 +14,12 @@ import torch
 from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
 from ..decision.members import CLOSED
 from ..decision.policy import RULES, Policy
-from ..folds import COIN_BITS, audit_salt, content_hash, toss
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceArray, TraceSpec
 from ..store.records import StoredDecision
 from ..traces import LARGEST, WITHIN_LIMITS, ForceLimitsGate
 from .past_versions import Novelty, Thresholds
 
-MAX_NEEDED = 20_000  # more labels within the radius than that are not considered
 BOUNDED = (Reason.CERTAIN, Reason.UNCERTAIN, Reason.AUDIT, Reason.SAFE_MODE)
 DID = {Action.ACCEPT: "accepted", Action.REJECT: "rejected", Action.VERIFY: "verified"}
 
@@ -43,11 +40,6 @@ class Bound:
         Rejected where upper <= reject_threshold. None if nothing could be rejected, or unknown.
     origin : str
         Where the thresholds come from, in words.
-    successes_needed : int or None
-        So many more successes within the radius, and no failure, would have made it accepted; 0 if
-        it reached the threshold, None if no number would do.
-    failures_needed : int or None
-        The same of failures, for a reject.
     """
 
     n_success: int
@@ -57,8 +49,6 @@ class Bound:
     accept_threshold: float | None
     reject_threshold: float | None
     origin: str
-    successes_needed: int | None
-    failures_needed: int | None
 
 
 @dataclass(frozen=True)
@@ -72,8 +62,6 @@ class Circumstances:
     spec : TraceSpec
     model : str or None
         Name of a model that was handed in; None: the recipe describes the model.
-    seed : int
-        Of the engine.
     thresholds : (float, float) or None
         As in `PastVersion`; None if they are not kept.
     novelty : Novelty or None
@@ -85,7 +73,6 @@ class Circumstances:
     recipe: Recipe
     spec: TraceSpec
     model: str | None = None
-    seed: int = 0
     thresholds: Thresholds | None = None
     novelty: Novelty | None = None
     safe_mode: str = ""
@@ -97,14 +84,13 @@ class Circumstances:
 
 
 def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
-    """Return a decision's bounds with their thresholds and what more evidence it would have needed.
+    """Return a decision's bounds with the thresholds that they had to reach.
 
     Returns None if no bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and
-    SAFE_MODE, and for a decision that was lost, and recorded again from its line stop.
+    SAFE_MODE.
     """
-    if decision.reason not in BOUNDED or _was_lost(decision):
+    if decision.reason not in BOUNDED:
         return None
-    policy = circumstances.recipe.policy
     accept_threshold, reject_threshold, origin = _find_thresholds(circumstances)
     return Bound(
         n_success=decision.n_success,
@@ -114,18 +100,7 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
         accept_threshold=accept_threshold,
         reject_threshold=reject_threshold,
         origin=origin,
-        successes_needed=_count_needed(policy, decision, accept_threshold, 1),
-        failures_needed=_count_needed(policy, decision, reject_threshold, 0),
     )
-
-
-def _was_lost(decision: Decision) -> bool:
-    """Return whether a decision was lost, and recorded again when its part stopped the line.
-
-    Such a decision is an accept with the bounds 0 and 1.
-    """
-    fields = (decision.reason, decision.action, decision.lower, decision.upper)
-    return fields == (Reason.CERTAIN, Action.ACCEPT, 0.0, 1.0)
 
 
 def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
@@ -151,35 +126,13 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
     return accept_threshold, reject_threshold, origin
 
 
-def is_score(policy: Policy, decision: Decision) -> bool:
+def _is_score(policy: Policy, decision: Decision) -> bool:
     """Return whether a decision's `lower` and `upper` are one score, and no interval.
 
     The score is the probability of success that the reducer's classifiers (its heads) give. It is
     so under the guarantees "pooled" and "cost", where lower equals upper.
     """
     return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
-
-
-def _count_needed(
-    policy: Policy, decision: Decision, threshold: float | None, success: int
-) -> int | None:
-    """Return how many more labels of one kind within the radius would have reached a threshold.
-
-    `success` is 1 for successes and `lower`, 0 for failures and `upper`. 0 if the threshold was
-    reached; None if no number up to MAX_NEEDED would do, if there is no threshold, and if it was
-    missed by a score, which does not depend on counts.
-    """
-    if threshold is None:
-        return None
-    if is_score(policy, decision):  # it does not depend on counts
-        is_reached = decision.lower >= threshold if success else decision.upper <= threshold
-        return 0 if is_reached else None
-    more = np.arange(MAX_NEEDED + 1)
-    n_success = decision.n_success + success * more
-    n_failure = decision.n_failure + (1 - success) * more
-    lower, upper = policy.bound(n_success, n_failure)
-    enough = np.flatnonzero(lower >= threshold if success else upper <= threshold)
-    return int(enough[0]) if len(enough) else None
 
 
 def explain_in_words(
@@ -191,11 +144,7 @@ def explain_in_words(
     now.
     """
     decision = item.decision
-    reason = (
-        ": the decision was lost, and recorded again from its line stop; its evidence is unknown."
-    )
-    if not _was_lost(decision):
-        reason = WHY[decision.reason](decision, item.trace, circumstances)
+    reason = WHY[decision.reason](decision, item.trace, circumstances)
     yield DID[decision.action].capitalize() + reason
     if bound is not None:
         yield from _bound_sentences(decision, bound, circumstances)
@@ -204,38 +153,6 @@ def explain_in_words(
     else:
         source = "" if item.source is None else f" ({item.source.value})"
         yield f"The part turned out {item.label}{source}."
-
-
-def _explain_audit(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the rest of the sentence on an audit: what the model alone would have done, the coin.
-
-    The coin, a number that decides which certain parts are audited, is computed again from the
-    trace and the engine's seed.
-    """
-    (coin,) = toss(content_hash(trace[None]), audit_salt(circumstances.seed)).tolist()
-    alone = f" as an audit: the model alone would have {DID[decision.predicted]} it"
-    coin_fell = (
-        f"The audits' coin fell on {coin / 2**COIN_BITS:.4f}, below the audit rate "
-        f"{decision.propensity:g}"
-    )
-    return f"{alone}. {coin_fell}; it is a function of the trace and the seed."
-
-
-def _explain_saturated(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the rest of the sentence on a saturated trace.
-
-    It has the number of samples that touch the sensor's range, and the time and the channel of the
-    first.
-    """
-    spec = circumstances.spec
-    limit = math.inf if spec.limit is None else spec.limit
-    touching = np.argwhere(np.abs(trace) >= limit)
-    if not len(touching):
-        return ": the trace touched the sensor's range."
-    channel, sample = (int(i) for i in touching[np.argmin(touching[:, 1])])
-    first = f"first after {spec.time_text(sample)} ({spec.names[channel]})"
-    text = spec.value_text(limit, channel)
-    return f": {len(touching)} samples touch the sensor's range of {text}, {first}."
 
 
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
@@ -260,21 +177,16 @@ WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
     Reason.CERTAIN: lambda *_: ": the bound meets the policy.",
     Reason.UNCERTAIN: lambda *_: ": the bound does not meet the policy.",
     Reason.NO_MODEL: lambda *_: ": no model had been trained yet, so every part was verified.",
-    Reason.AUDIT: _explain_audit,
+    Reason.AUDIT: lambda decision, *_: (
+        f" as an audit: the model alone would have {DID[decision.predicted]} it."
+    ),
     Reason.NOT_FINITE: lambda decision, trace, circumstances: (
         f": {(~np.isfinite(trace)).sum()} of {trace.size} samples are NaN or infinite."
     ),
-    Reason.CONSTANT: lambda decision, trace, circumstances: (
-        f": every sample is {circumstances.spec.value_text(float(trace.flat[0]), 0)}: a dead "
-        "sensor."
-    ),
-    Reason.SATURATED: _explain_saturated,
-    Reason.TOO_LARGE: lambda decision, trace, circumstances: (
-        ": a sample of "
-        + circumstances.spec.value_text(
-            float(np.abs(trace).max()), int(np.abs(trace).max(axis=1).argmax())
-        )
-        + f"; beyond {LARGEST:g} nothing can be computed from it."
+    Reason.CONSTANT: lambda *_: ": every sample has the same value: a dead sensor.",
+    Reason.SATURATED: lambda *_: ": the trace touched the sensor's range.",
+    Reason.TOO_LARGE: lambda *_: (
+        f": a sample is beyond {LARGEST:g}, where nothing can be computed from it."
     ),
     Reason.MODEL_ERROR: lambda *_: ": the model raised an error; see the log of that time.",
     Reason.NOVEL: lambda decision, trace, circumstances: (
@@ -300,12 +212,10 @@ WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
 def _bound_sentences(
     decision: Decision, bound: Bound, circumstances: Circumstances
 ) -> Iterator[str]:
-    """Yield the sentences on a decision's evidence, its bounds, and what it would have needed.
+    """Yield the sentences on a decision's evidence, its bounds, and the thresholds for them.
 
-    The last is said of the action that the model alone would have done; if that is to verify, of
-    the action that needed fewer labels. If no bound was good enough to accept or reject, or the
-    thresholds are unknown, it says so instead. For a model that decides by its own method there is
-    one sentence, with its counts and bounds.
+    If no bound was good enough to accept or reject, or the thresholds are unknown, they say so. For
+    a model that decides by its own method there is one sentence, with its counts and bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
@@ -318,7 +228,7 @@ def _bound_sentences(
     counts = (
         f"{decision.n_success} of {n} labels {within} are successes" if n else f"No label {within}"
     )
-    if is_score(policy, decision):
+    if _is_score(policy, decision):
         yield (
             f"{counts}; the heads give it {decision.lower:.3f}, the mean of what each says "
             "of its success."
@@ -337,52 +247,11 @@ def _bound_sentences(
             else f"What it had to reach: {bound.origin}."
         )
         return
-    # An uncertain decision is explained by the action that it was nearer to.
-    successes = MAX_NEEDED + 1 if bound.successes_needed is None else bound.successes_needed
-    failures = MAX_NEEDED + 1 if bound.failures_needed is None else bound.failures_needed
-    is_uncertain = decision.predicted is Action.VERIFY
-    if decision.predicted is Action.ACCEPT or (is_uncertain and successes <= failures):
-        condition = f"lower must be at least {{:.4g}} ({bound.origin}); it is {decision.lower:.3f}"
-        kinds = ("success", "successes", "failure")
-        yield _needed_sentence(
-            "accept", condition, bound.accept_threshold, bound.successes_needed, kinds
-        )
-    else:
-        condition = f"upper must be at most {{:.4g}} ({bound.origin}); it is {decision.upper:.3f}"
-        kinds = ("failure", "failures", "success")
-        yield _needed_sentence(
-            "reject", condition, bound.reject_threshold, bound.failures_needed, kinds
-        )
-
-
-def _needed_sentence(
-    action: str,
-    condition: str,
-    threshold: float | None,
-    needed: int | None,
-    kinds: tuple[str, str, str],
-) -> str:
-    """Return the sentence on what an accept or a reject would have needed.
-
-    Parameters
-    ----------
-    action : {"accept", "reject"}
-    condition : str
-        What had to hold, with a field {} for the threshold.
-    threshold : float or None
-        None: nothing could pass.
-    needed : int or None
-        Number of labels that were missing; 0: it was enough, None: no number would do.
-    kinds : (str, str, str)
-        The word for one label of the kind that is needed, for several, and for one of the other
-        kind.
-    """
-    if threshold is None:
-        return f"To {action}: no level held, so nothing could be {action}ed."
-    if needed == 0:
-        return f"To {action}, {condition.format(threshold)}, enough."
-    single, several, other = kinds
-    more = "no number of labels"
-    if needed is not None:
-        more = f"{needed} more {single if needed == 1 else several} and no {other}"
-    return f"To {action}, {condition.format(threshold)}: {more} would do."
+    for action, condition, threshold in (
+        ("accept", "lower must be at least", bound.accept_threshold),
+        ("reject", "upper must be at most", bound.reject_threshold),
+    ):
+        if threshold is None:
+            yield f"To {action}: no level held, so nothing could be {action}ed."
+        else:
+            yield f"To {action}, {condition} {threshold:.4g} ({bound.origin})."

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from ..decision.certificate import Certificate
 from ..decision.intervals import wilson_interval
 from ..decision.policy import Policy
-from ..errors import StoreError, counted, expect
+from ..errors import StoreError, expect
 from ..recipe import Recipe
 from ..records import (
     REPEATS,
@@ -34,6 +34,7 @@ from ..records import (
     TraceSpec,
     stored_trace_spec,
 )
+from ..representation import to_jsonable
 from ..store.records import (
     LOSS_REMEDY,
     SAFE_MODE_BEGAN,
@@ -172,7 +173,7 @@ class Watch:
     novelty: float
 
 
-@dataclass(frozen=True, slots=True, repr=False)
+@dataclass(frozen=True, slots=True)
 class Status:
     """The status of an engine. Times are in seconds since 1970.
 
@@ -259,14 +260,6 @@ class Status:
     store_fault: str = ""
     retraining: bool = False
     store_lag: float = 0.0
-
-    def __repr__(self) -> str:
-        counts = self.ever
-        name = f"{self.cell}: version {self.version}, {counted(counts.decisions, 'decision')}"
-        return (
-            f"<Status of {name}, {counts.verified} verified, {counts.accepted} accepted, "
-            f"{counts.false_accepts} known bad, {counts.rejected} rejected>"
-        )
 
     @property
     def alarm(self) -> str:
@@ -637,8 +630,8 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     last : int
         Number of newest decisions that the picture marks; it is only passed on to `Course`.
     **by
-        `seconds` and `start` for periods of time, or `batch` for batches, as `SqlStore.stretches`
-        takes them. By default a stretch has at least 20 decisions, the newest perhaps fewer.
+        `seconds` and `start` for periods of time, as `SqlStore.stretches` takes them. By default a
+        stretch has at least 20 decisions, the newest perhaps fewer.
 
     Returns
     -------
@@ -732,40 +725,10 @@ def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
     """
     import pandas as pd
 
-    items = list(decisions)
+    rows = [
+        to_jsonable(item) | {"label": None if item.success is None else item.label}
+        for item in decisions
+    ]
     names = [field.name for field in fields(Decision) if field.name != "embedding"]
-    values = [[getattr(item.decision, name) for name in names] for item in items]
-    frame = pd.DataFrame(values, columns=names)
-    frame.insert(1, "time", pd.to_datetime([item.time for item in items], unit="s", utc=True))
-    labels = [item.label if item.success is not None else None for item in items]
-    return frame.assign(label=labels).set_index("id")
-
-
-def read_retrains_and_events(
-    store: SqlStore, since: float | None = None, until: float | None = None
-) -> dict[str, list[StoredVersion | Event]]:
-    """Return the retrains and the events of a cell between two times, each oldest first.
-
-    Dropped retrains are included, those of the product's other cells are not. Rollbacks and new
-    policies, which make versions, are among the retrains.
-
-    Parameters
-    ----------
-    store : SqlStore
-    since, until : float or None
-        Seconds since 1970; `since` is included, `until` is not. None: no limit.
-
-    Returns
-    -------
-    dict of str to list
-        "retrains": list of StoredVersion; "events": list of Event.
-    """
-    first = since or float("-inf")
-    end = float("inf") if until is None else until
-    past: dict[str, list[Any]] = {
-        "retrains": store.versions.all(cell_only=True),
-        "events": store.events.newest(),
-    }
-    return {
-        name: [item for item in items if first <= item.time < end] for name, items in past.items()
-    }
+    frame = pd.DataFrame(rows, columns=[*names, "time", "label"])
+    return frame.assign(time=pd.to_datetime(frame["time"], unit="s", utc=True)).set_index("id")

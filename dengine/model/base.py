@@ -96,12 +96,9 @@ class EngineModel(ABC):
         Otherwise the model is trained again on the traces of its version.
     min_traces : int
         Number of labelled traces that the first training waits for.
-    is_compiled : bool
-        Whether a trained model predicts without running Python.
     """
 
     keeps_references = True
-    is_compiled = False
     min_traces = 1
     rule_is_stale = False
     rule_learns = False

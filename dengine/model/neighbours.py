@@ -583,10 +583,6 @@ class ModelPrediction(EngineModel):
         return TraceSpec(samples, channels=channels)
 
     @property
-    def is_compiled(self) -> bool:  # type: ignore[override]  # asked when there is a predictor
-        return isinstance(self._decider, torch.jit.ScriptModule)
-
-    @property
     def predictor(self) -> Any:
         """The `Predictor` in the decider; ValueError if nothing was fitted."""
         return self.decider(self._conditions).predictor

@@ -81,14 +81,6 @@ ShiftHours = Annotated[
 ShiftStart = Annotated[
     float, Meta(ge=0.0, le=1e7, description="When a shift begins, in hours since 1970.")
 ]
-Batch = Annotated[
-    str,
-    Meta(
-        max_length=9,
-        description="Makes the decisions on one batch a stretch: the number of first characters of "
-        "a part's number that name its batch, or the characters that end the batch's name, as -/.",
-    ),
-]
 
 
 class HttpApi:
@@ -363,14 +355,12 @@ class HttpApi:
         """
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
-    async def course(
-        self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0, batch: Batch = ""
-    ) -> Json:
+    async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
         """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
-        A stretch is a shift, a batch (`batch` goes before `hours`), or without these a share of the
-        decisions, 20 or more, the newest perhaps fewer. The newest 120 stretches are returned; the
-        cell's retrains and safe modes may be older. 422: hours below one second, unless 0.
+        A stretch is a shift, or without `hours` a share of the decisions, 20 or more, the newest
+        perhaps fewer. The newest 120 stretches are returned; the cell's retrains and safe modes may
+        be older. 422: hours below one second, unless 0.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,
@@ -378,9 +368,7 @@ class HttpApi:
             hours,
         )
         recipe = self.service.engine.recipe
-        by: Json = {}
-        if hours or batch:
-            by = {"seconds": 3600.0 * hours, "start": 3600.0 * start, "batch": batch}
+        by = {"seconds": 3600.0 * hours, "start": 3600.0 * start}
         course = await self.service.read(lambda store: read_course(store, recipe, N_LABELS, **by))
         return response_fields("Course", course)
 

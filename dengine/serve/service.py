@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from numpy.typing import ArrayLike
 
 from ..engine.engine import DataEngine
-from ..errors import BusyError, NotTakenError, log
+from ..errors import BusyError, NotTakenError, ReportConflictError, log
 from ..files import FilePath
 from ..history.status import NEWEST, Status, status
 from ..records import Decision, PartNumber, Reason, RetrainReport, as_id, as_success
@@ -168,8 +168,6 @@ class CellService:
         self.observers: list[Callable[[ServiceResponse | ReportResponse | RetrainReport], object]]
         self.observers = []
         self._jobs: queue.Queue[Job | None] = queue.Queue(max_waiting)
-        # The engine is used by its thread, or by the event loop for a decision that need not wait.
-        self._in_use = threading.Lock()
         # The default executor may be full of readers of a store that is unavailable.
         self._timeout_threads = ThreadPoolExecutor(max_waiting, "dengine-late")
         self._listeners: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
@@ -193,8 +191,7 @@ class CellService:
     async def decide(
         self, trace: ArrayLike, request: str | None = None, part: PartNumber = None
     ) -> ServiceResponse:
-        """Decide on a trace, in the engine's thread or, if nothing has to wait, at once in this
-        one.
+        """Decide on a trace in the engine's thread, for which the request waits in the queue.
 
         Parameters
         ----------
@@ -228,16 +225,6 @@ class CellService:
             If the queue is full or the service is closing; nothing is recorded.
         """
         begin = time.monotonic()
-        is_idle = not (self.waiting or self._closing)
-        if request is None and is_idle and self._in_use.acquire(blocking=False):
-            try:
-                decision_now = self.engine.decide(trace, part, wait=False)
-            finally:
-                self._in_use.release()
-            if decision_now is not None:
-                self._notify_listeners()
-                response = ServiceResponse(decision_now, time.monotonic() - begin)
-                return self._notify_observers(response)
         id_ = uuid.uuid4().hex if request is None else as_id(request)
 
         # With the caller's id the decision must be on disk before the response: the caller may
@@ -253,13 +240,9 @@ class CellService:
         if pending.done() or not future.cancel():
             decision = await pending
         else:
-            record = partial(
-                self.engine.decide, trace, part, decision_id=id_, timed_out=True, wait=False
-            )
+            record = partial(self.engine.decide, trace, part, decision_id=id_, timed_out=True)
             loop = asyncio.get_running_loop()
-            recorded = await loop.run_in_executor(self._timeout_threads, record)
-            assert recorded is not None  # of a timeout there is always a decision
-            decision = recorded
+            decision = await loop.run_in_executor(self._timeout_threads, record)
             self.late += 1
         response = ServiceResponse(decision, time.monotonic() - begin)
         return self._notify_observers(response)
@@ -300,7 +283,14 @@ class CellService:
             stored = engine.find(decision_id)
             if stored is not None and stored.success is label:
                 return True, None
-            retrain = engine.report(decision_id, label)
+            try:
+                retrain = engine.report(decision_id, label)
+            except ReportConflictError:
+                engine.flush()  # a confirmation by the next decision may not have been on disk yet
+                stored = engine.find(decision_id)
+                if stored is None or stored.success is not label:
+                    raise
+                return True, None
             if author:
                 engine.store.events.put(
                     "report",
@@ -472,11 +462,9 @@ class CellService:
         opened.set_result(engine)
         with engine:
             while (job := self._next_job(engine)) is not None:
-                with self._in_use:
-                    job.run(engine)
+                job.run(engine)
                 if not job.read_only:
                     self._notify_listeners()
-            self._in_use.acquire()  # never released: the engine is closed from now on
 
     def _next_job(self, engine: DataEngine) -> Job | None:
         """Wait for the next job in the queue and return it; None means that the service ends.
@@ -492,8 +480,7 @@ class CellService:
             with suppress(queue.Empty):
                 return self._jobs.get(timeout=timeout)
             try:
-                with self._in_use:
-                    report = engine.poll(brief=True)
+                report = engine.poll(brief=True)
                 if report is not None:
                     self._notify_observers(report)
                     self._notify_listeners()

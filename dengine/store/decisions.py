@@ -279,10 +279,9 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         n : int
-            Without effect on stretches of time and on batches.
+            Without effect on stretches of time.
         **by
-            `seconds` and `start` for periods of time, or `batch` for batches of parts; the
-            arguments of `stretches_query`.
+            `seconds` and `start` for periods of time; the arguments of `stretches_query`.
 
         Returns
         -------

@@ -11,8 +11,6 @@ from ..errors import StoreError, log
 from .cell_table import CellTable
 from .records import (
     ACKNOWLEDGED,
-    POLICY_CHANGED,
-    SHADOW_CHANGED,
     Event,
     as_text,
     from_row,
@@ -20,7 +18,7 @@ from .records import (
     open_losses,
     to_row,
 )
-from .schema import DECISION, EVENT
+from .schema import EVENT
 
 
 class EventTable(CellTable):
@@ -98,28 +96,3 @@ class EventTable(CellTable):
         """
         if losses := open_losses(self.newest()):
             self.put(ACKNOWLEDGED, f"{len(losses)} losses of data", author=author)
-
-    def policy_change_after(self, decision_id: str) -> Event | None:
-        """Return the event of the first change of the policy or the shadow mode after a decision.
-
-        The order is that of the ledger's entries, whatever the clock said.
-
-        Parameters
-        ----------
-        decision_id : str
-
-        Returns
-        -------
-        Event or None
-            None if there was no such change, or there is no decision with this id.
-        """
-        is_decision = self._own(DECISION) & (DECISION.c.id == decision_id)
-        decided = sa.select(DECISION.c.entry).where(is_decision).scalar_subquery()
-        kinds = EVENT.c.kind.in_((POLICY_CHANGED, SHADOW_CHANGED)) & EVENT.c.data.is_not(None)
-        rows = self._read(
-            sa.select(EVENT)
-            .where(self._own(EVENT), kinds, EVENT.c.entry > decided)
-            .order_by(EVENT.c.number)
-            .limit(1)
-        )
-        return from_row(Event, rows[0]._mapping) if rows else None

@@ -10,9 +10,8 @@ disk or the database does not answer. `lag` is how far the database is behind.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 NO_LIMIT = 1e9  # seconds: never reached
-LOCK_SECONDS = 0.001  # a wait for the lock that counts as none
 # Opening waits so long for SQLite's check; that of a large store goes on beside.
 CHECK_SECONDS = 0.1
 CLOSE_SECONDS = 5.0  # the longest that closing waits
@@ -168,21 +166,6 @@ class JournalledStore(Outbox):
     @property
     def is_drained(self) -> bool:
         return self._drainer.is_drained
-
-    @contextmanager
-    def try_lock(self) -> Iterator[bool]:
-        """Context manager that tries to take the outbox's lock, and yields whether it has the lock.
-
-        It waits at most a millisecond, and the block runs in either case. While the block holds the
-        lock, all calls to this outbox from other threads wait, and so do its own threads.
-        """
-        # A thread that only looks has it for an instant.
-        locked = self._changed.acquire(timeout=LOCK_SECONDS)
-        try:
-            yield locked
-        finally:
-            if locked:
-                self._changed.release()
 
     # What the engine records
 

@@ -10,7 +10,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
@@ -132,10 +132,6 @@ class Outbox(ABC):
     def is_drained(self) -> bool:
         """Whether the database has taken every record."""
         return True
-
-    def try_lock(self) -> AbstractContextManager[bool]:
-        """Return a context manager that gives True if its block need not wait; here always."""
-        return nullcontext(True)
 
     # What the engine records
 

@@ -5,7 +5,7 @@ into a product. `SqlStore` and `Database` compose their statements from them.
 """
 
 from dataclasses import dataclass
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -276,12 +276,12 @@ def n_decisions(cell_id: str) -> sa.ScalarSelect[int]:
 
 
 def stretches_query(
-    cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0, batch: str = ""
+    cell_id: str, length: int, seconds: float = 0.0, start: float = 0.0
 ) -> sa.Select[Any]:
     """Return the query that counts a cell's decisions in stretches of equal length, oldest first.
 
-    A stretch is a run of consecutive decisions, a period of time, or a batch of parts. It has a row
-    only if it has decisions.
+    A stretch is a run of consecutive decisions, or a period of time. It has a row only if it has
+    decisions.
 
     Parameters
     ----------
@@ -292,11 +292,6 @@ def stretches_query(
         Length of a stretch in time instead; 0.0: by number.
     start : float, default 0.0
         A time, in seconds since 1970, at which a stretch of `seconds` begins.
-    batch : str, default ""
-        If not "", a stretch is a batch: the decisions whose parts' numbers begin alike. If `batch`
-        is a number n in digits, the first n characters are compared. Otherwise its characters are
-        separators, such as "-/", and everything up to the last separator is compared. Decisions
-        without a part's number are one group.
 
     Returns
     -------
@@ -305,10 +300,7 @@ def stretches_query(
         decision.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
-    columns = (
-        *DECISION.c["cell_id", "id", "time", "action", "reason", "part"],
-        number.label("number"),
-    )
+    columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))
     every = sa.select(*columns).where(DECISION.c.cell_id == cell_id).subquery("every")
     is_of_decision = (LABEL.c.cell_id == every.c.cell_id) & (LABEL.c.decision_id == every.c.id)
     verified, accepted, rejected = (every.c.action == action.value for action in Action)
@@ -318,19 +310,11 @@ def stretches_query(
     counts: list[sa.ColumnElement[Any]] = [
         sa.func.sum(sa.case((condition, 1), else_=0)) for condition in conditions
     ]
-    query = sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts])
-    query = query.select_from(every.outerjoin(LABEL, is_of_decision))
-    part: Any = every.c.part
-    name: Any = sa.null()
-    if batch.isdecimal():
-        name = sa.func.substr(part, 1, int(batch))
-    elif batch:  # trim the characters that are no separators off the end
-        others = reduce(lambda text, separator: sa.func.replace(text, separator, ""), batch, part)
-        name = sa.func.rtrim(part, others)
     by_number = every.c.number - every.c.number % length
     by_time = sa.func.floor((every.c.time - start) / seconds) if seconds else by_number
     return (
-        query.add_columns(name)
-        .group_by(name if batch else by_time)
+        sa.select(*[sa.func.count(), sa.func.max(every.c.time), *counts])
+        .select_from(every.outerjoin(LABEL, is_of_decision))
+        .group_by(by_time)
         .order_by(sa.func.max(every.c.number))
     )

@@ -38,7 +38,7 @@ from ..records import Action, Arrays, Decision, RetrainReport, Source, State, Tr
 SAFE_MODE_BEGAN = "safe mode"
 SAFE_MODE_ENDED = "safe mode ended"
 POLICY_CHANGED = "policy"  # its data holds the old and the new policy
-SHADOW_CHANGED = "shadow"  # likewise
+POLICY_KINDS = (POLICY_CHANGED, "shadow")  # the second is of stores from version 1.0
 DATA_LOST = "lost"  # an alarm until the next event ACKNOWLEDGED
 ACKNOWLEDGED = "acknowledged"
 LOSS_REMEDY = (

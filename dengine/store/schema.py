@@ -207,38 +207,20 @@ def check_schema(connection: sa.Connection, name: str) -> None:
     the database, for the error.
     """
     inspector = sa.inspect(connection)
-    tables = {
-        table: {column["name"] for column in inspector.get_columns(table)}
-        if table in METADATA.tables
-        else set()
-        for table in inspector.get_table_names()
-    }
-    if tables.get(SETTING.name) != set(SETTING.c.keys()):
-        description = (
-            f"tables of another program: {', '.join(sorted(tables))}" if tables else "no tables"
-        )
-    else:
-        # The one query over all cells.
-        query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()
-        description = "schema " + (
-            ", ".join(sorted(connection.execute(query).scalars())) or "unknown"
-        )
-    if description != f"schema {SCHEMA}":
-        do = "open it with the dengine that wrote it, or name a new file or database"
-        if not tables:
-            do = (
-                "a plain copy of a store that is in use lacks what it holds: make it by "
-                "`dengine backup`"
-            )
-        raise StoreError(
-            f"Expected a dengine store of schema {SCHEMA}, found {description} in {name}; {do}."
-        )
+    is_complete = True
     for table in METADATA.tables.values():
         expected = {column.name for column in table.c if column not in ADDED}
-        if missing := expected - tables.get(table.name, set()):
-            query = sa.select(SETTING.c.value).where(SETTING.c.key == "dengine").distinct()
-            versions = ", ".join(connection.execute(query).scalars()) or "unknown"
-            raise StoreError(
-                f"Expected columns {sorted(missing)} of {table.name} in {name}, found a store of "
-                f"dengine {versions}, which lacks them; open it with that dengine."
-            )
+        names = inspector.get_columns(table.name) if inspector.has_table(table.name) else []
+        is_complete = is_complete and expected <= {column["name"] for column in names}
+    schemas: list[str] = []
+    if is_complete:
+        # The one query over all cells.
+        query = sa.select(SETTING.c.value).where(SETTING.c.key == SCHEMA_KEY).distinct()
+        schemas = sorted(connection.execute(query).scalars())
+    if schemas != [SCHEMA]:
+        found = f"schema {', '.join(schemas) or 'unknown'}" if is_complete else "other tables"
+        raise StoreError(
+            f"Expected a dengine store of schema {SCHEMA} with all its columns, found {found} in "
+            f"{name}; open it with the dengine that wrote it, restore a copy that `dengine backup` "
+            "made, or name a new file or database."
+        )

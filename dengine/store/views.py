@@ -212,7 +212,7 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Counts over consecutive decisions, over a period of time, or over a batch of parts.
+    """Counts over consecutive decisions, or over a period of time.
 
     Attributes
     ----------
@@ -228,8 +228,6 @@ class Stretch:
         Accepted parts that are known to be bad.
     outside : int
         Decided by an operator's limits.
-    batch : str or None
-        Name of the batch; None for a stretch that is no batch.
     """
 
     n: int
@@ -240,4 +238,3 @@ class Stretch:
     false_accepts: int
     rejected: int
     outside: int
-    batch: str | None = None

@@ -499,21 +499,17 @@ def test_a_newer_schema_is_refused_and_both_are_named(tmp_path: Path) -> None:
         connection.execute("UPDATE setting SET value = '99' WHERE key = 'schema_version'")
     connection.close()  # and the last one to close empties the journal into the file
     before = file.read_bytes()
-    with pytest.raises(StoreError, match="schema 1, found schema 99"):
+    with pytest.raises(StoreError, match="schema 1 with all its columns, found schema 99"):
         SqlStore(str(file), "another cell")
     assert file.read_bytes() == before
 
 
-def test_a_store_of_another_version_is_refused_by_that_version_and_what_it_lacks(
-    tmp_path: Path,
-) -> None:
+def test_a_store_that_lacks_a_column_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "a.db"
-    with SqlStore(str(file)) as store:
-        store.settings.save({"dengine": "0.8.2"})
+    SqlStore(str(file)).close()
     execute(file, "ALTER TABLE label DROP COLUMN silent")
-    with pytest.raises(StoreError, match=r"dengine 0\.8\.2, which lacks them; open") as refused:
+    with pytest.raises(StoreError, match="open it with the dengine that wrote it"):
         SqlStore(str(file))
-    assert "['silent'] of label" in str(refused.value)
 
 
 @pytest.mark.parametrize("table", ["trials (id)", "setting (name)", "label (id)"])
@@ -521,7 +517,7 @@ def test_another_programs_database_is_refused_and_left_alone(tmp_path: Path, tab
     file = tmp_path / "a.db"
     execute(file, f"CREATE TABLE {table}")
     before = file.read_bytes()
-    with pytest.raises(StoreError, match="schema 1, found tables of another program"):
+    with pytest.raises(StoreError, match="schema 1 with all its columns, found other tables"):
         SqlStore(str(file))
     assert file.read_bytes() == before
     assert list(tmp_path.iterdir()) == [file]

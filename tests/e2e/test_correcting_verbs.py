@@ -146,7 +146,9 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(
     wrong = dengine("policy", store, "--force-limit", "0.05:0.1:-5::channel=4")
     assert "got '0.05:0.1:-5::channel=4'" in " ".join(wrong.stderr.split())
     assert "interval wilson -> jeffreys. Event 4, by" in policy("--interval", "jeffreys")
-    assert policy("--shadow", "on", "--author", "kim").startswith("Shadow mode: every part")
+    assert policy("--shadow", "on", "--author", "kim").startswith(
+        "The policy's shadow False -> True"
+    )
     assert "already" in policy("--shadow", "on")
     rule = "from dengine.decision.rule import DecisionRule\n\nclass Mine(DecisionRule): ...\n"
     (tmp_path / "own_rule.py").write_text(rule)

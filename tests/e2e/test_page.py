@@ -337,8 +337,8 @@ def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> 
         answers = [(event.kind, event.author) for event in store.events.newest(4)]
     assert answers == [
         ("report", "Kim"),
-        ("shadow", "Kim"),
-        ("shadow", "Kim"),
+        ("policy", "Kim"),
+        ("policy", "Kim"),
         ("policy", "Kim"),
     ]  # nobody typed a name
 
@@ -378,8 +378,7 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     page.get_by_role("button", name="Change the policy").click()
     page.get_by_label("Force limits").fill("0.01:0.05::30:reject")
     page.get_by_role("button", name="Do it").click()
-    opened(page, demo, "overview?by=batch")
-    expect(page.locator("#trend tbody")).to_contain_text(f"{STRANGE}-")
+    opened(page, demo, "overview?by=hour")
     page.locator("#escapes").get_by_role("link", name=part).click()
     expect(page.locator("#part figcaption")).to_contain_text(
         "the operator's limits are at most 30.0, else reject"

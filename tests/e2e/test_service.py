@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from dengine import DataEngine, Dataset, Reason
+from dengine import Action, DataEngine, Dataset, Reason
 from dengine.errors import StoreError, TraceError
 from dengine.serve.service import CellService
-from tests.support.driving import Counting, evidence
 from tests.support.serving import RECIPE, WAIT, a_service, busy_engine
 
 
@@ -57,6 +56,23 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
         assert (service.read_store.decisions.counts()["decisions"], service.late) == (3, 2)
 
 
+def test_a_part_that_the_next_decision_confirms_may_be_reported_as_good(stream: Dataset) -> None:
+    async def cell(service: CellService) -> None:
+        ids = []
+        for i in range(120):
+            decision = (await service.decide(stream.X[i])).decision
+            if decision.action is Action.ACCEPT:
+                ids.append(decision.id)
+            else:
+                await service.report(decision.id, bool(stream.y[i]))
+        await service.decide(stream.X[0])
+        assert ids
+        assert all([(await service.report(id_, True)).repeated for id_ in ids])
+
+    with a_service(recipe=RECIPE.with_policy(stops="all")) as service:
+        asyncio.run(cell(service))
+
+
 def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> None:
     async def cell(service: CellService) -> None:
         for i in range(40):
@@ -74,44 +90,13 @@ def test_the_engine_does_what_it_has_to_while_nobody_asks(stream: Dataset) -> No
         asyncio.run(cell(created))
 
 
-def test_a_model_of_the_users_keeps_the_engines_thread_and_never_the_loop(stream: Dataset) -> None:
-    looked = threading.Event()
-
-    class Slow(Counting):
-        def decide(self, X):
-            looked.wait(WAIT)
-            return super().decide(X)
-
+def test_a_request_without_an_id_is_verified_where_the_engine_is_late(stream: Dataset) -> None:
     async def cell(service: CellService) -> None:
-        for i in range(30):
-            await service.report((await service.decide(stream.X[i])).decision.id, bool(stream.y[i]))
-        await service.call(lambda engine: engine.retrain())
-        asked = asyncio.create_task(service.decide(stream.X[30]))
-        asyncio.get_running_loop().call_later(0.05, looked.set)
-        assert (await asked).decision.reason is not Reason.MODEL_ERROR
-        assert looked.is_set()
-
-    with closing(CellService(lambda: DataEngine(model=Slow()), deadline=WAIT)) as created:
-        asyncio.run(cell(created))
-
-
-def test_a_decision_without_an_id_is_what_the_thread_would_say_and_verify_where_that_is_held(
-    stream: Dataset,
-) -> None:
-    async def cell(service: CellService) -> None:
-        for i in range(40):
-            await service.report((await service.decide(stream.X[i])).decision.id, bool(stream.y[i]))
-        at_once, thread = (
-            await service.decide(stream.X[41]),
-            await service.decide(stream.X[41], "in-the-thread"),
-        )
-        assert evidence(at_once.decision) == evidence(thread.decision)
-        assert at_once.decision.model_version == 1
+        await service.decide(stream.X[0])
         service.deadline = 0.05
         with busy_engine(service):
-            late = asyncio.create_task(service.decide(stream.X[42]))
-            await asyncio.sleep(0.2)
-        assert (await late).decision.reason is Reason.LATE
+            late = await service.decide(stream.X[1])
+        assert (late.decision.action, late.decision.reason) == (Action.VERIFY, Reason.LATE)
 
     with a_service() as service:
         asyncio.run(cell(service))

@@ -54,34 +54,3 @@ def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(
         assert engine.trace == TraceSpec(MIN_SAMPLES)
     with DataEngine("pca", trace=TraceSpec(samples)) as engine:  # it is meant
         assert engine.decide(np.arange(samples)).reason in (Reason.NO_MODEL, Reason.CONSTANT)
-
-
-def test_the_first_trace_of_a_lost_stop_sets_a_contract_as_any_other(place) -> None:
-    with DataEngine("pca", store=place) as engine:
-        engine.report("lost-1", False, trace=np.full(50, np.nan))
-        assert engine.trace is None
-        engine.report("lost-2", False, trace=np.arange(50.0))
-        assert engine.trace == TraceSpec(50)
-        assert engine.store.decisions.counts()["sources"]["stop"] == 2
-
-
-def test_a_wrong_contract_that_nothing_was_learned_by_says_how_to_start_over(
-    tmp_path: Path, make_data
-) -> None:
-    data = make_data(3)
-    place = tmp_path / "engine.db"
-    with DataEngine("pca", store=place) as engine:
-        engine.decide(np.arange(20.0))
-    with DataEngine.open(place) as engine:  # it is known after a restart, too
-        with pytest.raises(
-            TraceError,
-            match=r"Expected 20 samples, got 100;.* was set by the first trace.*with a new store",
-        ):
-            engine.decide(data.X[0])
-        engine.report(engine.decide(np.arange(20.0) ** 2).id, True)
-        with pytest.raises(TraceError) as caught:
-            engine.decide(data.X[0])
-    assert "first trace" not in str(caught.value)  # one label was learned by it: it was meant
-    with DataEngine("pca", trace=TraceSpec(20)) as engine, pytest.raises(TraceError) as caught:
-        engine.decide(data.X[0])
-    assert "first trace" not in str(caught.value)  # it was given, and is nobody's guess

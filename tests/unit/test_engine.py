@@ -339,40 +339,6 @@ def test_a_second_report_is_an_error_and_the_first_stands(
     )
 
 
-def test_a_stop_whose_decision_was_lost_is_accepted_with_its_trace(
-    trained: DataEngine, data: Dataset
-) -> None:
-    labels = len(trained.store.labels.with_traces().labels)
-    trained.set_policy(replace(trained.policy, audit_rate=0.999))
-    trained.report("from-a-lost-process", success=False, trace=good(data))
-    stored = trained.store.decisions.get("from-a-lost-process")
-    assert (stored.decision.action, stored.success, stored.source) == (
-        Action.ACCEPT,
-        False,
-        Source.STOP,
-    )
-    assert (stored.decision.audit, stored.decision.reason, stored.decision.propensity) == (
-        False,
-        Reason.CERTAIN,
-        0.999,
-    )
-    np.testing.assert_array_equal(stored.trace[0], good(data))
-    assert len(trained.store.labels.with_traces().labels) == labels + 1
-
-
-def test_a_lost_success_is_not_taken_since_only_stops_speak_for_themselves(
-    trained: DataEngine, data: Dataset
-) -> None:
-    before = trained.store.decisions.counts()
-    for text in ({"success": True, "trace": good(data)}, {"success": False}):
-        with pytest.raises(
-            ReportError,
-            match=r"'lost', which is unknown; a system stop .* can be reported with its trace",
-        ):
-            trained.report("lost", **text)
-    assert trained.store.decisions.counts() == before
-
-
 @pytest.mark.parametrize("where", ["insert", "verify", "proceed"])
 def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(
     where, data, tmp_path: Path

@@ -15,7 +15,7 @@ from dengine import Action, DataEngine, Dataset, Policy, Reason, Recipe, SqlStor
 from dengine.errors import ReportError, StoreError
 from dengine.history.envelope import envelope_of
 from dengine.history.explain import Explanation, explain
-from dengine.history.sentences import WHY, Circumstances, bound_of
+from dengine.history.sentences import WHY
 from dengine.representation import to_jsonable
 from tests.support.driving import Counting, drive, easy_parts
 from tests.support.stores import execute
@@ -70,23 +70,17 @@ def test_what_is_counted_again_is_what_was_counted_then_decision_by_decision(
     with played(tmp_path, data, RECIPES[name]) as engine:
         balls = 0
         for past in list(engine.history())[::6]:
-            explanation = engine.explain(past.decision.id)
-            assert not any(
-                "Counted again" in note or "another bound" in note for note in explanation.notes
-            ), (
-                past,
-                explanation.notes,
-            )
+            explanation = engine.explain(past.decision.id, neighbours=1000)
             assert explanation.decision == past
-            if explanation.bound is not None:
+            bound = explanation.bound
+            if bound is not None:
                 balls += 1
-                needed = {
-                    Action.ACCEPT: explanation.bound.successes_needed,
-                    Action.REJECT: explanation.bound.failures_needed,
-                }
-                assert (
-                    needed.get(past.decision.predicted, 1) == 0
-                ) or past.decision.predicted is Action.VERIFY
+                near = [item.success for item in explanation.neighbours if item.inside]
+                assert (near.count(True), near.count(False)) == (bound.n_success, bound.n_failure)
+                accepted = (
+                    bound.accept_threshold is not None and bound.lower >= bound.accept_threshold
+                )
+                assert accepted == (past.decision.predicted is Action.ACCEPT), past
         assert balls > 15
 
 
@@ -138,33 +132,6 @@ def test_of_a_version_that_is_not_kept_the_record_is_shown_and_no_neighbours(
     assert "the thresholds of that time are not kept" in said_of(again)
 
 
-def test_the_bound_says_how_many_more_labels_would_have_done(
-    make_data: Callable[..., Dataset],
-) -> None:
-    with played(None, make_data(200, samples=60), RECIPES["local"]) as engine:
-        (past,) = engine.history(last=1, reason="certain")
-    result = Circumstances(RECIPES["local"], TraceSpec(60))
-    policy = result.recipe.policy
-    for n_success, n_failure in ((38, 0), (3, 1), (0, 0), (100, 12), (0, 30), (1, 60)):
-        lower, upper = policy.bound(n_success, n_failure)
-        created = replace(
-            past.decision, n_success=n_success, n_failure=n_failure, lower=lower, upper=upper
-        )
-        counted = replace(created, reason=Reason.UNCERTAIN)
-        bound = bound_of(counted, result)
-        for needed, of_success, at in (
-            (bound.successes_needed, 1, 0.9),
-            (bound.failures_needed, 0, 0.1),
-        ):
-            reached = [
-                policy.bound(n_success + of_success * m, n_failure + (1 - of_success) * m)
-                for m in (needed, needed - 1)
-            ]
-            assert reached[0][0] >= at if of_success else reached[0][1] <= at + 1e-12
-            if needed:
-                assert reached[1][0] < at if of_success else reached[1][1] > at
-
-
 def test_each_reason_is_explained_by_what_it_rests_on(
     make_data: Callable[..., Dataset], tmp_path: Path
 ) -> None:
@@ -182,25 +149,20 @@ def test_each_reason_is_explained_by_what_it_rests_on(
             "audit": next(iter(engine.history(last=1, reason="audit"))).decision.id,
             "no_model": next(iter(engine.history())).decision.id,
         }
-        engine.report("lost", success=False, trace=data.X[3] + 0.01)
         explained = {reason: engine.explain(id_) for reason, id_ in ids.items()}
-        explained["lost"] = engine.explain("lost")
     novel = explained["novel"]
     assert (novel.decision.decision.reason, novel.bound) == (Reason.NOVEL, None)
     assert max(asdict(novel.novelty).values()) > 1.0
     for reason, words in {
         "novel": [f"in level {novel.novelty.level:.2f} times the limit"],
-        "constant": ["every sample is 4 Nm: a dead sensor", "The trace is quarantined"],
+        "constant": ["every sample has the same value: a dead sensor", "The trace is quarantined"],
         "not_finite": ["1 of 60 samples are NaN or infinite", "The trace is quarantined"],
-        "saturated": ["first after 0.060 s (channel 0)", "The trace is quarantined"],
-        "audit": ["the model alone would have", "below the audit rate 0.1"],
+        "saturated": ["the trace touched the sensor's range", "The trace is quarantined"],
+        "audit": ["the model alone would have"],
         "no_model": ["no model had been trained yet", "the trace was not embedded"],
-        "lost": ["the decision was lost, and recorded again", "turned out bad (stop)"],
     }.items():
         text = said_of(explained[reason])
         assert [item for item in words if item not in text] == [], text
-    coin = re.search(r"coin fell on ([\d.]+),", said_of(explained["audit"])).group(1)
-    assert 0.0 <= float(coin) < 0.1
 
 
 @pytest.mark.parametrize("size", [3.4e38, 1e18, 1e-30, 1e-45, np.nan, np.inf])
@@ -267,30 +229,21 @@ def test_an_unknown_id_says_where_the_ids_are(make_data: Callable[..., Dataset])
     assert set(WHY) == set(Reason)
 
 
-def test_a_planted_excess_is_found_where_and_how_far_it_is() -> None:
+def test_the_envelope_counts_the_samples_that_leave_it_and_needs_twenty_successes() -> None:
     X = np.random.default_rng(0).normal(0.0, 1.0, (200, 2, 50)).astype(np.float32)
     trace = np.median(X, axis=0)
-    trace[1, 20:25], trace[0, 40] = 6.0, -5.0
+    trace[1, 20:25], trace[0, 40], trace[0, 3] = 6.0, -5.0, np.nan  # a NaN lies nowhere
     result = envelope_of(X, trace)
-    found = [(e.channel, e.first, e.last, e.above) for e in result.excesses]
-    assert found == [(1, 20, 24, True), (0, 40, 40, False)]  # the farthest first
-    widths = (6.0 - result.high[1, 20:25]) / (result.high - result.low)[1, 20:25]
-    assert result.excesses[0].widths == pytest.approx(widths.max(), rel=1e-5)
     assert result.outside == pytest.approx(6 / 100)
-    trace = np.zeros((2, 50), np.float32)
-    trace[0, 3], trace[1, 4:6] = np.nan, np.inf  # these lie nowhere
-    trace[0, 10:12], trace[0, 12:15] = 9.0, -9.0  # one that changes sides is two
-    result = envelope_of(X, trace)
-    found = sorted((e.first, e.last, e.above) for e in result.excesses)
-    assert (result.not_finite, found) == (3, [(10, 11, True), (12, 14, False)])
+    share_inside = ((result.low <= X) & (result.high >= X)).mean()
+    assert share_inside == pytest.approx(0.95, abs=0.01)
     assert envelope_of(X[:19], trace) is envelope_of(X, trace[:, :49]) is None
 
 
-@pytest.mark.parametrize("clock_goes", [1.0, 0.0, -1.0], ids=["on", "not", "back"])
 def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_made(
-    make_data, tmp_path: Path, clock_goes: float
+    make_data, tmp_path: Path
 ) -> None:
-    times = iter(np.arange(1e6) * clock_goes + 1e9)
+    times = iter(np.arange(1e6) + 1e9)
     data, window = make_data(160, samples=60), "0:0.1:-1000:1000"
     engine = played(
         SqlStore(str(tmp_path / "e.db"), clock=lambda: float(next(times))),
@@ -315,7 +268,5 @@ def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_mad
         assert [engine.explain(id_).policy for id_ in ids] == policies
         first = engine.explain(ids[0])
         assert first.bound.accept_threshold == 0.9
-        assert first.bound.successes_needed == 0
         assert "lower must be at least 0.9 (" in said_of(first)
-        assert "present settings" not in said_of(first)
         assert engine.explain(ids[1]).bound.accept_threshold == 0.95

@@ -395,20 +395,6 @@ def test_a_callback_that_raises_costs_no_label(stream: Dataset) -> None:
     )
 
 
-def test_a_decision_at_once_leaves_it_to_settle_to_say_that_safe_mode_begins(
-    stream: Dataset,
-) -> None:
-    heard: list[str] = []
-    engine = make(
-        replace(POOLED, stops="some", audit_rate=0.5, label_within=2), on_safe_mode=heard.append
-    )
-    play(engine, stream)
-    assert all(engine.decide(x, wait=False) for x in spoiled(stream).X)  # their audits are owed
-    assert (bool(engine.safe_mode), heard) == (True, [])
-    engine.poll()
-    assert heard == [engine.safe_mode]
-
-
 @pytest.mark.parametrize("guarantee", ["local", pytest.param("pooled", marks=pytest.mark.slow)])
 def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_evidence_keeps_the_tolerance(
     stream: Dataset, make_data, guarantee: str

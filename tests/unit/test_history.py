@@ -10,7 +10,7 @@ import pytest
 
 import dengine.history
 from dengine import SqlStore
-from dengine.history.status import history, read_retrains_and_events
+from dengine.history.status import history
 from dengine.records import Action, Decision, Reason, RetrainReport, Source
 from dengine.store.records import StoredDecision
 from dengine.store.views import HistoryFilter, Stretch
@@ -198,12 +198,6 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore, n: int) 
     assert store.decisions.stretches(n) == expected
     shifts = [[item for item in whole if item.time // (10.0 * n) == k] for k in range(N)]
     assert store.decisions.stretches(seconds=10.0 * n) == [counted(item) for item in shifts if item]
-    for batch, name in (
-        ("5", lambda part: part[:5]),
-        ("-/", lambda part: part[: part.rindex("-") + 1]),
-    ):
-        sizes = Counter(name(item.decision.part) for item in whole)
-        assert {item.batch: item.n for item in store.decisions.stretches(batch=batch)} == sizes
 
 
 def test_an_empty_store_has_no_past() -> None:
@@ -230,18 +224,6 @@ def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlS
     ]
     by_id = {past.decision.id: past for past in everything(store)}
     assert all(label.decided == by_id[label.decision_id].time for label in every)
-
-
-def test_retrains_and_events_are_those_of_the_time_that_is_asked_for(store: SqlStore) -> None:
-    whole = everything(store)
-    every = read_retrains_and_events(store)
-    assert (len(every["retrains"]), [item.text[:5] for item in every["events"]]) == (
-        6,
-        ["too m", "fresh"],
-    )
-    late = read_retrains_and_events(store, since=whole[-1].time)
-    assert [len(item) for item in late.values()] == [1, 2]
-    assert read_retrains_and_events(store, until=whole[0].time)["retrains"] == []
 
 
 def test_a_page_is_read_along_the_index_and_no_trace_is(tmp_path: Path) -> None:

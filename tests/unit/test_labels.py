@@ -4,7 +4,6 @@ is stored.
 
 import re
 from fractions import Fraction
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +27,7 @@ GOOD = [
     Fraction(1),
 ]
 BAD = [False, np.False_, 0, 0.0, -0.0, np.int8(0), np.float64(0), np.array(0.0), Fraction(0)]
-HUGE = [10**5000, "x" * 2**20, list(range(10**5))]
+HUGE = ["x" * 2**20, list(range(10**5))]
 NONE = [
     100,
     -1,
@@ -103,17 +102,12 @@ def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
     x = make_data(2).X
     for id_ in NO_IDS:
         with pytest.raises(ReportError, match="Expected the id of a decision"):
-            engine.report(id_, False, trace=x[0])
+            engine.report(id_, False)
     for part in NO_PARTS:
-        for call in (
-            partial(engine.decide, x[0]),
-            partial(engine.report, "lost", False, trace=x[0]),
-        ):
-            with pytest.raises(TraceError, match="part's number"):
-                call(part=part)
+        with pytest.raises(TraceError, match="part's number"):
+            engine.decide(x[0], part=part)
     engine.flush()
     assert engine.store.decisions.counts()["decisions"] == 0
-    engine.report("lost-1", False, trace=x[0])
     decision = engine.decide(x[1])
     for value in NONE:
         with pytest.raises(ReportError):
@@ -122,7 +116,7 @@ def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
     assert engine.store.decisions.counts()["sources"] == {
         "verification": 1,
         "audit": 0,
-        "stop": 1,
+        "stop": 0,
         "confirmed": 0,
         "inspection": 0,
     }

@@ -145,19 +145,16 @@ def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
         assert engine.find(id_).success is bool(value)
 
 
-@given(value=anything, trace=traces, x=SOUND, how=st.integers(0, 3), good=st.booleans())
+@given(value=anything, x=SOUND, decides=st.booleans(), good=st.booleans())
 @tries(2.0)
 def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(
-    engines, value, trace, x, how: int, good
+    engines, value, x, decides: bool, good
 ) -> None:
-    calls: list[Callable[[], Any]] = [
-        lambda: engines[0].report(value, good),
-        lambda: engines[0].report(value, False, trace=x),
-        lambda: engines[0].report(f"lost-{x.sum()}", False, trace, value),
-        lambda: engines[0].decide(x, part=value),
-    ]
     with suppress(DengineError):
-        calls[how]()
+        if decides:
+            engines[0].decide(x, part=value)
+        else:
+            engines[0].report(value, good)
 
 
 @given(

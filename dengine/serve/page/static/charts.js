@@ -94,9 +94,10 @@ const unitOf = ({ unit }, channel) => (Array.isArray(unit) ? unit[channel] : uni
 export const isForce = ({ channels, unit }) => channels === 1 && /^[µmckM]?N$/.test(unit);
 
 export function traceCharts(explanation) {
-  const widest = explanation.trace.map(() => 0);
-  for (const each of explanation.envelope?.excesses ?? []) widest[each.channel] = Math.max(widest[each.channel], each.widths);
-  const order = widest.map((_, channel) => channel).sort((a, b) => widest[b] - widest[a] || a - b);
+  const { low, high } = explanation;
+  const isOutside = (value, channel, i) => low && value !== null && (value < low[channel][i] || value > high[channel][i]);
+  const outside = explanation.trace.map((values, channel) => values.filter((value, i) => isOutside(value, channel, i)).length);
+  const order = outside.map((_, channel) => channel).sort((a, b) => outside[b] - outside[a] || a - b);
   const shown = order.slice(0, CHANNELS).sort((a, b) => a - b);
   const isLast = (i) => i === shown.length - 1;
   return shown.map((channel, i) => traceChart(explanation, channel, HEIGHTS[shown.length - 1] + (isLast(i) ? 69 : 25), isLast(i)));
@@ -144,11 +145,7 @@ function traceCaption(explanation, channel) {
   const limits = limitsOf(explanation, channel).map((each) => limitsText(spec, each)).join("");
   const caption = `${what} over ${duration}, from ${range}. ${limits}`;
   if (!envelope) return `${caption}The band of good parts is drawn from 20 good parts on.`;
-  const outside = `${caption}${percent(envelope.outside, 1)} of ${several ? "all channels" : "it"} lies outside the band of good parts; for most good parts it is less than ${percent(envelope.usual, 1)}.`;
-  const most = envelope.excesses.filter((each) => each.channel === channel).sort((a, b) => b.widths - a.widths)[0];
-  if (!most) return outside;
-  const [from, to] = [most.first, most.last].map((sample) => timeText(spec, timeOf(spec, sample), 2));
-  return `${outside} It leaves the band farthest ${most.above ? "upwards" : "downwards"} ${from === to ? "at" : `between ${from} and`} ${to}.`;
+  return `${caption}${percent(envelope.outside, 1)} of ${several ? "all channels" : "it"} lies outside the band of good parts.`;
 }
 
 export function traceLegend(explanation) {

@@ -192,18 +192,16 @@ const HOURS = { shift: 8, day: 24, hour: 1 };
 const SHIFT_BEGINS = 6; // o'clock
 const ROWS = 20; // of the trend
 
-async function trend(get, wished, parts) {
-  // A row for each shift, day, hour or batch. A batch is what a part's number begins with, up to its last - _ / . or blank.
-  const batch = parts.some((each) => /[-_/. ]/.test(each.part ?? ""));
-  const by = wished in HOURS || (wished === "batch" && batch) ? wished : "shift";
+async function trend(get, wished) {
+  const by = wished in HOURS ? wished : "shift";
   const start = new Date().setHours(by === "shift" ? SHIFT_BEGINS : 0, 0, 0, 0) / 1000;
-  const { stretches } = await get(`course?${by === "batch" ? `batch=${encodeURIComponent("-_/. ")}` : `hours=${HOURS[by]}&start=${start / 3600}`}`);
+  const { stretches } = await get(`course?hours=${HOURS[by]}&start=${start / 3600}`);
   const begun = (last) => start + Math.floor((last - start) / (3600 * HOURS[by])) * 3600 * HOURS[by];
-  const rows = stretches.slice(-ROWS).reverse().map((each) => [by === "batch" ? each.batch || "no batch" : el("time", {}, moment(begun(each.last)).slice(0, 16)), number(each.n),
+  const rows = stretches.slice(-ROWS).reverse().map((each) => [el("time", {}, moment(begun(each.last)).slice(0, 16)), number(each.n),
     percent((each.accepted + each.rejected) / each.n), percent(each.verified / each.n), number(each.accepted), number(each.false_accepts), number(each.outside)]);
-  const ways = [...Object.keys(HOURS), ...(batch ? ["batch"] : [])].map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
+  const ways = Object.keys(HOURS).map((way) => el("li", {}, el("a", { href: `overview?by=${way}`, "aria-current": way === by ? "true" : null }, `by ${way}`)));
   return card("trend", "Trend", el("ul", { class: "chips" }, ways), rows.length === 0 ? small("No parts yet.")
-    : table([[by === "batch" ? "Batch" : "From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"], ["Outside the limits", "num more"]], rows));
+    : table([["From"], ["Parts", "num"], ["Certain", "num more"], ["Verified", "num"], ["Accepted", "num more"], ["Bad accepted", "num"], ["Outside the limits", "num more"]], rows));
 }
 
 async function overview(get, query, status) {
@@ -241,7 +239,7 @@ async function overview(get, query, status) {
     ? el("ol", { class: "story" }, events.map((each) => el("li", {}, el("time", {}, moment(each.time)), " ", el("b", {}, each.kind), each.author && ` · ${each.author}`,
       el("br"), each.text.replace(/\b([0-9a-f]{12})[0-9a-f]{28,}\b/g, "$1…"))))
     : small("No events yet."));
-  return { title: "Overview", elements: [el("h1", {}, "Overview"), escapes, el("div", { class: "tiles" }, tiles), el("div", { class: "split" }, el("div", { class: "stack" }, lines, await trend(get, query.get("by"), decisions)), happened)] };
+  return { title: "Overview", elements: [el("h1", {}, "Overview"), escapes, el("div", { class: "tiles" }, tiles), el("div", { class: "split" }, el("div", { class: "stack" }, lines, await trend(get, query.get("by"))), happened)] };
 }
 
 async function map(get, query, status) {

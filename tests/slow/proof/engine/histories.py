@@ -375,8 +375,7 @@ class History:
     def _kill(self, step: Step) -> None:
         """Open a cell again without closing its engine, after its store wrote all that waited.
 
-        What the engine alone knew is lost, as confirmations are. `tests.slow.faults` ends processes by
-        SIGKILL.
+        `tests.slow.faults` ends processes by SIGKILL.
         """
         with self._call(step.cell, "killed") as engine:
             engine.store.flush()

@@ -80,12 +80,9 @@ class Part:
     def learned(self, at: Moment) -> Moment:
         """Return when the outcome that counts at a moment was learned; NEVER if there is none.
 
-        A confirmation counts from the next decision on, whenever it is stored. If a line stop
-        replaced it before it was stored, the outcome is learned anew with the report.
+        The next decision confirms a part before it is itself decided.
         """
-        is_replaced = self.label is not None and self.label["source"] != "confirmed"
-        is_replaced = is_replaced and self.reported < at
-        if self.is_confirmed_by_silence and self.next_decided < at and not is_replaced:
+        if self.is_confirmed_by_silence and self.next_decided < at:
             return min(self.next_decided, self.reported)
         return self.reported if self.reported < at else NEVER
 

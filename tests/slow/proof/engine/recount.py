@@ -407,17 +407,9 @@ class Recount:
         pinned = self.ledger.events.get(("rollback", newest), {"to": 0})["to"]
         self.expect("status", "pinned", status.pinned, pinned)
         self._check_certificate(engine, parts, at)
-        if engine.model is None or self._lacks_confirmations(cell, now):
+        if engine.model is None:
             return
         RuleReplay(self, cell).check(engine, at)
-
-    def _lacks_confirmations(self, cell: int, now: float) -> bool:
-        """Return whether a cell was opened after its newest decision.
-
-        Confirmations that were lost with the process are learned with the next decision.
-        """
-        last = max((part.decided[0] for part in self.ledger.of_cell(cell)), default=0.0)
-        return any(restarted == cell and time > last for time, restarted in self.diary.restarts)
 
     def _check_certificate(self, engine: DataEngine, parts: list[Part], at: Moment) -> None:
         """Compare the certificate with the outcomes of accepted and of audited parts."""
