@@ -63,8 +63,8 @@ class Verbs(click.Group):
 
         Expected are DengineError, OSError (but BrokenPipeError, which passes) and UnicodeError. An
         ImportRefusedError, which `--allow-import` avoids, becomes `click.UsageError`, exit code 2.
-        A message is put on one line, and names the options of the command line in place of Python's
-        arguments. Passwords in it are masked, also in click's own messages. The current folder is
+        The message is put on one line, and names the options of the command line in place of
+        Python's arguments. Passwords are masked, in click's own messages too. The current folder is
         added to the end of `sys.path`, so that `module:Class` is found there. Ctrl-C ends the
         process with exit code 130.
         """

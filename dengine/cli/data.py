@@ -61,12 +61,12 @@ def data(
 
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
     .npz, .ts or .mcap. The verb shows the saved description or, without one, a proposal, in which ?
-    marks what you have to state with --set. Below, it shows what was read by the description, and
-    drift. --out draws the traces. Look at them, and write the description with --save: every other
-    verb reads by it.
+    marks what you have to state with --set. While a ? is left, no recording is read. Below, it
+    shows what was read by the description, and drift. --out draws the traces. Look at them, and
+    write the description with --save, because every other verb needs it to read the recordings.
 
-    DATA may also be what needs no description: a bundled set, the file of a store, or an .npz file
-    with X (traces, samples) and y (1 success, 0 failure).
+    DATA may also be a source that needs no description: a bundled set, the file of a store, or an
+    .npz file with X (traces, samples) and y (1 success, 0 failure).
     """
     from ..datasets.description import Seen
     from ..datasets.sample import write_sample
@@ -103,9 +103,9 @@ def data(
 
 
 def _print_open_keys(source: DataChoice, description: "Description", path: Path | None) -> None:
-    """Print a description with `?` in it, and what is to be stated.
+    """Print a description with `?` in it, and the keys that the user must state.
 
-    path : the file to which it was written, if it was.
+    path : the file to which the description was written, or None.
     """
     notes = description.notes
     questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]
@@ -120,7 +120,10 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
 
 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
-    """Yield tables and sentences on what was read; a sentence may be ""."""
+    """Yield the tables and sentences that the verb `data` prints of a survey and of the notes.
+
+    A sentence may be "".
+    """
     from ..datasets.checks import tolerance_note
     from ..decision.policy import Policy
     from ..model.neighbours import MANY_REPEATS
@@ -170,8 +173,9 @@ def _trace_line(dataset: "Dataset", i: int) -> str:
 def _drift_row(drift: "Drift") -> tuple[str, str, str]:
     """Return three cells of a table: the quantity, its means over tenths, and a verdict on drift.
 
-    The verdict is "rises" or "falls" if the p-value is below 0.01, else that no drift is seen, and
-    has Spearman's rho and the p-value. It is "never changes" where rho is NaN.
+    The verdict says that the quantity rises or falls with the order if the p-value is below 0.01,
+    and otherwise that no drift is seen; Spearman's rho and the p-value follow. If rho is NaN, it is
+    only "never changes".
     """
     means = " ".join(f"{mean:.2g}" for mean in drift.tenths)
     if math.isnan(drift.rho):
@@ -246,10 +250,11 @@ def train(
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
     is stored, but never trained on. A store that has been used has its own recipe and seed: leave
     these options out, because other values are refused. Recordings are brought to the length of the
-    store's traces. If nothing is new and a version answers, nothing is trained. If training needs
-    more time than the recipe's budget, several retrains follow each other. The exit code is 1 if
-    the new version is not used, or if steps are missing at the end, because the budget is too short
-    for a single step. Ctrl-C keeps what was imported; the same command continues there.
+    store's traces. If no label is new and a version is in force, nothing is trained. If training
+    needs more time than the recipe's time budget, several retrains follow each other. The exit code
+    is 1 if a new version is dropped, or if training steps are missing at the end, because the time
+    budget is too short for a single step. Ctrl-C keeps what was imported; the same command
+    continues there.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

@@ -129,8 +129,9 @@ def history(store: str, events: bool, **criteria: Any) -> None:
 
 
 def _label_text(stored: StoredDecision) -> str:
-    """Return a label with its source, as "good verified" or "bad stop"; "-" without a label, or
-    with a forgotten one.
+    """Return a label and its `Source` as text, like "good verified" or "bad stop".
+
+    It is "-" if there is no label, or if the label was forgotten.
     """
     if stored.success is None:
         return "-"
@@ -196,7 +197,7 @@ def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> s
 def _event_line(item: StoredVersion | Event) -> str:
     """Return the line of an event or a retrain: its time in UTC, what happened, and why.
 
-    That of a retrain also has the number of traces and the duration.
+    The line of a retrain also has the number of traces and the duration.
     """
     from ..store.records import Event
 
@@ -267,9 +268,9 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
 def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     """Yield (title, text) rows of an explanation.
 
-    They say when and by which version it was decided, the part, why, what was found when it was
-    computed again, and how much of the trace leaves the envelope of successes, or that there are
-    too few successes for one.
+    They say when the decision was made and by which version, on which part, and why. Then come the
+    notes on what was computed again, and the share of samples that leave the envelope of the known
+    successes; or a sentence that there are too few successes for an envelope.
     """
     decision = explanation.decision.decision
     version = decision.model_version

@@ -50,9 +50,9 @@ def verb(example: str) -> Callable[[Command], click.Command]:
 
 
 def names_of(kind: str) -> tuple[str, ...]:
-    """Return the names that an option of this kind accepts.
+    """Return the names that an option of this kind accepts, such as "wilson" for an interval.
 
-    They are the keys of the package's own tables, imported only when they are needed.
+    The tables that hold them are imported only when this is called.
 
     Parameters
     ----------
@@ -218,8 +218,8 @@ store_argument = existing_store(click.argument("store", metavar="STORE"))
 def store_option(text: str, *names: str, required: bool = False) -> Option:
     """Return a decorator that adds `--store`, `--cell-id` and `--product`.
 
-    They are handed on as one address; the store need not exist. The address, the verb's argument
-    `store`, is None without `--store`; a cell or product without it is a usage error.
+    The verb gets them as one address, its argument `store`; the store need not exist. The address
+    is None without `--store`. A cell or product without `--store` is a usage error.
 
     Parameters
     ----------
@@ -268,6 +268,8 @@ class RecipeChoice:
     def load(self, base: Any = "conv") -> Recipe:
         """Return the recipe, or `base` if no name was given, with the given settings.
 
+        `base` is anything that `Recipe.load` takes.
+
         Raises
         ------
         SettingError
@@ -292,10 +294,11 @@ class RecipeChoice:
         return self.load() if self.name or self.settings else None
 
     def make_contender(self) -> Contender:
-        """Return the contender of a replay: dengine with this recipe, or the baseline of this name.
+        """Return what a replay plays: a `Contender`, which is a recipe or a baseline.
 
-        Both get the settings that were given. Without a name it is dengine with the recipe conv.
-        Raises SettingError as `load` does.
+        It is the baseline if the name is that of a baseline, and otherwise the recipe that `load`
+        returns. Both get the settings that were given. Without a name it is the recipe conv. Raises
+        SettingError as `load` does.
         """
         from ..experiments.replay import Contender
 
@@ -433,18 +436,20 @@ class DataChoice:
     def describe(self, *, propose: bool = False) -> Description | None:
         """Return the description with the stated keys; None for a source that needs none.
 
-        These are the bundled sets, stores and files of ours, if no key and no description is given.
-        A progress bar is shown meanwhile.
+        A bundled set, the file of a store and a file in a format of dengine need none, unless a key
+        is stated, or a description is given or saved beside the file. While the description is read
+        or proposed, a progress bar is shown.
 
         Parameters
         ----------
         propose : bool
-            Whether a description is proposed if none was saved; else that is a DataError.
+            If no description was saved: True proposes one, False raises DataError.
 
         Raises
         ------
         DataError
-            If the source does not exist, or its description cannot be read or proposed.
+            If the source does not exist or is damaged, or its description cannot be read or
+            proposed.
         """
         from ..datasets.loading import description_of, own_reader
 
@@ -456,10 +461,10 @@ class DataChoice:
     def load(self, description: Description | None = None) -> Dataset:
         """Load the data set and return it.
 
-        Its notes and the first recordings that were left out are printed to stderr, but not with
-        `--json`. Raises DataError if it cannot be read.
+        Its notes, and the first three recordings that were left out, are printed to stderr, but not
+        with `--json`. Raises DataError if it cannot be read.
 
-        description : None: that of `describe`.
+        description : the description to read by; None takes the one that `describe` returns.
         """
         from ..datasets import load_dataset
         from ..datasets.loading import count_files
@@ -561,9 +566,10 @@ DATA = CHOICE | {
 
 
 def parse_stated(items: Iterable[str]) -> dict[str, Any]:
-    """Return the keys and values of `--set KEY=VALUE`: a value is TOML, else a text.
+    """Return the values of `--set KEY=VALUE` by their keys, which stay texts like `label.column`.
 
-    Raises click.UsageError for a text without `=`.
+    A value is read as TOML; if it is not valid TOML, it is the text itself. If a key comes twice,
+    its last value counts. Raises click.UsageError for an item without `=`.
     """
     stated = dict[str, Any]()
     for item in items:
@@ -621,10 +627,11 @@ def data_options(
 
 
 def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
-    """Return a robot recorder's settings, by its own names, and the `TraceSpec` of its traces.
+    """Return the settings of a robot's recorder, by its argument names, and its `TraceSpec`.
 
-    Both come from the options in `TRACE` that were given; others are ignored. Raises SettingError
-    for values that no trace can have.
+    They come from the options of `TRACE`, which say what traces look like, as far as they were
+    given; other options are ignored. The settings are samples, rate and channels. The `TraceSpec`
+    also has the unit and the fit. Raises SettingError for values that no trace can have.
     """
     from ..cells.ur.recorder import spec_of_recording
 
@@ -635,14 +642,14 @@ def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
 
 
 def trace_spec_from(options: Options) -> TraceSpec | None:
-    """Return what live traces look like, by those options of `TRACE` that were given.
+    """Return the `TraceSpec` of live traces that the options in `TRACE` state.
 
-    `--channels` with one number gives how many there are; with names, their columns.
+    If `--channels` is one number, this is the number of channels; otherwise it has their names.
 
     Parameters
     ----------
     options : mapping
-        Values by the names in `TRACE`, without those that were not given. Others are ignored.
+        Values of the options that were given, by the names in `TRACE`. Other names are ignored.
 
     Returns
     -------
@@ -664,8 +671,7 @@ def trace_spec_from(options: Options) -> TraceSpec | None:
         return None
     if "samples" not in settings:
         raise click.UsageError(
-            "A contract of traces needs --samples too; without these options the first trace sets "
-            "it."
+            "Live traces need --samples too; without these options the first trace sets all."
         )
     # `--channels 3` is a number of channels, not the name of one.
     n_channels = int(names[0]) if len(names) == 1 and names[0].isdecimal() else len(names) or 1

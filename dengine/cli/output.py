@@ -88,9 +88,9 @@ class Out:
     force: bool = False
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
-        """Write files, creating their folder, and a manifest of them, and return their paths.
+        """Write files and a manifest that lists them, and return the paths.
 
-        There is no manifest if the file is `path` itself.
+        The folder is created. There is no manifest if the file is `path` itself.
 
         Parameters
         ----------
@@ -105,8 +105,8 @@ class Out:
         Raises
         ------
         OutputError
-            A file exists and `force` is not set, or it cannot be written. Those before it are
-            written already.
+            A file exists and `force` is not set, or it cannot be written. The files before it in
+            `contents` are written already.
         """
         from matplotlib.figure import Figure
 
@@ -137,10 +137,10 @@ def print_result(
     Parameters
     ----------
     record : mapping
-        The JSON document, which `--json` prints alone, with the verb's name and the paths of the
-        files besides. The mapping itself is not changed.
+        The JSON document, which `--json` prints alone. The verb's name and the paths of the files
+        are added to it, in a copy.
     *parts : str or rich.Table
-        What people see instead, with a line for each file that was written.
+        What is printed without `--json`. A line for each file that was written follows.
     out : Out or None
         Where the files go. None writes none.
     make_files : callable or None
@@ -149,8 +149,8 @@ def print_result(
     Raises
     ------
     DengineError
-        The files could not be written. Raised after the result was printed, so that what was
-        computed is not lost.
+        `make_files` raised it, or a file could not be written. It is raised after the result was
+        printed, so that what was computed is not lost.
     """
     files: list[Path] = []
     refusal: DengineError | None = None
@@ -245,9 +245,9 @@ def format_value(name: str, value: Any) -> str:
     name : str
         The field's name. Its ending tells the unit, see `FORMATTERS`: `_s`, `_bytes`, `share` ...
     value : object
-        A number, a text, a dataclass, or a mapping or sequence of these. "-" stands for None, for
-        NaN and for ""; "yes" and "no" for bools. A mapping gives its items that are not 0, or
-        "none". In a text passwords are masked.
+        A number, a text, a dataclass, or a mapping or sequence of these. None, NaN and "" give "-",
+        a bool "yes" or "no". Of a mapping only the items that are not 0 are shown; if there are
+        none, the text is "none". Passwords in a text are masked.
     """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"
@@ -317,8 +317,8 @@ def certificate_record(certificate: "Certificate") -> Record:
 def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Show a progress bar on stderr while the block runs; it vanishes at the end.
 
-    Where stderr is no terminal, a line every 30 s says how far the work is. Beside `--json` nothing
-    is shown, and `advance` does nothing.
+    If stderr is no terminal, a thread writes a line every 30 s that says how far the work is. With
+    `--json` nothing is shown, and `advance` does nothing.
 
     Parameters
     ----------
@@ -362,7 +362,11 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
 
 @contextmanager
 def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Write a line to stderr every `LINE_SECONDS` while the block runs, as `progress_bar` does."""
+    """Write the progress to stderr, a line every `LINE_SECONDS` while the block runs.
+
+    A thread writes the lines. The function that is yielded, `advance(n)`, adds n steps and writes
+    nothing itself.
+    """
     n_steps = 0
     ended = Event()
 
@@ -395,8 +399,9 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
     """Show a progress bar, and let Ctrl-C or SIGTERM end the work between two steps.
 
     It replaces the handlers of these signals until the block ends. The first signal makes the next
-    call of `count` raise StepInterruptedError. A second one acts at once, as it would have without
-    this block. It must be used in the main thread, as Python asks of signal handlers.
+    call of `count` raise StepInterruptedError; if no call follows, the signal has no effect. A
+    second signal acts at once, as it would have without this block. It must be used in the main
+    thread, because Python allows signal handlers only there.
 
     Parameters
     ----------

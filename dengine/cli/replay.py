@@ -90,7 +90,7 @@ class PlayedTasks(NamedTuple):
         seconds : wall time. core_seconds : of one core, over all replays. kept : how many replays
         had been kept by an earlier run.
     error : BaseException or None
-        What left some out, Ctrl-C among others.
+        The error or Ctrl-C that ended the work early; None if all tasks were played.
     """
 
     replays: list[Replay]
@@ -101,8 +101,8 @@ class PlayedTasks(NamedTuple):
 def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
     """Play the tasks with a progress bar; return the finished replays and the time they took.
 
-    Ctrl-C or an error ends the work and raises nothing: those that were finished until then are
-    returned, with the error, which the caller passes to `_end`.
+    Ctrl-C or an error ends the work and is not raised: the replays that were finished until then
+    are returned, with the error, which the caller must pass to `_end`.
     """
     from ..experiments.grid import iterate_replays
 
@@ -131,10 +131,10 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
-    """End the verb if an error or Ctrl-C interrupted its replays; for None do nothing.
+    """End the verb if an error or Ctrl-C interrupted its replays; do nothing if `error` is None.
 
-    After Ctrl-C the text, which says what is shown, is printed to stderr, and the exit code is 130.
-    Any other error is raised; before that the text is printed, too, if something is shown.
+    `text` says which replays are shown. After Ctrl-C it is printed to stderr, and the exit code is
+    130. Any other error is raised; before, `text` is printed to stderr if `is_shown`.
     """
     if isinstance(error, KeyboardInterrupt):
         exit_interrupted(text)
@@ -150,7 +150,7 @@ _SHUFFLES = "Number of shuffled replays of each recipe."
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
     """Return a decorator that adds the options of how streams are played.
 
-    They are handed on as one `Stream`, the verb's argument `stream`. `--repeats` beside
+    The verb gets them as one `Stream`, its argument `stream`. `--repeats` together with
     `--in-order` is a usage error.
 
     Parameters
@@ -158,7 +158,8 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
     repeats, n_jobs : int
         Defaults of `--repeats` and `--n-jobs`.
     least : int
-        Smallest number of repeats; above 1 there is no `--in-order`, which plays one.
+        Smallest number of repeats. If it is above 1, there is no option `--in-order`, because that
+        plays the stream only once.
     text : str
         Help of `--repeats`.
     """
@@ -287,8 +288,8 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Methods are reducers and baselines, under one policy or a grid of policies: a setting is given
-    as one value, such as --alpha, or as a list to try, such as --alphas, not both. For each method
+    Methods are reducers and baselines. They are played under one policy or a grid of policies: give
+    a setting either as one value (--alpha) or as a list to try (--alphas). For each method
     the output is that of `dengine replay`. umap-learn takes much longer than the others. Ctrl-C, or
     an error in a replay, ends it and shows the replays that were finished.
     """
@@ -393,9 +394,10 @@ def _group_replays(
 
 
 def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> str:
-    """Return the title of tables and pictures: who played what, how often, and how many cycles.
+    """Return the title of tables and pictures.
 
-    The bundled data set is called "simulated insertions".
+    It names the recipes and baselines, the data set, the order of the parts, the number of replays
+    of each, and the number of cycles. The bundled data set is called "simulated insertions".
     """
     counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
     n_cycles = len(next(iter(by_name.values()))[0])
@@ -409,10 +411,10 @@ def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> st
 def _replay_files(
     frame: pd.DataFrame, replays: Sequence[Replay], title: str
 ) -> Iterator[tuple[str, Any]]:
-    """Yield (file name, content) of what `--out` keeps.
+    """Yield the name and the content of each file that `--out` writes.
 
-    These are the CSV of all replays, their curves, and a map of the first replay of each recipe; a
-    baseline embeds no traces and has none.
+    These are a table of all replays, their curves, and for each recipe a map of the embedding in
+    its first replay. There is no map if no trace was embedded, such as in a baseline's replay.
     """
     import numpy as np
 
@@ -520,13 +522,13 @@ def costs(
 ) -> None:
     """Find out, by three prices, which policy pays.
 
-    Shows what a part of your recordings costs under the policies that pay most, and what it costs
-    if everything is verified. Says how certain these costs are, and how to set the policy. If no
-    policy pays or may pay, the choice is to verify everything, and the output names no policy. It
-    tries levels of LB, the --lower-bound, around break-even, where accepting costs as much as
-    verifying, and the guarantees pooled and cost. All costs are in one unit, such as seconds of
-    production or money. Ctrl-C, or an error in a replay, ends it and shows what was finished, if at
-    least two shuffles are finished.
+    Shows what a part of your recordings costs under the best policies, and what it costs if
+    everything is verified. Says how certain these costs are, and how to set the policy. If no
+    policy pays or may pay, the choice is to verify everything, and the output names no policy. The
+    policies that are tried have the guarantees pooled and cost, or levels of LB, the --lower-bound,
+    around break-even, where accepting costs as much as verifying. All costs are in one unit, such
+    as seconds of production or money. Ctrl-C, or an error in a replay, ends it and shows what was
+    finished, if at least two shuffles are finished.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of
@@ -594,9 +596,10 @@ def costs(
 
 
 def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
-    """Return the sentences below the table of a cost curve: what was chosen, and how that depends
-    on the prices; repeated recordings, policies that the first shuffles left behind, and those not
-    tried.
+    """Return the sentences below the table of a cost curve.
+
+    They say which policy was chosen, how the choice depends on the prices, how many recordings
+    repeat another, which policies were dearer in the first shuffles, and which were not tried.
     """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset
@@ -639,9 +642,9 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
 
 def _error_cell(error: ErrorRate) -> str:
-    """Return "wrong of decided" with the interval of the share in a second line.
+    """Return "wrong of decided", like "3 of 120", with the interval of the share in a second line.
 
-    It is "-" without decisions.
+    It is "-" if there was no decision.
     """
     if not error.decided:
         return "-"

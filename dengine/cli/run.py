@@ -42,7 +42,7 @@ STRETCHES = 6  # rows of the table
 
 
 class CellToDrive(NamedTuple):
-    """The contract of a cell's traces, and a function that makes the cell for an engine.
+    """The `TraceSpec` of a cell, and a function that makes the cell for an engine.
 
     The function returns the cell and its name for people.
     """
@@ -220,11 +220,11 @@ def _safe_mode_line(change: Record) -> str:
 def _simulated_cell(
     scenario: str, cycles: int, check_seconds: float, source: DataChoice, **others: Any
 ) -> CellToDrive:
-    """Return what makes the simulated cell.
+    """Return the `TraceSpec` of the simulated cell, and a function that makes the cell.
 
-    Its seed, which grows with the decisions in the store and differs between the cells of a
-    product, which share labels, gives parts that the store has not seen. A verification takes
-    `check_seconds` of simulated time.
+    The `TraceSpec` has what the options of `source` state; the rest is the simulation's own. The
+    cell's seed depends on the number of decisions in the store, and in a product also on the cell,
+    so that no part comes twice. A verification takes `check_seconds` of simulated time.
     """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
@@ -247,12 +247,12 @@ def _simulated_cell(
 
 
 def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
-    """Return what makes a cell that plays a recording from the part after the last one that was
-    played before.
+    """Return the `TraceSpec` of a recording, and a function that makes a cell which plays it.
 
-    Played before are parts whose trace has a label of this cell in the store, and its newest
-    accepted part without a report. The recording is loaded at once. Making the cell raises
-    SettingError if fewer parts than `cycles` are left.
+    The cell begins after the last part that was played before. A part was played before if its
+    trace has a label of this cell in the store, or if it is this cell's newest accepted part
+    without a report. The recording is loaded at once. Making the cell raises SettingError if fewer
+    parts than `cycles` are left.
     """
     import numpy as np
 
@@ -289,15 +289,17 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
 
 
 def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
-    """Return what connects to a Universal Robots controller and makes its cell.
+    """Return the `TraceSpec` of a robot, and a function that connects to it and makes its cell.
+
+    The robot is a Universal Robots controller.
 
     Raises
     ------
     SettingError
         No host, a port that is no number, or an option that the recorder does not take.
     CellError
-        When the cell is made: the controller cannot be reached, or its program is not ready in
-        time.
+        Raised by the function, when it makes the cell: the controller cannot be reached, or its
+        program is not ready in time.
     """
     from ..cells.ur.cell import UrCell
 
@@ -355,9 +357,9 @@ COLUMNS = {  # title -> count of a stretch
 def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> None:
     """Print the result of a run: a table of stretches, the cell's own report, and sentences.
 
-    These say what was saved, how the retrains went, when safe mode was on, and the certificate.
-
-    Adds the counts to `record`, which `--json` prints, and writes run.csv and run.png to `out`.
+    The sentences say how much time was saved, how the retrains went, when safe mode began and
+    ended, and what the certificate is. The counts are added to `record`, which `--json` prints in
+    place of all that. run.csv and run.png are written to `out`.
     """
     from ..experiments.figures import curves
     from ..experiments.metrics import Costs

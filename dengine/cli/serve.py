@@ -122,13 +122,13 @@ def serve(
     """Answer robots, controllers and people.
 
     Continues with its store, or starts a new one, and retrains in a separate process. It runs until
-    SIGTERM or Ctrl-C, which end it in order, with exit code 0: requests in line are answered, and
+    SIGTERM or Ctrl-C, which end it in order, with exit code 0: waiting requests are answered, and
     everything known is written. --shadow stays in force in the store, until `dengine policy STORE
     --shadow off`. --demo plays recorded parts as a robot would, with a deadline of 5 s or more. It
     keeps them in a new --store, or without --store forgets them at the end. Without --token-file,
     programs on the same machine need no token. Other machines reach it only with --host, which
     needs --token-file, and should have --cert and --key. --samples, --rate-hz, --unit, --channels
-    and --fit are the contract of traces. Without them a new store takes the form of its first
+    and --fit say what a trace looks like. Without them a new store takes the form of its first
     trace, and rate and unit are unknown; with --robot, it takes 1000 samples at 500 Hz.
     """
     if deploy is not None:
@@ -193,8 +193,8 @@ def _open_engine(
 ) -> "DataEngine":
     """Open the engine that the server drives, or create it with its store, and return it.
 
-    The engine logs when safe mode begins or ends. With `shadow` the shadow mode is turned on, and
-    the store keeps that.
+    The engine trains in `executor`, and logs when safe mode begins or ends. If `shadow` is True,
+    shadow mode is turned on, and stays on in the store.
     """
     from ..engine.engine import DataEngine
     from ..serve.server import log_safe_mode

@@ -56,9 +56,9 @@ def status(store: str, last: int, check_seconds: float) -> None:
 
     STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`. If
     it holds several cells and none is named, they are listed; cells of one product share labels and
-    versions. The interval of bad accepted parts is valid if you read it once, the certificate
-    however often you read it. If the model was certain of parts that were verified, as in shadow
-    mode, a line says how much time it would have saved, by `--check-seconds`.
+    versions. The interval of bad accepted parts is valid if you look once; the certificate is valid
+    however often you look. If the model was certain of parts that were verified, as in shadow mode,
+    a line says how much time the model would have saved, at `--check-seconds` for each check.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable
@@ -108,10 +108,11 @@ def _overview_table(store: str, report: "Status") -> Any:
 
 
 def _present_rows(report: "Status") -> list[tuple[str, str]]:
-    """Return (title, text) rows of what holds now, an alarm first.
+    """Return (title, text) rows on the present state of the engine, an alarm first.
 
-    They are the cell, the settings, the contract of traces, the certificate, the last and the worst
-    retrain, and the newest events, the newest first.
+    They are the cell, the settings, the `TraceSpec`, the certificate, the last and the slowest
+    retrain, and the newest events, the newest first. The recipe is left out if the model was handed
+    in by the user, because the recipe has no effect on it.
     """
     rows = []
     if report.alarm:
@@ -155,7 +156,8 @@ def _without_audits(counts: dict[str, int]) -> dict[str, int]:
 def _span_cell(name: str, span: "Span") -> str:
     """Return the text of a span's field: a time, a number, or a share of errors and its verdict.
 
-    A sentence stands in place of a share of nothing, or of one that another row shows too.
+    A few words replace the share if there is none, because no part was accepted, or if the row of
+    bad accepted parts shows the same share.
     """
     value = getattr(span, name)
     if name in ("first", "last"):
@@ -170,15 +172,16 @@ def _span_cell(name: str, span: "Span") -> str:
 
 
 def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
-    """Return a text on the share of wrong decisions: counts, interval and verdict on the tolerance;
-    or that none is known.
+    """Return a text on the share of wrong decisions: counts, interval, verdict on the tolerance.
+
+    If no outcome is known and nothing can be said, the text says so.
 
     Parameters
     ----------
     estimate : ErrorEstimate
-        The interval of the share, and what it rests on.
+        The interval of the share, and the outcomes that it is computed from.
     n_stops : int
-        Line stops, which stand first in the text if the share does not include them; 0 names none.
+        Number of line stops. The text begins with it, unless it is 0 or the share includes them.
     """
     stops = ""
     if n_stops and estimate.basis != "every outcome":

@@ -66,12 +66,12 @@ def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
 def _change_and_print(
     change: Callable[[DataEngine, str], Changed], store: str, author: str, allow_import: bool
 ) -> None:
-    """Open the store's engine, let `change` change it for the author, and print what changed.
+    """Open the store's engine, call `change` with it and the author, and print what changed.
 
-    `change` returns a `Changed`, which says so in words; the other arguments are `store_options`.
-    The engine is closed before that is printed. If nothing changed, that is printed. Raises
-    StoreError if another engine owns the cell, as while it runs, and what `change` raises. The JSON
-    document also has the policy and the certificate after the change.
+    `change` returns a `Changed`, whose text is printed after the engine was closed; it may say that
+    nothing changed. The JSON document also has the policy and the certificate after the change. The
+    other arguments are those that `store_options` adds to a verb. Raises StoreError if an engine
+    runs on the cell, and whatever `change` raises.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -97,12 +97,12 @@ def report(part: str, label: str, **changing: Any) -> None:
     """Report whether a part was good or bad.
 
     Name the part by its number, or by the id of its decision. The number is enough if the part has
-    one decision, or one that is no reject. An accepted part that was bad is a line stop; a rejected
-    one that was examined afterwards is an inspection, and the engine trains on its label. An event
-    records it. The same label again changes nothing. Another label than the reported one is refused
-    with exit code 1, unless it is a line stop; `dengine correct` puts a wrong label right. The verb
-    is refused while an engine runs on the cell. A store that names a reducer or rule of your own,
-    module:Class, needs --allow-import.
+    one decision, or one that is no reject. For an accepted part, bad is a line stop, and good a
+    confirmation. For a rejected part the label is that of an inspection, and the engine trains on
+    it. An event records the report. The same label again changes nothing. Another label than the
+    reported one is refused with exit code 1, unless it is a line stop; `dengine correct` puts a
+    wrong label right. The verb is refused while an engine runs on the cell. A store that names a
+    reducer or rule of your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -200,12 +200,13 @@ def release(**changing: Any) -> None:
 def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool) -> None:
     """Show the policy in force, or change it.
 
-    Without options it is shown, while an engine may run; a change is refused while an engine runs
-    on the cell. What is not given stays as it is. Earlier decisions keep their bounds. The
-    certificate starts again after any change. After a change of the tolerance, such as --alpha, the
-    rule also forgets what it learned, because a tolerance that is chosen after the data was seen
-    needs fresh evidence. Shadow mode lasts over restarts; `dengine status` counts what the model
-    would have done, and how much was wrong.
+    Without options it is shown, even while an engine runs on the cell; a change is refused then. A
+    setting that is not given stays as it is. Earlier decisions keep their bounds. The certificate
+    starts again after any change. The rule also forgets what it learned, after a change of --alpha,
+    --lower-bound, --interval, --guarantee, --stops or --prices, and with some guarantees of
+    --audit-rate: a tolerance that is chosen after the data was seen needs fresh evidence. Shadow
+    mode lasts over restarts; `dengine status` counts what the model would have done, and how much
+    of it was wrong.
     """
     if settings:
         _change_and_print(
@@ -285,9 +286,9 @@ def verify(
     """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
-    the rows, with its rows. The verb lists what was changed, what is missing and what is in no
-    entry, and data that was lost; the exit code is then 1. It writes only with --acknowledge, and
-    engines may run meanwhile.
+    the rows, with its rows. The verb lists rows that were changed, that are missing or that are in
+    no entry, and data that was lost. If there are any, the exit code is 1. The verb writes only
+    with --acknowledge, and engines may run meanwhile.
     """
     from ..store.sql import SqlStore
     from ..store.verification import verify_history
@@ -414,8 +415,8 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     """Import the labels of a cell program into the store.
 
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
-    imported. If a line was changed or is missing, the lines before it are imported and the others
-    are set aside, with exit code 1. A file that is no journal, has a line that cannot be read, or
+    imported. If a line was changed or is missing, the lines before it are imported, the others are
+    not, and the exit code is 1. A file that is no journal, has a line that cannot be read, or
     belongs to another model (unless --any-model) is refused as a whole. The verb is refused while
     an engine runs on the cell.
     """

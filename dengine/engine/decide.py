@@ -80,7 +80,7 @@ class DecisionMaker:
             if agreed is None and store.product is not None:
                 agreed = self._outbox.call_store(lambda: read_peers_trace_spec(store))
         except StoreError:  # the cell's own first trace stands
-            log.exception("the product's contract of traces cannot be had")
+            log.exception("the product's TraceSpec cannot be read")
         spec = spec if agreed is None else agreed.completed(spec)
         if spec != present.trace:
             self._settings.change(replace(present, trace=spec))

@@ -93,8 +93,8 @@ class Baseline(ABC):
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Train from scratch and return self.
 
-        With labels of one class, or too few for the method, it is untrained afterwards, and every
-        part is verified.
+        If the labels are of one class, or too few for the method, the baseline is untrained
+        afterwards, and every part is verified.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class Baseline(ABC):
     def add(self, x: ArrayLike, y: Any) -> Self:
         """Learn one trace (C, T) with its label, 1 for success, and return self.
 
-        Nothing is learned before a training has succeeded, or if the method has no such step.
+        Nothing is learned before a training has succeeded, or if the method learns only in `fit`.
         """
         self._last = None
         if self.is_trained:
@@ -139,9 +139,9 @@ class Baseline(ABC):
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """Return an `Action` for each trace of X (n, C, T), as an array of objects, shape (n,).
 
-        ACCEPT where the lower bound reaches the accept threshold, REJECT where the upper bound is
-        at or below the reject threshold, else VERIFY. These are `thresholds`, or LB and 1 - LB
-        where that is None.
+        It is ACCEPT if the lower bound is at least the accept threshold, REJECT if the upper bound
+        is at most the reject threshold, and otherwise VERIFY. `thresholds` has both; if it is None,
+        they are LB and 1 - LB.
         """
         from ..decision.rule import action_of
 
@@ -155,11 +155,11 @@ class Baseline(ABC):
         return np.array([ACTIONS[number] for number in numbers], dtype=object)
 
     def predict(self, X: ArrayLike) -> BaselinePrediction:
-        """Return bounds and counts of labels for traces X (n, C, T), as a `BaselinePrediction`.
+        """Return bounds of the success probability, and counts of labels, for traces X (n, C, T).
 
-        The last one is cached, and returned again for the same traces until a training or an `add`.
-        Before a training has succeeded the bounds are 0 and 1. Without labels to count, as then,
-        both counts are the integer 0, not arrays.
+        The last result is cached: it is returned again for the same traces until the next `fit` or
+        `add`. Before a training has succeeded, all bounds are 0 and 1. A baseline that counts no
+        labels returns the integer 0, and no array, for both counts; so does an untrained one.
         """
         traces = as_traces(X)
         key = traces.tobytes()
@@ -271,7 +271,7 @@ class AgreeingNeighbours(Baseline):
         self._references.add(_rows(X), good)
 
     def _predict(self, X: Traces) -> BaselinePrediction:
-        """Return bounds, both the share of successes among the k nearest, and counts of these k."""
+        """Return the share of successes among the k nearest as both bounds, with their counts."""
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)
@@ -309,7 +309,7 @@ class ScaledComponents:
         -------
         Z : array, shape (n, d), or None
             The scaled components of these traces. None if there are no more traces than components,
-            or fewer samples in a trace than components; components and scale are not changed then.
+            or fewer samples in a trace than components; then nothing is changed.
         """
         try:
             components = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)
@@ -363,7 +363,8 @@ class WilsonKernelDensity(Baseline):
     def _fit(self, X: Traces, good: Labels) -> bool:
         """Find the components and the bandwidth; return False if there are too few traces.
 
-        All traces become references. A bandwidth that was not given is chosen by the newest 1,000.
+        All traces become references. If no bandwidth was given, it is chosen by the labels of the
+        newest 1,000 traces.
         """
         Z = self._components.fit(X)
         if Z is None:
@@ -410,7 +411,7 @@ def kernel_counts(distances: Floats, good: Labels, bandwidth: float) -> tuple[Fl
 def choose_bandwidth(references: LabelledPoints, alpha: float) -> float:
     """Return the bandwidth among `BANDWIDTHS` under which the references' labels are most likely.
 
-    Each label is left out in turn when its probability is computed, as the centre of Wilson's
+    The probability of each label is computed from the other labels, as the centre of Wilson's
     interval at error level `alpha`.
     """
     z = normal_quantile(alpha)
@@ -505,11 +506,11 @@ def risk_bound(n_wrong: int, n: int, delta: float) -> float:
 
 
 def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: float) -> float:
-    """Find the least confidence from which on a classifier errs with at most the given risk.
+    """Find the lowest confidence above which a classifier errs with at most the given risk.
 
-    With probability 1 - delta over these traces the risk beyond the threshold is at most `risk`, if
-    they are independent draws from what will be decided: ceil(log2 m) thresholds are tried by
-    bisection, each with its share of delta.
+    If these traces and the later ones are independent draws from one distribution, then with
+    probability 1 - delta the share of errors at or above the threshold is at most `risk`.
+    ceil(log2 m) thresholds are tried by bisection, each with an equal share of delta.
 
     Parameters
     ----------
@@ -600,8 +601,9 @@ class RocketSelective(Baseline):
     def _fit(self, X: Traces, good: Labels) -> bool:
         """Train on some labels and set `thresholds` by the others; return whether it trained.
 
-        It needs both classes among the labels that train, and one label at least to choose on. A
-        side without a guaranteed threshold gets an infinite one and is never decided.
+        It needs both classes among the labels to train on, and at least one other label. If no
+        threshold can be guaranteed for accepting, or for rejecting, an infinite one is set, so that
+        no part is decided that way.
         """
         order = np.random.default_rng(self.seed).permutation(len(X))
         n_held_out = round(self.holdout * len(X))
@@ -651,8 +653,8 @@ BASELINES: dict[str, type[Baseline]] = {
 def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Baseline:
     """Make an untrained baseline for `DataEngine(model=...)`.
 
-    Its library is imported and compiled here, so that no training is timed with that; aeon takes a
-    minute the first time.
+    Its library is imported and compiled here, so that no training is timed with that; for
+    "minirocket" this takes a minute the first time.
 
     Parameters
     ----------
@@ -668,8 +670,8 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
     Raises
     ------
     SettingError
-        An unknown name or parameter, a value out of range (but `n_components` and `C`, which only
-        the training checks), or a library that is not installed.
+        An unknown name or parameter, a value out of range, or a library that is not installed.
+        `n_components` and `C` are checked only by the training.
     """
     require_baseline(name)
     kind = BASELINES[name]

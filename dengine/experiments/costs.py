@@ -114,8 +114,8 @@ class Missing:
     Attributes
     ----------
     accepted, seen : int
-        Different accepted parts that would show it, and as how many independent ones those of the
-        recordings count.
+        Number of different accepted parts that would show it, and the number of independent parts
+        for which the accepted parts of the recordings count.
     recordings, production : int
         Further recordings, or parts of production, that bring them.
     audit_rate : float
@@ -139,8 +139,8 @@ class CostCurve:
     rows : tuple of PolicyCost
         The policies that played the shuffles that are reported, the cheapest first.
     marked : PolicyCost
-        The cheapest of `rows`, or one that let fewer bad parts through and is not dearer beyond
-        chance.
+        The best of `rows`: the cheapest, or a row that let fewer bad parts through and is not
+        significantly dearer.
     verdict : str
         "pays" if the whole interval of the marked policy is below the cost of verifying
         everything, "does not pay" if its mean or its expected cost is not, else "may pay".
@@ -157,7 +157,8 @@ class CostCurve:
     cycles, shuffles : int
         Parts of each shuffle, and number of shuffles that are reported.
     fresh : bool
-        Whether they chose nothing; False if the search was interrupted before.
+        Whether the reported shuffles are fresh: no policy was chosen by them. False if the search
+        was interrupted before it could play fresh ones.
     """
 
     costs: Costs
@@ -185,7 +186,7 @@ class CostCurve:
     def missing(self) -> Missing | None:
         """How many more parts would turn "may pay" into "pays".
 
-        None for another verdict, and if more than `MOST_MORE` times the recordings are needed.
+        None if the verdict is another, or if `MOST_MORE` times as many recordings are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -229,9 +230,10 @@ class CostCurve:
 
     @property
     def sentence(self) -> str:
-        """The verdict for people: the marked policy, its cost with the interval, what is missing.
+        """The verdict for people: the best policy, its cost with the interval, what is missing.
 
-        If another policy is cheaper, but not beyond chance, it says so.
+        It says "Nothing pays" if no policy pays or may pay. It also says if another policy is
+        cheaper, but not significantly, and if the search was not finished.
         """
         row = self.marked
         cheapest = self.rows[0]
@@ -282,9 +284,9 @@ class CostCurve:
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each policy that was played.
 
-        It has costs, shares and error rates, `chosen`, True for the policy that pays or may pay,
-        and `reported`, False for those that were left behind. Shares are from 0 to 1, costs in the
-        user's unit.
+        It has costs, shares and error rates. `chosen` is True for the policy that pays or may pay,
+        if there is one. `reported` is False for the policies that were left behind. Shares are from
+        0 to 1, costs in the user's unit.
         """
         import pandas as pd
 
@@ -299,7 +301,10 @@ class CostCurve:
 
 
 def policy_name(policy: Policy) -> str:
-    """Return a policy's name for people: its lower bound LB, and alpha or the guarantee."""
+    """Return a policy's name for people, like "alpha 0.1, LB 95 %" or "pooled, LB 95 %".
+
+    Under the guarantee "cost" it is only "the cost guarantee".
+    """
     if policy.guarantee == "cost":
         return "the cost guarantee"
     kind = f"alpha {policy.alpha:g}" if policy.guarantee == "local" else policy.guarantee
@@ -307,10 +312,11 @@ def policy_name(policy: Policy) -> str:
 
 
 def settings_of(policy: Policy) -> dict[str, Any]:
-    """Return the settings by which `Policy` makes this one, except its interval and windows.
+    """Return the settings that tell a candidate from others, as keyword arguments of `Policy`.
 
-    They are alpha, lower_bound and guarantee, or under the guarantee "cost" the prices, which imply
-    these; and audit_rate and stops if they are not the defaults.
+    They are alpha, lower_bound and guarantee, or only the prices under the guarantee "cost", since
+    the prices imply the other three. audit_rate and stops are added if they are not the defaults.
+    The interval, the force limits and all other settings are left out.
     """
     names = ["alpha", "lower_bound", "guarantee"]
     if policy.guarantee == "cost":
@@ -425,10 +431,11 @@ class PolicySearch:
             self.remaining.append(candidate)
 
     def run(self, play: Play) -> None:
-        """Halve the candidates in rounds, and let the last ones play fresh shuffles.
+        """Halve the candidates in rounds, and let the last two play fresh shuffles.
 
-        While more than two remain, they play two shuffles, and the dearer half is left behind. It
-        shortens `remaining` and keeps the replays, of which `curve` makes the result. Call it once.
+        While more than two remain, they play two shuffles, and the dearer half is removed from
+        `remaining`. The replays are kept, and `curve` computes the result from them. Call this
+        once.
 
         Parameters
         ----------
@@ -450,9 +457,9 @@ class PolicySearch:
     def _play(self, play: Play, seeds: range, scores: Contender | None) -> bool:
         """Play the remaining candidates over some seeds, and keep their replays.
 
-        With `scores`, one engine that checks every part is replayed for each seed, and each
-        candidate's rule decides on its predictions (`replay_policy`); without, each candidate has a
-        replay of its own. Returns whether all was played.
+        If `scores` is None, each candidate has a replay of its own for each seed. Otherwise only
+        `scores`, a contender in shadow mode, is replayed, and each candidate's rule decides on its
+        predictions (`replay_policy`). Returns whether all tasks were played.
         """
         players = [scores] if scores else self.remaining
         tasks = [Task(player, seed, self._cycles) for seed in seeds for player in players]
@@ -479,10 +486,10 @@ class PolicySearch:
     def curve(self) -> CostCurve | None:
         """Return the cost curve of what was played; nothing is played here.
 
-        Only shuffles count that every policy in `remaining` has finished. They are the fresh ones,
-        by which no policy was left behind, or if fewer than two of these are finished, as after an
-        interruption, those by which policies were left behind (`fresh` is False then). None if
-        there are fewer than two of these as well.
+        A shuffle counts if every policy in `remaining` has finished it. The curve is computed from
+        the fresh shuffles, by which no policy was left behind. If fewer than two of them count,
+        because the search was interrupted, it is computed from the earlier shuffles, and `fresh`
+        is False. If fewer than two of these count, too, the result is None.
         """
         played = {c.recipe.policy: self._replays[c.recipe.policy] for c in self.remaining}
         behind = [self._row(policy) for policy in self._replays if policy not in played]
@@ -498,14 +505,16 @@ class PolicySearch:
 def candidates(
     contender: Contender, costs: Costs, alphas: Sequence[float], lower_bounds: Sequence[float]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the settings of a contender's policy that are to be tried, as keyword arguments.
+    """Yield the settings of each policy that is to be tried, as keyword arguments.
 
     First come all pairs of an alpha and a lower bound LB (the success probability that accepted
-    parts must have), for the contender's own rule or else for the guarantee "local". Then come
-    "pooled" at a few LBs, and "cost" once; both are left out for an own rule and for a baseline,
-    and if line stops alone tell of accepted parts and no audits are set, they get 5 %. Without
-    `alphas` there is one, `ALPHA`, and without `lower_bounds` there are levels around the LB at
-    which accepting breaks even, where 1 - LB is check / escape.
+    parts must have) for the guarantee "local", or for the user's own rule if the contender has one.
+    Then come "pooled" at a few LBs, and "cost" once, but not for a user's own rule or a baseline.
+    If stops="some" and no audits are set, these two get an audit rate of 5 %, because they need
+    outcomes of accepted parts.
+
+    If `alphas` is empty, it is `ALPHA` alone. If `lower_bounds` is empty, LBs are taken around
+    break-even, where 1 - LB is check / escape.
     """
     policy = contender.recipe.policy
 
@@ -533,11 +542,12 @@ def candidates(
 
 
 def needed_parts(policy: Policy) -> int:
-    """Return how many good parts a policy needs before it can accept one.
+    """Return the least number of good parts that a policy needs before it can accept a part.
 
-    For "local" they are labels near a trace, z^2 LB / (1 - LB) of them with Wilson's interval; for
-    "pooled" parts in a row that score high enough and are good, until the evidence for them
-    suffices at error level alpha. It is 0 for others.
+    For "local" this is the number of good labels near a trace, z^2 LB / (1 - LB) with Wilson's
+    interval. For "pooled" it is the number of good parts, without a bad one, whose score reaches
+    the threshold, until there is enough evidence at error level alpha. For other guarantees it is
+    0.
     """
     if policy.guarantee == "local":
         counts = range(1, MOST_NEIGHBOURS)
@@ -575,9 +585,9 @@ def cost_curve(
         unit.
     recipe : object, default "conv"
         Anything `Contender.load` takes. Guarantee (the rule by which a policy decides), alpha,
-        lower_bound and prices of its policy are replaced. The guarantees "pooled" and "cost" must
-        hear of accepted parts: if it has no audits (checks of parts that the model is certain of),
-        and `stops` is "some", they get 5 %.
+        lower_bound and prices of its policy are replaced. If its policy has no audits (checks of
+        parts that the model is certain of) and stops="some", the guarantees "pooled" and "cost" get
+        an audit rate of 5 %, because they need outcomes of accepted parts.
     n_jobs : int, default 1
         Replays at a time, as joblib counts them.
     keep : path or None, default None
@@ -615,9 +625,9 @@ def curve_of(
     out_of_reach: tuple[str, ...] = (),
     fresh: bool = True,
 ) -> CostCurve:
-    """Return the cost curve of each policy's replays, all of the same shuffles.
+    """Return the cost curve of some policies, from the replays of each, all of the same shuffles.
 
-    The other parameters are the fields of `CostCurve` with these names.
+    `left_behind`, `out_of_reach` and `fresh` become the fields of `CostCurve` with these names.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
@@ -646,10 +656,12 @@ def curve_of(
 
 
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
-    """Return the rows of a curve, the marked one and its verdict; see `CostCurve`.
+    """Return the rows of a cost curve, the best row, and the verdict on it; see `CostCurve`.
 
-    The marked one is the cheapest, or a safer one: a row that accepts fewer bad parts, is not
-    dearer than the cheapest beyond chance, and whose expected cost is below the check's.
+    There is a row for each policy in `groups`, the cheapest first. The best row is the cheapest,
+    unless there are rows that accept fewer bad parts, are not significantly dearer, and have an
+    expected cost below the price of a check: then it is the row of these that accepts fewest bad
+    parts. The verdict is "pays", "may pay" or "does not pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
@@ -721,10 +733,10 @@ def _order_error(means: Floats) -> float:
 def _difference(
     first: Sequence[Replay], other: Sequence[Replay], costs: Costs
 ) -> tuple[float, float]:
-    """Return how much dearer a part is under one policy than under another, and its error.
+    """Return how much dearer a part is under one policy than under another, and its standard error.
 
-    Both have played the same shuffles. The standard error has the variance between parts, each
-    with its sum over the shuffles, and between shuffles.
+    Both policies have played the same shuffles. The standard error adds the variance between parts,
+    whose differences are summed over the shuffles first, and the variance between shuffles.
     """
     differences = np.array(
         [

@@ -137,14 +137,13 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
 
 
 def embedding_map(replay: Replay, title: str = "") -> Figure:
-    """Draw where the newest 300 parts of a replay lie, left by truth and right by decision.
+    """Draw the embeddings of a replay's newest 300 parts, by truth (left) and decision (right).
 
-    Each part is drawn where it lay when it was decided, though each retrain moves the map; those
-    that no model embedded are left out, on the left also those of unknown truth. The first two
-    dimensions are drawn, the mean over the spaces, in equal units; a circle is the neighbourhood of
-    the newest part drawn, with the recipe's radius. If the first dimension is a probability, the
-    second is small against the radius: then the cycle stands in its place, and two lines bound the
-    neighbourhood.
+    A point is the mean over the embedding spaces of the folds, in its first two dimensions, as it
+    was at the decision; later retrains do not move it. Parts that no model embedded are left out,
+    on the left also parts of unknown truth. A circle with the recipe's radius is the neighbourhood
+    of the newest point. If the first dimension is a probability, the second says little: the
+    vertical axis is then the cycle, and two vertical lines bound the neighbourhood.
 
     Parameters
     ----------
@@ -200,9 +199,9 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
 
 
 def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip: bool) -> None:
-    """Draw the neighbourhood of a point (2,), a cross, into all axes, and a legend below.
+    """Draw a point (2,) as a cross, and its neighbourhood, into all axes, and a legend below.
 
-    It is a circle, or a strip between two lines.
+    The neighbourhood is a circle, or a strip between two vertical lines if `is_strip`.
     """
     from matplotlib.patches import Circle
 
@@ -233,11 +232,12 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     Returns
     -------
     curves : DataFrame
-        A row for each cycle, in percent, over the window that ends there. certain : parts that the
-        model accepted or rejected, of all cycles, the mean over the replays. certain_low,
-        certain_high : its 10th and 90th percentile over the replays. precision, false_positive :
-        good and bad ones of the accepted parts in the windows of all replays together.
-        false_negative : good ones of the rejected parts.
+        A row for each cycle. Each column is a share in percent, over the window that ends with the
+        cycle. certain : the share of parts that the model accepted or rejected, the mean over the
+        replays. certain_low, certain_high : its 10th and 90th percentile over the replays.
+        precision, false_positive : the shares of good and of bad parts among the accepted parts,
+        counted in the windows of all replays together. false_negative : likewise, the share of
+        good parts among the rejected parts.
     """
     import pandas as pd
 
@@ -269,9 +269,9 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
     """Draw the paper's curves, with a colour for each key: replays of a recipe, or a live run.
 
-    From the top: the share of certain decisions, those without a check, and its spread over the
-    replays; the precision of the accepted ones, and the policy's lower bound LB; the errors, bad
-    parts as a share of the accepted ones (solid) and good parts as a share of the rejected ones
+    The panels show, from the top: the share of certain decisions, those without a check, and its
+    spread over the replays; the share of good parts among the accepted parts, and the policy's
+    lower bound LB; bad parts among the accepted parts (solid), good parts among the rejected parts
     (dashed), and the tolerance 100 - LB. The legend below has the counts. Shares of fewer than
     `FEWEST` parts are not drawn. The window is `WINDOW` cycles, or a third of the longest replay if
     that is less.
@@ -279,7 +279,7 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     Parameters
     ----------
     by_recipe : mapping of str to sequence of Replay
-        Those of one recipe are equally long.
+        The replays of one recipe are equally long.
     title : str, default ""
 
     Returns
@@ -338,9 +338,10 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
 def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     """Draw what a part costs under each policy, the cheapest at the top.
 
-    A line marks the cost of checking everything, and a ring the chosen policy. Policies that were
-    left behind are hollow: their costs are of other shuffles. An interval that leaves the axes ends
-    in an arrow with its value. On the right stands the share of parts decided without a check.
+    A line marks the cost of checking everything, and a ring the chosen policy, if one pays or may
+    pay. Policies that were left behind are hollow, because their costs are of other shuffles. An
+    interval that leaves the axes ends in an arrow with its value. The right panel shows the share
+    of parts that were decided without a check.
 
     Parameters
     ----------
@@ -405,8 +406,8 @@ def explained_picture(explanation: Explanation) -> Figure:
 
     It has a panel for each channel, of at most four, those that leave the envelope most. The
     envelope is the band in which 95 % of the successes lie at each sample. Stretches in which the
-    trace leaves it by more than a tenth of its width are shaded. Without an envelope only the
-    traces are drawn.
+    trace leaves the envelope by a tenth of its width or more are shaded. Without an envelope only
+    the traces are drawn.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -469,9 +470,9 @@ def _draw_band(
 def data_picture(data: Dataset, title: str = "") -> Figure:
     """Draw a data set's traces, and how it changes in its order; return the figure.
 
-    Above, a panel for each channel, of at most three: the median trace of good and of bad parts,
-    and where the middle 80 % lie. Below: the share of good parts, and the mean of each trace's
-    first channel, in recorded order. Traces that are not finite are not drawn.
+    Above, a panel for each of the first three channels shows the median trace of good and of bad
+    parts, and where the middle 80 % lie. Below are the share of good parts, and the mean of each
+    trace's first channel, in recorded order. Traces that are not finite are not drawn.
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
@@ -495,7 +496,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: str) -> None:
     """Draw the share of good parts in a sliding tenth of the set, and each finite trace's mean.
 
-    The mean is that of the first channel, over the trace; `label` names it and its unit.
+    The mean is taken over the samples of the first channel; `label` names the channel and its unit.
+    `figure` is a Figure or SubFigure.
     """
     import pandas as pd
 

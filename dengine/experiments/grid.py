@@ -92,13 +92,13 @@ class KeptReplays:
     def path(self, task: Task) -> Path:
         """Return the path of a task's replay in the folder, whether or not it is there.
 
-        Its name is a hash of all that the decisions depend on: data, settings, source and
+        Its name is a hash of all that the decisions depend on: data, settings, source code and
         libraries.
 
         Raises
         ------
         SettingError
-            The reducer holds something that cannot be hashed, so it cannot be told from others.
+            The reducer holds an object that cannot be hashed, such as a lambda.
         """
         contender = task.contender
         reducer = contender.recipe.reducer
@@ -130,8 +130,8 @@ class KeptReplays:
     def get(self, task: Task) -> Replay | None:
         """Read the kept replay of a task; return None if there is none or its file is damaged.
 
-        It has the present name and recipe of the contender. Raises SettingError for a reducer that
-        cannot be hashed.
+        The replay gets the name and recipe of the task's contender. Raises SettingError for a
+        reducer that cannot be hashed.
         """
         path = self.path(task)
         try:
@@ -150,10 +150,10 @@ class KeptReplays:
             return None
 
     def put(self, task: Task, replay: Replay) -> None:
-        """Write the finished replay of a task, as a whole or not at all, over an earlier one.
+        """Write the finished replay of a task, replacing an earlier one.
 
-        Raises OutputError if it cannot be written, SettingError for a reducer that cannot be
-        hashed.
+        The file is written as a whole or not at all. Raises OutputError if it cannot be written,
+        and SettingError for a reducer that cannot be hashed.
         """
         arrays: dict[str, Any] = {}
         values: dict[str, Any] = {}
@@ -188,7 +188,10 @@ def _digest_of_source() -> str:
 
 @cache  # a file that changes while a grid is played is not what was imported
 def _source_of(class_or_function: Any) -> str:
-    """Return the text of the source file of a class or function; "" if it has none that is text."""
+    """Return the text of the source file of a class or function; "" if there is no readable file.
+
+    A file is read once in a process.
+    """
     try:
         return Path(getsourcefile(class_or_function) or "").read_text(encoding="utf-8")
     except (OSError, TypeError, UnicodeDecodeError):
@@ -196,7 +199,7 @@ def _source_of(class_or_function: Any) -> str:
 
 
 def _classes_and_functions(reducer: Any) -> list[Any]:
-    """Return what a transformer's code consists of, without repeats.
+    """Return the classes and functions whose code a scikit-learn transformer runs, without repeats.
 
     These are its class, the classes of the estimators among its parameters, and the functions among
     its parameters.
@@ -213,8 +216,8 @@ def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
     Raises
     ------
     SettingError
-        One is no recipe, or two have the same name and policy, so that no table could tell them
-        apart.
+        One of them cannot be loaded, or two have the same name and policy, so that no table could
+        tell them apart.
     """
     recipes = [recipes] if isinstance(recipes, str) else recipes
     contenders = [Contender.load(recipe) for recipe in recipes]
@@ -254,10 +257,10 @@ def iterate_replays(
     keep: FilePath | None = None,
     on_cycle: Any = None,
 ) -> Iterator[PlayedReplay]:
-    """Play tasks and yield each replay as soon as it is finished, in the order of their ends.
+    """Play tasks and yield each replay as soon as it is finished.
 
-    Tasks are played seed by seed, so that what an interrupted run has finished can be compared.
-    Replays that were kept by an earlier run come first.
+    Replays that an earlier run kept come first. The other tasks are begun seed by seed, so that the
+    replays that an interrupted run has finished can be compared.
 
     Parameters
     ----------
@@ -270,8 +273,8 @@ def iterate_replays(
         Folder of finished replays, made if it is missing: those in it are not played again, and
         others are added as they end.
     on_cycle : callable or None, default None
-        Called with the number of finished cycles of a replay, only where `n_jobs` is 1: a callback
-        cannot travel to other processes.
+        Called after each cycle with the number of finished cycles of its replay. It is not called
+        if `n_jobs` is not 1, because a callback cannot travel to other processes.
 
     Yields
     ------
@@ -280,8 +283,8 @@ def iterate_replays(
     Raises
     ------
     SettingError
-        A baseline's library is missing; raised before anything is played, but after the kept
-        replays. With `keep` also for a reducer that cannot be hashed.
+        A baseline's library is missing: this is raised after the kept replays were yielded, and
+        before anything is played. With `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
     """
@@ -430,7 +433,7 @@ def play_tasks(
 ) -> list[Replay]:
     """Play all tasks as `iterate_replays` does; return their replays in the order of the tasks.
 
-    It raises what that raises.
+    Raises what `iterate_replays` raises.
     """
     played = iterate_replays(dataset, tasks, n_jobs=n_jobs, keep=keep)
     replays = {position: replay for position, replay, _ in played}

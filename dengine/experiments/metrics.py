@@ -52,11 +52,12 @@ class ErrorRate:
 def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 0.05) -> ErrorRate:
     """Compute the share of wrong decisions over many replays of one data set.
 
-    Thirty shuffles of one set play the same traces thirty times, so they are not thirty samples of
-    the world. The unit is therefore the trace: the variance of the ratio is that between traces,
-    linearised, and the interval is Wilson's for the number of independent decisions that has this
-    variance. If that is 0, as where no decision was wrong, it is Wilson's for the number of
-    different traces. The interval speaks of other parts of the same kind, not of another cell.
+    Thirty shuffles of one set play the same traces thirty times, so they are not thirty independent
+    samples. The unit is therefore the trace: the variance of the share is estimated from the
+    differences between traces, by linearisation. The interval is Wilson's, for the number of
+    independent decisions that would have this variance. If the variance is 0, for example because
+    no decision was wrong, it is Wilson's for the number of different traces. The interval holds for
+    other parts of the same kind, not for another cell.
 
     Parameters
     ----------
@@ -101,9 +102,10 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
 
 
 def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> NDArray[np.float64]:
-    """Return in how many cycles of all replays each trace was marked, shape (size,).
+    """Return for each trace in how many cycles of all replays a field was True, shape (size,).
 
-    `name` is a field of bool, one value a cycle; `replay.index` says which trace a cycle had.
+    `name` is a field of `Replay` with a bool for each cycle; `index` of the replay says which trace
+    a cycle had.
     """
     counts = np.zeros(size)
     for replay in replays:

@@ -87,14 +87,14 @@ class Contender:
 
     @classmethod
     def load(cls, recipe: Any) -> "Contender":
-        """Return the contender for a recipe, for a baseline's name, or for itself.
+        """Return the contender for a recipe or for a baseline's name.
 
         Parameters
         ----------
         recipe : Contender, str or object
             A contender is returned as it is. A baseline's name gives the baseline with its default
-            settings. Otherwise anything that `Recipe.load` takes; a TOML file gives its stem as the
-            name.
+            settings. Otherwise anything that `Recipe.load` takes; the name of a contender that is
+            read from a TOML file is the file's name without suffix.
 
         Raises
         ------
@@ -120,10 +120,10 @@ class Contender:
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
     def engine(self, seed: int, trace: TraceSpec | None = None) -> DataEngine:
-        """Return a new engine in memory, with the baseline as its model if there is one.
+        """Return a new engine in memory; its model is the baseline if the contender is one.
 
-        It counts steps and not seconds in a retrain, so that the same seed repeats exactly. Raises
-        SettingError if the baseline's library is not installed.
+        A training ends after a number of steps and not by the time budget, so that the same seed
+        gives the same decisions. Raises SettingError if the baseline's library is not installed.
         """
         model = None
         if self.baseline is not None:
@@ -261,7 +261,8 @@ class Replay:
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each cycle, numbered from 1.
 
-        Its columns are the fields of shape (n,), and embedding_1, embedding_2, ... of the position.
+        Its columns are the fields of shape (n,), and one for each dimension of `position`:
+        embedding_1, embedding_2, ...
         """
         import pandas as pd
 
@@ -289,7 +290,7 @@ class Replay:
         Parameters
         ----------
         cycles : slice, default all
-            Those that count, by their position from 0, without a step.
+            The cycles to count, numbered from 0; a slice without a step.
 
         Returns
         -------
@@ -297,7 +298,7 @@ class Replay:
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
             of cycles: verified, accepted, rejected (by the model), false_positive, false_negative,
             novel, safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts
-            passed on, None without a clock, without cycles, and where no time passed.
+            passed on per hour: None if the cell has no clock, no time passed, or there is no cycle.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -321,12 +322,12 @@ class Replay:
     def summary(self, check_seconds: float = VERIFY_SECONDS) -> dict[str, Any]:
         """Return one row of a table: settings, counts, shares and times over the whole run.
 
-        Shares, times and `first_certain` are NaN where there is nothing to compute them from.
+        Shares, times and `first_certain` are NaN if there is nothing to compute them from.
 
         Parameters
         ----------
         check_seconds : float, default 5.0
-            How long a verification takes in the cell, for what was saved.
+            How long a verification takes in the cell, to compute the time saved.
 
         Returns
         -------
@@ -405,9 +406,9 @@ class ObservedCycle(NamedTuple):
 def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[ObservedCycle]:
     """Let the engine drive a cell, and yield each cycle as it ends.
 
-    The truth is the cell's attribute `truth` if it has one, else the label that was reported, NaN
-    without any. The clock is its attribute `clock`, None without one. An exception of the cell goes
-    on to the caller, after the engine has written what it knows.
+    The truth is the cell's attribute `truth` if it has this attribute, otherwise the label that was
+    reported, or NaN if none was. The clock is the cell's attribute `clock`, or None. An exception
+    of the cell is raised after the engine has written what it knows.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)
@@ -447,8 +448,9 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 def _positions(decisions: list[Decision]) -> Floats:
     """Return the embedding of each decision, the mean over its spaces, (n, d).
 
-    d is the width of the newest one, 2 without any. A reducer may widen as it sees more traces;
-    rows with an embedding of another width, or none, are NaN.
+    d is the dimension of the newest embedding, or 2 if there is none. A reducer may give more
+    dimensions as it sees more traces; rows with another dimension, or without an embedding, are
+    NaN.
     """
     means = [
         np.mean(decision.embedding, axis=0) if decision.embedding else np.empty(0)
@@ -579,11 +581,11 @@ def replay(
 def replay_policy(scores: Replay, policy: Policy) -> Replay:
     """Play a policy on the predictions of a replay in shadow mode, without its model.
 
-    In shadow mode every part was verified, and the model's bounds were recorded. What becomes known
-    to the policy's rule is as in a replay of its own: checks, audits and line stops, and with
-    `stops="all"` that an accepted part was good. One difference stays: the scores come from a model
-    that has learned all labels. Audits are drawn anew; what an operator's limits reject is
-    verified.
+    In shadow mode every part was verified, and the model's bounds were recorded. The policy's rule
+    learns only outcomes that it would know in a replay of its own: checks, audits and line stops,
+    and with `stops="all"` also that an accepted part was good. One difference stays: the
+    predictions come from a model that has learned all labels. Audits are drawn anew. A part that an
+    operator's limits reject is verified.
 
     Parameters
     ----------

@@ -121,8 +121,8 @@ def survey_dataset(data: Dataset) -> Survey:
     """Count the traces, labels, faults and repeats of a data set, and test its order for drift.
 
     Labels are only counted, nothing is learned from them. Repeats, and the drift of the channels,
-    are looked for among the usable traces: finite, not constant and not too large. There is no
-    drift where the recorded order is not known.
+    are looked for among the usable traces: finite, not constant and not too large. If the recorded
+    order is not known, the survey has no drift.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def _spread(values: NDArray[Any] | None) -> Spread | None:
 def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Drift, ...]:
     """Return the drift of the labels, named "good", and then of each channel's mean.
 
-    The labels are those of all traces, the means those of usable traces of X (n, C, T) alone.
+    The labels of all traces are used, but only the means of the usable traces of X (n, C, T).
     """
     means = channel_means(np.where(usable[:, None, None], X, 0))
     means = np.where(usable[:, None], means, np.nan)
@@ -192,7 +192,7 @@ def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Dr
 def _drift(name: str, values: NDArray[np.float64]) -> Drift:
     """Return the drift of values (n,) in recorded order, leaving out those that are NaN.
 
-    The correlation is NaN for fewer than three values, and if they are all equal.
+    The correlation and its p-value are NaN if there are fewer than three values, or all are equal.
     """
     from scipy.stats import spearmanr
 

@@ -64,17 +64,18 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
 
 
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
-    """Pool the replays of equal settings: the columns `CONDITION`, from the recipe to `confirm`.
+    """Pool the replays that have the same settings.
 
-    Returns a row for each combination of their values, in the frame's order.
+    The settings are the columns in `CONDITION`, from the recipe to `confirm`. There is a row for
+    each combination of their values, in the frame's order.
 
     Parameters
     ----------
     frame : DataFrame
         As `frame_of` gives it.
     replays : sequence of Replay, default ()
-        Those of the frame's rows, in their order. Without them the error's interval is NaN and no
-        dropped retrain is counted.
+        The replays of the frame's rows, in their order. Without them the error's interval is NaN,
+        and retrains_dropped is 0.
 
     Returns
     -------
@@ -84,15 +85,15 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
         - certain, accepted, rejected, false_positive and the other `COUNTS`: means per replay.
           `total_*`: their sums. `certain_sd` and `false_positive_sd`: standard deviations over the
           replays, NaN for one replay.
-        - precision, npv : over the sums of all replays. The mean of their ratios would weigh a
-          replay that accepted three parts as much as one that accepted 300.
+        - precision, npv : computed from the sums over all replays. A mean over the replays would
+          weigh a replay that accepted three parts as much as one that accepted 300.
         - Times of retrains and decisions, the first certain cycle and savings: median, largest or
           mean, as `AGGREGATED` says.
-        - error_lower, error_upper : 95 % interval of the share of bad ones among the accepted
+        - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
           parts; NaN also if none was accepted.
-        - promise_kept : whether the pooled precision is at least LB; None where fewer than `ENOUGH`
+        - promise_kept : whether the pooled precision is at least LB; None if fewer than `ENOUGH`
           parts were accepted.
-        - retrains_dropped : number of retrains whose model was not used.
+        - retrains_dropped : number of retrains whose version was not put in force.
     """
     rows = []
     for key, part in frame.reset_index(drop=True).groupby(CONDITION, sort=False):
@@ -123,11 +124,11 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
 
 
 def promise_lines(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each pooled row: whether at least LB of the accepted parts were good.
+    """Return a sentence for each row of `pool`: were at least LB of its accepted parts good?
 
-    LB is the policy's lower bound. A sentence ends in "kept", "broken", or that there are too few
-    accepted parts to say; or it says that no part was accepted. It names the recipe, the guarantee,
-    and interval, alpha and confirmation only if the rows differ in them.
+    LB is the lower bound of the row's policy. The sentence ends with "kept" or "broken", or says
+    that no part, or too few parts, were accepted. It always names the recipe and the guarantee. It
+    names the interval, alpha, and whether good parts are confirmed only if the rows differ in it.
     """
     varying = [
         name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1
@@ -157,9 +158,9 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
 def pooled_table(rows: Sequence[Row], title: str = "Replays", legend: str = LEGEND) -> Table:
     """Return the rows of `pool` as a rich Table for the screen.
 
-    There must be at least one row. The first column has the recipe, the guarantee, how outcomes of
-    accepted parts come ("confirmed", or the policy's `stops`), and the interval if the rows differ
-    in it.
+    There must be at least one row. The first column has the recipe, the guarantee, "confirmed" if
+    accepted good parts were confirmed or else the policy's `stops`, and the interval if the rows
+    differ in it.
     """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []
@@ -176,14 +177,14 @@ def pooled_table(rows: Sequence[Row], title: str = "Replays", legend: str = LEGE
 def table_of_numbers(
     title: str, rows: Sequence[Mapping[str, str]], caption: str, total: bool = False
 ) -> Table:
-    """Return a rich Table of right-aligned numbers behind the names of the rows.
+    """Return a rich Table: the names of the rows at the left, right-aligned numbers beside them.
 
     Parameters
     ----------
     title, caption : str
     rows : sequence of mappings
-        Column title -> cell, the same titles in each, one row at least; the first column has the
-        names of the rows.
+        A mapping for each row, at least one: column title -> cell, with the same titles in all. The
+        first column has the names of the rows.
     total : bool, default False
         Draw a line above the last row.
     """
@@ -241,7 +242,7 @@ CELLS: dict[str, Any] = {
 def retrain_line(retrains: Sequence[RetrainReport]) -> str:
     """Return a sentence: how many retrains there were, the slowest, and how many were dropped.
 
-    Of the dropped ones it gives the last one's reason. "No retrain." without any.
+    It gives the reason of the last dropped retrain. If there was no retrain, it is "No retrain."
     """
     if not retrains:
         return "No retrain."
