@@ -36,7 +36,7 @@ from ..store.outbox import Outbox
 from ..store.records import StoredDecision
 from ..traces import convert_trace, infer_trace_spec
 from .guard import NOT_PRECOMPUTED, guarded
-from .labels import CellLabels, ProductLabels
+from .labels import CellLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce, read_peers_trace_spec
 
@@ -50,7 +50,7 @@ class DecisionMaker:
         Read at each decision; the first trace without a fault sets the `TraceSpec` in them.
     live : LiveModel
         Holds the model that decides.
-    labels : CellLabels or ProductLabels
+    labels : CellLabels
         Says whether anything was learned yet.
     outbox : Outbox
         Takes the decisions.
@@ -65,7 +65,7 @@ class DecisionMaker:
         self,
         settings: SettingsInForce,
         live: LiveModel,
-        labels: CellLabels | ProductLabels,
+        labels: CellLabels,
         outbox: Outbox,
     ) -> None:
         self.has_seen_trace = False

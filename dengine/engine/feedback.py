@@ -24,7 +24,7 @@ from ..store.records import (
     StoredDecision,
     already_reported,
 )
-from .labels import CellLabels, ProductLabels
+from .labels import CellLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
 
@@ -53,7 +53,7 @@ class Feedback:
         Takes the labels.
     live : LiveModel
         Learns from them.
-    labels : CellLabels or ProductLabels
+    labels : CellLabels
         Takes each label that is recorded.
     settings : SettingsInForce
         Whether an accepted part without a report is confirmed by the next decision, and since which
@@ -73,7 +73,7 @@ class Feedback:
         self,
         outbox: Outbox,
         live: LiveModel,
-        labels: CellLabels | ProductLabels,
+        labels: CellLabels,
         settings: SettingsInForce,
         on_safe_mode: Callable[[str], object] | None = None,
     ) -> None:
@@ -293,8 +293,8 @@ class Feedback:
         """Hand the labels of confirmed parts to the outbox; do not wait until they are stored.
 
         These are accepted parts that are known to be good because the next decision came. Their
-        labels enter the training window: at once, or in a product as soon as the store has given
-        them numbers. The rule then also counts the checks that have become overdue.
+        labels enter the training window: at once, or in a product with the next training. The rule
+        then also counts the checks that have become overdue.
 
         Returns
         -------
@@ -316,7 +316,7 @@ class Feedback:
         decision.
         """
         self._count_overdue()
-        if isinstance(self._labels, ProductLabels) and self._labels.has_unnumbered:
+        if self._labels.has_provisional:
             for id_, number in self._outbox.pop_label_numbers():
                 self._labels.assign_number(id_, number)
 
