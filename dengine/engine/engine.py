@@ -60,7 +60,7 @@ from .exclusive import ExclusiveUse
 from .feedback import Feedback, Remedy
 from .fleet import Peers
 from .garbage import frozen_objects, uncollected
-from .labels import CellLabels, ProductLabels
+from .labels import CellLabels
 from .learner import Learner
 from .live_model import LiveModel
 from .settings import (
@@ -238,11 +238,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         self._settings = SettingsInForce(settings, self._outbox)
         window = TrainingWindow(recipe.window)
         self._live = LiveModel(template, window, self._outbox, settings.evidence)
-        labels: CellLabels | ProductLabels = CellLabels(window)
+        labels = CellLabels(window, self._live)
         peers = None
         if store.product is not None:
-            labels = ProductLabels(window, self._live)
-            peers = Peers(self._outbox, self._live, window, labels, clock)
+            peers = Peers(self._outbox, self._live, window, clock)
         self._feedback = Feedback(self._outbox, self._live, labels, self._settings, on_safe_mode)
         limits = Limits(None if replaying else recipe.budget, recipe.max_steps)
         retrainer = Retrainer(window, limits, executor, clock)
@@ -263,7 +262,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Restore what the store holds: version, references, rule, labels and pending checks.
 
         The engine then decides bit for bit as before it was closed. A new cell of a product decides
-        as the product's other cells do. It is called once, before the first decision, and waits for
+        by the product's newest version. It is called once, before the first decision, and waits for
         the store without a time limit. If retrains run in the calling thread, it also waits until
         the first retrain can begin without delay. Raises StoreError if the store cannot be read.
         """

@@ -23,7 +23,7 @@ from ..store.records import (
     StoredDecision,
     already_reported,
 )
-from .labels import CellLabels, ProductLabels
+from .labels import CellLabels
 from .live_model import LiveModel
 from .settings import SettingsInForce
 
@@ -51,7 +51,7 @@ class Feedback:
         Takes the labels.
     live : LiveModel
         Learns from them.
-    labels : CellLabels or ProductLabels
+    labels : CellLabels
         Takes each label that is recorded.
     settings : SettingsInForce
         Whether an accepted part without a report is confirmed by the next decision, and since which
@@ -71,7 +71,7 @@ class Feedback:
         self,
         outbox: Outbox,
         live: LiveModel,
-        labels: CellLabels | ProductLabels,
+        labels: CellLabels,
         settings: SettingsInForce,
         on_safe_mode: Callable[[str], object] | None = None,
     ) -> None:
@@ -259,7 +259,7 @@ class Feedback:
         decision.
         """
         self._count_overdue()
-        if isinstance(self._labels, ProductLabels) and self._labels.has_unnumbered:
+        if self._labels.has_provisional:
             for id_, number in self._outbox.pop_label_numbers():
                 self._labels.assign_number(id_, number)
 

@@ -1,6 +1,5 @@
 """`Learner` calls, in the right order, all that an engine learns with: store labels, update the
-rule, train, swap, take in peers' news. `engine.DataEngine` calls it once per decision, report and
-cycle.
+rule, train, swap, hear of peers. `engine.DataEngine` calls it once per decision, report and cycle.
 
 It is the only object that calls the others in this order. `Feedback` turns outcomes into labels,
 `LiveModel` learns them, `Retrainer` trains a candidate, and `Peers` reads what other cells of the
@@ -16,7 +15,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import count
-from typing import Any
 
 import torch
 
@@ -28,9 +26,9 @@ from ..store.outbox import Outbox
 from ..store.records import Change, ModelVersion, without_rule
 from .candidate import Candidate
 from .feedback import Feedback, Remedy
-from .fleet import MOST, ROUNDS, Peers
+from .fleet import Peers
 from .guard import NOT_PRECOMPUTED, NOT_READY, guarded
-from .labels import CellLabels, ProductLabels
+from .labels import CellLabels
 from .live_model import LiveModel
 from .resume import add_labels_since, find_clean_start, refit
 from .settings import EvidenceWindow
@@ -49,7 +47,7 @@ class Learner:
     outbox : Outbox
     live : LiveModel
     window : TrainingWindow
-    labels : CellLabels or ProductLabels
+    labels : CellLabels
     feedback : Feedback
     peers : Peers or None
         None if the cell shares no product.
@@ -68,7 +66,7 @@ class Learner:
         outbox: Outbox,
         live: LiveModel,
         window: TrainingWindow,
-        labels: CellLabels | ProductLabels,
+        labels: CellLabels,
         feedback: Feedback,
         peers: Peers | None,
         retrainer: Retrainer,
@@ -103,29 +101,32 @@ class Learner:
         a thread that computes in advance for the next retrain (`precompute`). Raises StoreError if
         the store cannot be read.
         """
-        # The version is read before the labels: a peer may store both meanwhile.
         version = self._store.versions.newest()
-        labelled = self._store.labels.with_traces(self._window.capacity)
-        self._window.refill(labelled)
         reports = self._store.versions.retrains()
         for report in reports:
             self._note_outcome(report)
         newest_version = max((report.version for report in reports), default=0)
         self.live.resume(version, newest_version, label_within, policy_since)
-        if self.live.answering is not None or len(labelled.seq) >= IMPORTED:
+        self._refill_window(self.live.corrected_to)
+        if self.live.answering is not None or len(self._window) >= IMPORTED:
             self.precompute()
-        self.labels.resume(self.live.trained_on.counts_from)
-        if self._peers is not None:
-            self._peers.resume()
+
+    def _refill_window(self, corrected_to: int) -> None:
+        """Read the training window from the store, with corrections up to this number, and count
+        the new labels again.
+        """
+        capacity = self._window.capacity
+        self._window.refill(self._store.labels.with_traces(capacity, corrected_to=corrected_to))
+        self.labels.count_from(self.live.trained_on.counts_from)
 
     def precompute(self) -> None:
         """Start a thread that computes in advance what the next training needs; do not wait.
 
         These are above all the features of the window's traces. They are kept in the model that the
         training starts from; a failure is logged. Nothing is started until `wait_until_precomputed`
-        has waited for an earlier thread. The training window must not be empty.
+        has waited for an earlier thread, or if the training window is empty.
         """
-        if self._precomputed is not None:
+        if self._precomputed is not None or not len(self._window):
             return
         labelled = self._window.snapshot()
         start = self._choose_start()
@@ -178,9 +179,9 @@ class Learner:
         """Train a version and put it in force, in this thread, or begin to in the executor.
 
         First every label is stored, since a version is trained only on labels that the store has
-        numbered. Then the call waits for what is computed in advance, and takes in the news of
-        peers (what other cells of the product stored), since either may change what the training
-        starts from. Then new labels count from zero, and the training begins.
+        numbered. Then the call waits for what is computed in advance, and hears of peers (a newer
+        version, corrections and labels of the product's other cells), since either may change what
+        the training starts from. Then new labels count from zero, and the training begins.
 
         With `wait` True, or if no executor takes work, all is done in this thread, and the report
         is returned. Otherwise None is returned, and `advance` brings the version to its end. With
@@ -204,7 +205,7 @@ class Learner:
         self.store_labels()
         begin = self._clock()
         self.wait_until_precomputed()
-        self._take_in_all_news()
+        self._hear_of_peers()
         self.labels.begin_retrain()
         self._is_requested = False
         start = self._choose_start()
@@ -226,8 +227,9 @@ class Learner:
         then, or a training was discarded and is to begin again. A pinned version is not replaced,
         and such a request is withdrawn.
 
-        The news of peers is taken in first, so a peer's version may be in force afterwards, even if
-        nothing is trained here.
+        In a product a newer version and corrections of other cells are put in force first, so a
+        peer's version may be in force afterwards, even if nothing is trained here. They are looked
+        for once a second, and if a retrain is due.
 
         Parameters
         ----------
@@ -244,10 +246,14 @@ class Learner:
             store is unavailable, if a training or its preparation is under way, or if the executor
             now trains.
         """
-        is_due = self._is_due_after_news(retrain_every)
+        peers = self._peers
+        may_train = self.labels.is_due(retrain_every) and not self.live.pinned
+        if peers is not None and (may_train or peers.is_look_due):
+            self._try_to_hear(peers, with_labels=False)
         if self.live.pinned:
             self._is_requested = False
             return None
+        is_due = self.labels.is_due(retrain_every)
         if is_due:
             n_labels = max(self.labels.new_labels, len(self._window))
             is_due = n_labels >= self.live.newest.min_traces
@@ -304,15 +310,17 @@ class Learner:
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
         given up, and so is a training that hangs. In a product (cells that share labels and
-        versions) all steps are taken in any case. When the training is done, the news of the other
-        cells is taken in first; a correction or a rollback in it discards the training.
+        versions) all steps are taken in any case. When the training is done, the call first hears
+        of the other cells: a correction or a rollback discards the training, and if the store is
+        unavailable, the training waits for a later call.
         """
         if self._candidate is None and self._retrainer.future is None:
             return
         if self._peers is not None:
-            if self._retrainer.is_done:
-                self._take_in_all_news()  # a correction or a pinned version discards the training
             to_the_end = True  # no version or correction of a peer comes in between two steps
+            is_at_end = self._retrainer.is_done or wait > 0.0
+            if is_at_end and not self._try_to_hear(self._peers):
+                return
         candidate = self._candidate
         if candidate is None:
             trained = self._retrainer.collect(wait)
@@ -449,20 +457,14 @@ class Learner:
         newest_seq = self._window.newest_seq
         state = None
         if candidate.model is not None:
-            state = self._state_of(candidate.model, candidate.trained_on)
+            state = self.live.get_state(candidate.model, candidate.trained_on)
         return self._outbox.store_version(report, newest_seq, state)
-
-    def _state_of(self, model: EngineModel, trained_on: TrainedOn) -> dict[str, Any]:
-        """Return the arrays of this model as a version, by name, for the store."""
-        state = self.live.get_state(model, trained_on)
-        return state if self._peers is None else state | self._peers.labels.get_state()
 
     def _swap(self, candidate: Candidate) -> None:
         """Put a stored candidate in force with the present rule; keep its report for `take_report`.
 
-        In a product, labels of this cell that still wait for those of other cells become its
-        references. If the training was dropped, there is no model: the previous version stays in
-        force, the report is kept, and its reason is added to `dropped`.
+        If the training was dropped, there is no model: the previous version stays in force, the
+        report is kept, and its reason is added to `dropped`.
         """
         self._candidate = None
         self._report = candidate.report
@@ -473,20 +475,17 @@ class Learner:
             # An update of the rule may have failed since the candidate took it over.
             guarded(NOT_READY, candidate.model.prepare, self.live.newest)
             self.live.swap_in(candidate.model, candidate.report.version, candidate.trained_on)
-            if self._peers is not None:
-                self._peers.labels.add_missing_references(candidate.model)
 
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
         """Drop a candidate that could not be stored, and keep a report of this in memory only.
 
-        It is logged, and the previous version stays in force. In a cell that learns alone the
-        labels count as new again, so that the next retrain is soon.
+        It is logged, and the previous version stays in force. The labels count as new again, so
+        that the next retrain is soon.
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
         self._was_accepted = False
-        if isinstance(self.labels, CellLabels):  # in a product it is the turn of whichever is due
-            self.labels.give_back(candidate.report.n_traces)
+        self.labels.give_back(candidate.report.n_traces)
         self._report = replace(
             candidate.report,
             version=self.live.version,
@@ -505,68 +504,47 @@ class Learner:
         self._report = None
         return report
 
-    # News of a product
+    # The other cells of a product
 
-    def _is_due_after_news(self, retrain_every: int) -> bool:
-        """Return whether there are enough new labels for a retrain, and this cell is to do it.
+    def _try_to_hear(self, peers: Peers, with_labels: bool = True) -> bool:
+        """Hear of peers (`_hear_of_peers`), and return whether the store gave an answer.
 
-        In a product, some of the news, what the other cells stored, is taken in first, unless that
-        was done within the last second; a peer's version may be in force afterwards. If a retrain
-        is due then, the rest of the news is taken in, and it is checked once more whether one is
-        due.
+        If it gave none, that is logged, once until it answers again, and nothing is raised.
         """
-        if self._peers is not None and self._peers.is_news_due:
-            self._take_in_news(self._peers)
-        if not self.labels.is_due(retrain_every):
-            return False
-        self._take_in_all_news()  # a peer's version may have come
-        return self.labels.is_due(retrain_every)
+        failure = None
+        try:
+            self._hear_of_peers(with_labels)
+        except StoreError as error:
+            failure = error
+        peers.note_answer(failure)
+        return failure is None
 
-    def _take_in_all_news(self) -> None:
-        """Take in all news, what the product's other cells stored, with at most `ROUNDS` requests.
+    def _hear_of_peers(self, with_labels: bool = True) -> None:
+        """Put a newer version and corrections of the product's other cells in force.
 
-        If the store is unavailable, it stops, `Peers.is_lost` is set, and nothing is raised.
-        Without peers it does nothing.
+        If there is one of them, or with `with_labels`, this cell's labels are stored first, and the
+        labels of all cells are read into the training window at the end. What is read is checked
+        against the ledger, which may set the outbox's `integrity_error`. A pinned version or a
+        correction discards a training under way in the executor. Nothing happens in a cell without
+        a product. Raises StoreError if the store is unavailable.
         """
         peers = self._peers
         if peers is None:
             return
-        for _ in range(ROUNDS):
-            if self._take_in_news(peers) < MOST:
-                return
-
-    def _take_in_news(self, peers: Peers) -> int:
-        """Take in the newest version, at most `MOST` labels, and corrections of the product.
-
-        First it waits until this cell's recorded labels are in the store. Returns the number of
-        labels; 0 also if the store is unavailable, which sets `Peers.is_lost` and is not raised. A
-        pinned version or a correction among the news discards a training under way in the executor.
-        Corrections that cannot be read come with the next news.
-        """
-        version = None
-        try:
-            self.store_labels()  # one of the news may be a label of this cell
-            news, has_newer_version = peers.fetch_news()
-            if has_newer_version:
-                version = self._outbox.call_store(self._store.versions.newest)
-        except StoreError as error:
-            peers.note_loss(error)
-            return 0
-        if version is not None:
-            peers.take_over(version)
-            if self.live.pinned:
-                self._discard_training()
-        peers.take_in(news)
-        if news.correction > self.live.corrected_to:
-            self._discard_training()  # it does not have the corrections
-            try:
-                self.apply_corrections(may_retrain=False)
-            except StoreError as error:  # asked for again with the next news
-                product = self._store.product
-                log.warning("corrections of product %s cannot be had yet: %s", product, error)
-        n_labels = len(news.labelled.seq)
-        peers.note_taken(n_labels)
-        return n_labels
+        version, correction = peers.look()
+        is_corrected = correction > self.live.corrected_to
+        if not (version or is_corrected or with_labels):
+            return
+        self.store_labels()  # they are to be among the references of a peer's version
+        self._outbox.check_integrity(self._window.newest_seq)
+        is_newer = version > 0 and peers.put_in_force(version)
+        if is_corrected or (is_newer and self.live.pinned):
+            self._discard_training()  # it lacks the corrections, or would replace the version
+        if is_corrected:
+            self.apply_corrections(may_retrain=False)
+        peers.read_labels()
+        if is_newer:
+            self.labels.count_from(self.live.trained_on.counts_from)
 
     # What people put right
 
@@ -574,18 +552,12 @@ class Learner:
         """Finish what is under way before a person's change: a training, labels, news of peers.
 
         A trained version is put in force or dropped, and a training that is not done is discarded
-        and begins again later (`end_training`). News is what the product's other cells stored; at
-        most `ROUNDS` times `MOST` labels of it are taken in. Raises StoreError if the store is
-        unavailable, or if labels of peers before a label of this cell are missing.
+        and begins again later (`end_training`). News is what the product's other cells stored
+        (`_hear_of_peers`). Raises StoreError if the store is unavailable.
         """
         self.end_training()
         self.store_labels()
-        self._take_in_all_news()
-        peers = self._peers
-        if peers is not None and (peers.is_lost or peers.labels.has_gaps):
-            raise StoreError(
-                f"News of product {self._store.product!r} cannot be had now; try it again."
-            )
+        self._hear_of_peers()
 
     def apply_corrections(self, may_retrain: bool = True) -> None:
         """Apply the store's newest corrections to window, references, count of new labels and rule.
@@ -598,11 +570,9 @@ class Learner:
         if the store is unavailable.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
-        # In a product, labels after the window's newest come as news.
-        last = None if self._peers is None else self._window.newest_seq
-        self._window.refill(self._store.labels.with_traces(self._window.capacity, last=last))
-        is_done = self.live.apply_corrections()
-        self.labels.recount(self.live.trained_on.counts_from)
+        corrections = self._store.corrections.after(self.live.corrected_to)
+        self._refill_window(max([self.live.corrected_to, *(row.number for row in corrections)]))
+        is_done = self.live.apply_corrections(corrections)
         self.live.rebuild_rule()
         self._precompute_other_start()
         if is_done or not may_retrain:
@@ -622,7 +592,7 @@ class Learner:
         training window. Without an executor this call waits for the thread, so that the work does
         not use up the time budget of the retrain. Without labels nothing is done.
         """
-        if self._choose_start() is self.live.newest or not len(self._window):
+        if self._choose_start() is self.live.newest:
             return
         if self._precomputed is not None and self._precomputed.done():
             self._precomputed = None  # it was for another model
@@ -648,9 +618,9 @@ class Learner:
 
         It is stored together with `event`. Until then nothing changes, so all that can fail comes
         before: reading it, restoring it, and adding the later labels, up to the training window's
-        capacity, as its references. Once it is in force, news of peers is taken in, which become
-        its references as well. Only then new labels count from zero, since the version knows all
-        labels until now. A retrain that was requested before is not begun any more.
+        capacity, as its references. Once it is in force, new labels count from zero, since the
+        version knows all labels until now. A retrain that was requested before is not begun any
+        more.
 
         Raises StoreError if the version is not kept, if a trace is damaged that the model must be
         fitted on again, and if the version cannot be stored.
@@ -659,12 +629,12 @@ class Learner:
         self._outbox.check_integrity()
         version = self._store.versions.load(number)
         model, trained_on = self._restore_with_rule_in_force(version)
-        add_labels_since(model, self._store, version, self._window)
-        trained_on = replace(trained_on, counts_from=self._window.newest_seq, pinned=number)
+        newest = self._window.newest_seq
+        add_labels_since(model, self._store, version, self._window.capacity, shared_to=newest)
+        trained_on = replace(trained_on, counts_from=newest, pinned=number)
         reason = f"rolled back to version {number}"
         self._store_and_swap_in(event, model, trained_on, reason, self._clock() - begin)
         self._is_requested = False  # what was asked for was to replace another version
-        self._take_in_all_news()
         self.labels.begin_retrain()
         self._precompute_other_start()
 
@@ -723,7 +693,7 @@ class Learner:
         """
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)
-        state = self._state_of(model, trained_on)
+        state = self.live.get_state(model, trained_on)
         self._store.corrections.apply(
             replace(event, version=(report, self._window.newest_seq, state))
         )

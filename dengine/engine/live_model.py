@@ -5,7 +5,7 @@ when.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from ..model.base import EngineModel
 from ..records import ACTIONS, Decision, Reason, State
 from ..store.outbox import Outbox
 from ..store.records import (
+    Correction,
     ModelVersion,
     OutcomeRecord,
     StoredDecision,
@@ -149,7 +150,7 @@ class LiveModel:
             return
         self.swap_in(model, version.version, TrainedOn.from_state(version.state))
         guarded(NOT_READY, model.prepare, self.template)
-        self.corrected_to = add_labels_since(model, store, version, self.window)
+        self.corrected_to = add_labels_since(model, store, version, self.window.capacity)
         if past.last_seq:
             _update_rule(model, lambda: self._read_outcomes(past.last_seq))
         else:
@@ -276,18 +277,18 @@ class LiveModel:
         self.outbox.check_integrity(after)
         return self.outbox.store.labels.outcomes_since(after, self.evidence.since, self.overdue_to)
 
-    def apply_corrections(self) -> bool:
+    def apply_corrections(self, corrections: Sequence[Correction]) -> bool:
         """Apply the store's newest corrections to the references of the model in force.
 
         Returns False if the model must be trained again: always for a baseline (a model that the
         user handed in), and if it cannot change a reference. The caller must retrain then, because
-        each correction is read only once. Returns True before the first retrain; `corrected_to` is
-        set in any case. The rule is left to `rebuild_rule`. Raises StoreError if the store is
+        each correction is applied only once. Returns True before the first retrain; `corrected_to`
+        is set in any case. The rule is left to `rebuild_rule`. Raises StoreError if the store is
         unavailable.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
-        for correction in store.corrections.after(self.corrected_to):
+        for correction in corrections:
             if self.answering is not None:
                 is_done &= apply_correction(self.answering, store, correction)
             self.corrected_to = correction.number

@@ -1,6 +1,6 @@
 """Functions that restore a stored version bit for bit: its model, later labels and corrections.
 `live_model.LiveModel` uses these functions when a store is opened, `learner.Learner` for a rollback
-and after labels were forgotten, and `fleet.Peers` when another cell's version is taken over.
+and after labels were forgotten, and `fleet.Peers` when another cell's version is put in force.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..errors import StoreError
 from ..model.base import EngineModel
 from ..store.records import Correction, ModelVersion, without_rule
 from .guard import NO_REFERENCE, guarded
-from .trainer import TrainedOn, TrainingWindow
+from .trainer import TrainedOn
 
 if TYPE_CHECKING:
     from ..store.outbox import Outbox
@@ -118,39 +118,38 @@ def find_clean_start(
     return template, "from initial weights, which never saw the forgotten labels"
 
 
-def newest_reference(version: ModelVersion) -> int:
-    """Return the sequence number of the newest label among the references of a stored version.
-
-    For a model whose references are not stored, it is the newest label that it was trained on.
-    """
-    # Stored references include the labels that came during the retrain. A baseline has no stored
-    # references: it was trained again, without those labels.
-    if "points" in version.state:
-        return version.last_seq
-    return int(version.state["trained_on"][-1])
-
-
 def add_labels_since(
-    model: EngineModel, store: SqlStore, version: ModelVersion, window: TrainingWindow
+    model: EngineModel,
+    store: SqlStore,
+    version: ModelVersion,
+    capacity: int,
+    shared_to: int | None = None,
 ) -> int:
-    """Add to a version's model, as references, the labels that came after it was stored.
+    """Add to a version's model, as references, the labels that are none yet.
 
-    They are at most as many as `window` holds, and end with the window's newest label. Corrections
-    that came meanwhile are applied between the labels, where they came, so that the model is the
-    same bit for bit. A baseline (a model that the user handed in), which cannot be corrected, gets
-    the labels as they count now. A label that the model cannot take is logged and skipped. Returns
-    the number of the newest correction in the store. Raises StoreError if the store cannot be read.
+    They are the labels of all cells of the product up to number `shared_to`, and after it only this
+    cell's own. None stands for the newest label that the version was trained on, or that it got
+    with a rollback, so that an engine that opens a store counts what it counted before. At most the
+    `capacity` newest of both kinds are added. Corrections that came since the version was stored
+    are applied between the labels, where they came, so that the model is the same bit for bit. A
+    baseline (a model that the user handed in), which cannot be corrected, gets the labels as they
+    count now. A label that the model cannot take is logged and skipped. Returns the number of the
+    newest correction in the store. Raises StoreError if the store cannot be read.
     """
     corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another
     # model gets it as it was when the version was stored, and then the corrections.
     as_of = corrected_to if model.keeps_references else None
-    # Up to the newest label in the window: what peers stored since then comes as their news.
-    since = store.labels.with_traces(
-        window.capacity,
-        first=newest_reference(version) + 1,
-        last=window.newest_seq,
-        corrected_to=as_of,
+    trained_on = TrainedOn.from_state(version.state)
+    # Stored references include labels that came later. A baseline has no stored references: it was
+    # trained again, without those labels.
+    references = set(version.state["numbers"].tolist() if "points" in version.state else [])
+    trained_to = trained_on.counts_from if references else int(trained_on.seq[-1])
+    first = max(trained_to + 1, min(references, default=0))
+    shared_to = trained_on.counts_from if shared_to is None else shared_to
+    shared = store.labels.with_traces(capacity, first=first, last=shared_to, corrected_to=as_of)
+    own = store.labels.with_traces(
+        capacity, first=max(first, shared_to + 1), corrected_to=as_of, cell_only=True
     )
     corrections = deque(store.corrections.after(corrected_to))
     newest = corrections[-1].number if corrections else corrected_to
@@ -159,13 +158,14 @@ def add_labels_since(
         for label in store.labels.past(version.last_seq)
         if label.model_version == version.version
     }
-    rows = zip(since.seq.tolist(), since.traces, since.labels, since.hashes.tolist(), strict=True)
-    for seq, trace, label, hash_ in rows:
+    for seq, trace, label, hash_ in (*shared.rows(), *own.rows()):
+        if seq in references:
+            continue
         while corrections and corrections[0].newest_seq < seq:
             apply_correction(model, store, corrections.popleft())
         # The point is unknown where an earlier version answered the decision.
         point = points.get(seq)
-        guarded(NO_REFERENCE, model.add_reference, trace, int(label), hash_, seq, point=point)
+        guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, seq, point=point)
     for correction in corrections:
         apply_correction(model, store, correction)
     return newest
@@ -205,6 +205,7 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     label = None if correction.success is None else int(correction.success)
     if correction.was is not None or label is None:
         return model.change_reference(correction.seq, hash_, label)
+    model.change_reference(correction.seq, hash_, None)  # a version of a peer may have it already
     if len(data.seq):
         trace = data.traces[0]
         guarded(NO_REFERENCE, model.add_reference, trace, label, hash_, correction.seq)

@@ -96,6 +96,11 @@ class CorrectionTable(CellTable):
         labels = {0: False, 1: True, FORGOTTEN: None}
         return {id_: labels[stored[id_].corrected] for id_ in ids}
 
+    def newest_number(self) -> int:
+        """Return the number of the newest correction of the cell or its product; 0: none yet."""
+        with self._database.reading() as connection:
+            return self._scope.newest(connection, CORRECTION.c.number)
+
     def after(self, after: int = 0) -> list[Correction]:
         """Return corrections of labels, oldest first; a label that was corrected twice has two.
 

@@ -29,13 +29,12 @@ from .records import (
     FORGOTTEN,
     LabelledTraces,
     OutcomeRecord,
-    ProductNews,
     StoredDecision,
     from_row,
     overdue_outcomes,
     unpack,
 )
-from .schema import CORRECTION, DECISION, LABEL, TRACE
+from .schema import DECISION, LABEL, TRACE
 from .views import PastLabel
 
 
@@ -123,45 +122,6 @@ class LabelTable(CellTable):
             if len(rows) == limit or newest <= 2 * limit:
                 return rows
         return connection.execute(query).all()  # here more than half are quarantined or forgotten
-
-    def news_since(self, seq: int, limit: int) -> ProductNews:
-        """Return the labels after number `seq` of all cells of the product, this one included.
-
-        They come with their traces, and with the numbers of the product's newest version and newest
-        correction. Labels that were forgotten, and those of quarantined traces (stored, but never
-        used in training), are left out. So is a trace that is not as it was stored, and an event
-        about it is written to the store.
-
-        Parameters
-        ----------
-        seq : int
-        limit : int
-            Number of labels at most; the oldest are returned.
-
-        Returns
-        -------
-        ProductNews
-
-        Raises
-        ------
-        StoreError
-            If the traces have different shapes, or a label is not 0 or 1; other damage of a label
-            is not noticed here.
-        """
-        query = (
-            training_query(self._scope)
-            .where(LABEL.c.seq > int(seq))
-            .order_by(LABEL.c.seq)
-            .limit(limit)
-        )
-        with self._database.reading() as connection:
-            labelled, damaged = self._with_traces(
-                connection, connection.execute(query).all(), self._scope
-            )
-            version = self._scope.newest_version(connection)
-            correction = self._scope.newest(connection, CORRECTION.c.number)
-        self._record_left_out(damaged, "trace")
-        return ProductNews(labelled, version, correction)
 
     def _with_traces(
         self, connection: sa.Connection, rows: Sequence[Any], scope: Scope

@@ -270,24 +270,10 @@ class LabelledTraces:
     labels: NDArray[np.int8]
     hashes: NDArray[np.int64]
 
-
-@dataclass(frozen=True, slots=True)
-class ProductNews:
-    """What the cells of a product stored since an engine last asked.
-
-    Attributes
-    ----------
-    labelled : LabelledTraces
-        New labels of all cells, this one included, oldest first, as corrected.
-    version : int
-        Number of the newest version that was put in force; 0 before the first.
-    correction : int
-        Number of the newest correction; 0 before the first.
-    """
-
-    labelled: LabelledTraces
-    version: int
-    correction: int = 0
+    def rows(self) -> Iterator[tuple[int, TraceArray, int, int]]:
+        """Return the labelled traces one by one: number, trace, label and hash."""
+        lists = (self.labels.tolist(), self.hashes.tolist())
+        return zip(self.seq.tolist(), self.traces, *lists, strict=True)
 
 
 class OutcomeRecord(NamedTuple):

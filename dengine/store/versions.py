@@ -132,6 +132,14 @@ class VersionTable(CellTable):
         self._database.insert(connection, VERSION.c.retrain, [row | {"version": number}])
         return number
 
+    def newest_number(self) -> int:
+        """Return the number of the newest version that was put in force; 0 before the first.
+
+        Versions of all cells of the product count.
+        """
+        with self._database.reading() as connection:
+            return self._scope.newest_version(connection)
+
     def newest(self) -> ModelVersion | None:
         """Return the newest version that was put in force in the cell or its product.
 

@@ -2,6 +2,7 @@
 mixed.
 """
 
+import threading
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -12,15 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import sqlalchemy as sa
 from sklearn.decomposition import PCA
 
 from dengine import Action, DataEngine, Dataset, Recipe, SqlStore
 from dengine.errors import SettingError, StoreError, TraceError
 from dengine.records import RetrainReport
 from dengine.store import verify_history
-from dengine.store.labels import LabelTable
 from dengine.store.peers import list_cells
 from dengine.store.records import address
+from dengine.store.schema import VERSION
+from dengine.store.versions import VersionTable
 from tests.conftest import DATABASES, insertion_like, url_of
 from tests.support.command_line import dengine, document, succeed
 from tests.support.driving import learn
@@ -104,13 +107,25 @@ def rule(engine: DataEngine) -> dict[str, list[float]]:
 def taught(
     fleet: Fleet, parts: Dataset, n: int, recipe: Recipe = RECIPE
 ) -> tuple[DataEngine, DataEngine]:
-    """Two cells of one product that learned n parts by turns, and know each other's."""
+    """Two cells of one product that learned n parts by turns, and have one version of them all."""
     cells = fleet.engine("a", recipe=recipe), fleet.engine("b", recipe=recipe)
     for i in range(n):
         learn(cells[i % 2], parts, [i])
-    for engine in cells:
-        engine.poll()
+    share(*cells)
     return cells
+
+
+def share(first: DataEngine, *others: DataEngine) -> None:
+    """Have a cell train on the labels of all, and the others put its version in force."""
+    first.retrain()
+    for engine in others:
+        engine.poll()
+        assert engine.version == first.version
+
+
+def numbers(engine: DataEngine) -> list[int]:
+    """Return the numbers of the labels that an engine counts, in order."""
+    return sorted(engine.model.index.column("numbers").tolist())
 
 
 def test_a_new_cell_decides_at_once_and_as_its_peers_do(
@@ -118,6 +133,7 @@ def test_a_new_cell_decides_at_once_and_as_its_peers_do(
 ) -> None:
     first = fleet.engine("a")
     learn(first, parts, range(100))
+    first.retrain()
     second = fleet.engine("b")
     assert second.store.decisions.counts()["labels"] == 0
     assert second.version == first.version > 0
@@ -132,58 +148,80 @@ def test_one_retrain_serves_all(
     recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
 ) -> None:
     cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
-    for i in range(60):
+    for i in range(75):
         learn(cells[i % 3], parts, [i])
-    for engine in cells:
-        engine.poll()
+    assert 0 < len(cells[0].store.versions.retrains()) < 75 // EVERY
+    share(*cells)
     labels = sum(engine.store.decisions.counts()["labels"] for engine in cells)
-    retrains = cells[0].store.versions.retrains()
-    assert [report.version for report in retrains] == list(range(1, labels // EVERY + 1))
-    assert {engine.version for engine in cells} == {len(retrains)}
+    newest = cells[0].store.versions.newest()
+    assert newest.state["trained_on"].tolist() == list(range(1, labels + 1))
     assert (
         predictions(cells[0], probe) == predictions(cells[1], probe) == predictions(cells[2], probe)
     )
-    assert {len(engine.model.index) for engine in cells} == {labels}
-    assert {engine.state.new_labels for engine in cells} == {labels - EVERY * len(retrains)}
+    assert [numbers(engine) for engine in cells] == [list(range(1, labels + 1))] * 3
+    assert {engine.state.new_labels for engine in cells} == {0}
 
 
-def test_the_cell_whose_label_makes_it_due_retrains_and_another_where_it_does_not(
+def test_a_peers_label_counts_from_the_next_version_on_and_a_cells_own_at_once(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    first, second = taught(fleet, parts, 60)
+    shared = numbers(first)
+    learn(first, parts, range(60, 65))
+    learn(second, parts, range(65, 70))
+    for engine in (first, second):
+        engine.poll()
+        engine.flush()
+        assert numbers(engine)[: len(shared)] == shared
+        own = engine.store.labels.past(shared[-1])
+        assert numbers(engine)[len(shared) :] == [label.seq for label in own]
+    before = predictions(second, probe)
+    again = fleet.engine("", recipe=None, store=reopened(fleet, second))
+    assert predictions(again, probe) == before
+    learn(again, parts, range(70, 72))
+    share(first, again)
+    assert numbers(first) == numbers(again)
+    assert len(first.store.labels.with_traces().seq) == len(numbers(first)) > len(shared) + 5
+
+
+def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(
     fleet: Fleet, parts: Dataset
 ) -> None:
-    first, second = (
-        fleet.engine("a"),
-        fleet.engine("b", recipe=RECIPE.with_settings(retrain_every=1000)),
-    )
+    first = fleet.engine("a")
+    second = fleet.engine("b", recipe=RECIPE.with_settings(retrain_every=1000))
     for start in range(0, 38, 2):
         learn(first, parts, [start])
-        learn(
-            second, parts, [start + 1]
-        )  # the label that makes it due is always of the one that waits for 1000
+        learn(second, parts, [start + 1])
     assert first.store.versions.retrains() == []
-    learn(second, parts, [38])
-    learn(first, parts, [39, 40])
-    assert len(first.store.versions.retrains()) == 1
+    learn(second, parts, [38, 39])
+    assert first.store.versions.retrains() == []
+    learn(first, parts, [40])
+    second.poll()
+    assert (first.version, second.version) == (1, 1)
+    assert (first.state.new_labels, second.state.new_labels) == (0, 0)
 
 
 def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
     fleet: Fleet, parts: Dataset, probe
 ) -> None:
+    waiting = RECIPE.with_settings(retrain_every=1000)
+    may_train = threading.Event()
     with ThreadPoolExecutor(1) as executor:
-        first, second = fleet.engine("a", executor=executor), fleet.engine("b")
+        first = fleet.engine("a", recipe=waiting, executor=executor)
+        second = fleet.engine("b", recipe=waiting)
         learn(first, parts, range(30))
+        executor.submit(may_train.wait)
         first.retrain(wait=False)
         learn(second, parts, range(30, 40))
         learn(first, parts, range(40, 45))
+        may_train.set()
         executor.shutdown(wait=True)
-        for engine in (first, second, first, second):
+        for engine in (first, second):
             engine.poll()
-        assert first.version == second.version
+            assert engine.version == 1
+        assert first.store.versions.newest().state["trained_on"].tolist() == list(range(1, 31))
+        assert numbers(first) == numbers(second) == list(range(1, 46))
         assert counts(first, probe) == counts(second, probe)
-        assert (
-            len(first.model.index)
-            == len(second.model.index)
-            == sum(e.store.decisions.counts()["labels"] for e in (first, second))
-        )
 
 
 def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(
@@ -194,23 +232,19 @@ def test_a_reducer_without_arrays_is_refitted_on_the_same_traces(
     )
     learn(first, parts, range(50))
     learn(second, parts, range(50, 55))
-    first.poll()
-    assert second.version == first.version > 0
+    share(first, second)
     np.testing.assert_array_equal(counts(first, probe), counts(second, probe))
 
 
-def test_a_trace_that_came_in_two_cells_votes_once(fleet: Fleet, parts: Dataset) -> None:
-    first, second = fleet.engine("a"), fleet.engine("b")
-    learn(first, parts, range(30))
-    second.poll()
-    (before,) = counts(second, parts.X[100][None, None] + np.float32(0.01))
+def test_a_trace_that_came_in_two_cells_votes_once(fleet: Fleet, parts: Dataset, probe) -> None:
+    wide = RECIPE.with_settings(radius=1e6)  # every label is a neighbour
+    first, second = fleet.engine("a", recipe=wide), fleet.engine("b", recipe=wide)
     for engine in (first, second):
-        learn(engine, parts, [100])
-        engine.poll()
-    first.poll()
+        learn(engine, parts, range(15))
+    share(first, second)
     for engine in (first, second):
-        (after,) = counts(engine, parts.X[100][None, None] + np.float32(0.01))
-        assert sum(after) == sum(before) + 1
+        assert len(numbers(engine)) == 30
+        assert {sum(votes) for votes in counts(engine, probe)} == {15}
 
 
 def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_gaps(
@@ -220,7 +254,7 @@ def test_the_newest_labels_of_the_product_fill_the_window_and_bad_traces_leave_g
     for i in range(60, 70):
         first.report(first.decide(np.full(100, np.nan)).id, False)
         learn((first, second)[i % 2], parts, [i])
-    first.poll(), second.poll()
+    share(first, second)
     newest = first.store.labels.with_traces(30)
     np.testing.assert_array_equal(newest.seq, second.store.labels.with_traces(30).seq)
     assert len(newest.seq) == len(first.model.index) == len(second.model.index) == 30
@@ -247,8 +281,6 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
     assert [report.version for report in reports] == [1, 2]
     first.poll()
     assert first.version == second.version == 2
-    learn(first, parts, range(15, 20))
-    second.poll()
     assert predictions(first, probe) == predictions(second, probe)
 
 
@@ -389,17 +421,17 @@ def test_label_numbers_are_unique_and_increase_over_the_product(
 
 
 class ShakyNews:
-    """News of a product that cannot be asked for while `lost`; counts how often it was."""
+    """Looks for a product's newest version, which fail while `lost`; counts them."""
 
-    def __init__(self, labels: LabelTable) -> None:
-        self.lost, self.asked, self._news_since = False, 0, labels.news_since
-        labels.news_since = self
+    def __init__(self, versions: VersionTable) -> None:
+        self.lost, self.asked, self._newest_number = False, 0, versions.newest_number
+        versions.newest_number = self
 
-    def __call__(self, seq: int, limit: int) -> Any:
+    def __call__(self) -> int:
         self.asked += 1
         if self.lost:
             raise StoreError("The connection is gone.")
-        return self._news_since(seq, limit)
+        return self._newest_number()
 
 
 @ON_BOTH
@@ -407,7 +439,7 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
     fleet: Fleet, parts: Dataset, probe: np.ndarray, caplog
 ) -> None:
     first, second = fleet.engine("a"), fleet.engine("b")
-    shaky = ShakyNews(second.store.labels)
+    shaky = ShakyNews(second.store.versions)
     learn(first, parts, range(30))
     second.poll()
     asked = shaky.asked
@@ -415,19 +447,66 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
         second.decide(x)
     assert shaky.asked == asked  # no decision waits for news
     shaky.lost = True
-    for i in range(40):
+    for i in range(60):
         learn((first, second)[i % 2], parts, [100 + i])
         second.poll()
-    second.retrain()
+    assert second.version < first.version
+    with pytest.raises(StoreError, match="gone"):
+        second.retrain()
     assert [r.levelname for r in caplog.records if "news" in r.message] == ["WARNING"]
     shaky.lost = False
-    for engine in (second, first, second):
-        engine.poll()
+    second.poll()
     assert "comes again" in caplog.text
-    assert first.version == second.version
+    share(first, second)
     assert counts(first, probe) == counts(second, probe)
     again = fleet.engine("", recipe=None, store=reopened(fleet, second))
     assert counts(again, probe) == counts(first, probe)
+
+
+@ON_BOTH
+def test_every_label_counts_once_whoever_releases_a_version_or_brings_a_label_back(
+    fleet: Fleet, parts: Dataset, probe: np.ndarray
+) -> None:
+    waiting = RECIPE.with_settings(retrain_every=1000)
+    first, second = taught(fleet, parts, 60, waiting)
+    first.rollback(1)
+    second.poll()
+    learn(first, parts, range(60, 66))
+    learn(second, parts, range(66, 72))
+    gone = [past.decision.id for past in first.history() if past.success is not None][-1]
+    first.forget(gone)
+    first.release()  # its version lacks the second cell's newest labels, which that cell keeps
+    second.poll()
+    first.correct(gone, True)
+    second.poll()
+    learn(second, parts, range(72, 75))
+    second.rollback(second.version)
+    second.release()
+    first.poll()
+    everything = first.store.labels.with_traces().seq.tolist()
+    for engine in (first, second):
+        assert numbers(engine) == everything
+    assert counts(first, probe) == counts(second, probe)
+    before = predictions(first, probe)
+    again = fleet.engine("", recipe=None, store=reopened(fleet, first))
+    assert predictions(again, probe) == before
+
+
+def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(
+    fleet: Fleet, parts: Dataset, caplog
+) -> None:
+    first, second = taught(fleet, parts, 60)
+    version = second.version
+    first.retrain()
+    first.store.flush()
+    with first.store.database._engine.begin() as connection:
+        spoiled = sa.update(VERSION).where(VERSION.c.version == first.version)
+        connection.execute(spoiled.values(state=b"nothing"))
+    for _ in range(3):
+        second.poll()
+    assert second.version == version
+    assert caplog.text.count("cannot be used") == 1
+    share(first, second)
 
 
 @pytest.mark.parametrize(
@@ -485,7 +564,10 @@ def test_questions_about_a_product_go_down_an_index(tmp_path: Path) -> None:
     with SqlStore(str(tmp_path / "a.db"), "a", product="gear") as store:
         store.versions.put(RetrainReport(1, 0.1, 10, 1, True, ""), 0, {"w": np.ones(3)})
         with plans(tmp_path / "a.db") as result:
-            store.labels.news_since(5, 10)
+            store.versions.newest_number()
+            store.corrections.newest_number()
+            store.labels.with_traces(10, first=5)
+            store.labels.with_traces(10, first=5, cell_only=True)
             store.versions.load(1)
             store.corrections.after(1)
     assert len(result) >= 7

@@ -121,7 +121,7 @@ def score_changed_after_its_label(patch: pytest.MonkeyPatch) -> None:
 
 def corrected_label_counts_as_before(patch: pytest.MonkeyPatch) -> None:
     """References do not hear of corrections."""
-    patch.setattr(LiveModel, "apply_corrections", lambda self: True)
+    patch.setattr(LiveModel, "apply_corrections", lambda self, corrections: True)
 
 
 def corrected_outcome_counts_as_before(patch: pytest.MonkeyPatch) -> None:
@@ -157,7 +157,7 @@ def forgotten_label_in_the_weights(patch: pytest.MonkeyPatch) -> None:
 def label_lost_in_a_restart(patch: pytest.MonkeyPatch) -> None:
     """A restart forgets the labels since the newest version."""
     patch.setattr(
-        "dengine.engine.live_model.add_labels_since", lambda model, store, version, window: 0
+        "dengine.engine.live_model.add_labels_since", lambda model, store, version, capacity: 0
     )
 
 

@@ -11,6 +11,7 @@ compares, counts its comparisons in `compared`, and adds what differs to `faults
 """
 
 import io
+import itertools
 import json
 import math
 from collections import Counter
@@ -27,7 +28,7 @@ from ..rules.implementation import Rules, log_certificate
 from .directions import MEMORY, mean_difference
 from .hashing import fold, hash_of_part, hash_of_trace, is_audited
 from .histories import Case, Diary
-from .ledger import TOLD, Ledger, Moment, Part
+from .ledger import NEVER, TOLD, Ledger, Moment, Part
 
 CODES = {"verify": 0, "accept": 1, "reject": 2}
 RADIUS = 0.4
@@ -151,6 +152,7 @@ class Recount:
             id_: n for cell in range(case.n_cells) for id_, n in ledger.silent_before(cell).items()
         }
         self.spaces: dict[int, Space] = {0: self._untrained()}
+        self.shared: dict[int, frozenset[str]] = {0: frozenset()}  # references of each version
 
     def expect(self, kind: str, what: str, actual: Any, expected: Any) -> None:
         """Compare a value of the engine with the recount's."""
@@ -237,15 +239,42 @@ class Recount:
                 source = rollback["to"] if rollback is not None else version - 1
                 self.spaces[version] = self.spaces[source]
                 pinned = rollback is not None
+                if release is not None:  # the same model goes on
+                    at = (row["time"], TOLD)
+                    maker = int(row["cell_id"].split()[1])
+                    self.shared[version] = frozenset(self._references(maker, version - 1, at))
             else:
                 self.expect("pins", f"version {version} replaces a pinned one", pinned, False)
                 self.spaces[version] = self._train(row, state)
+            if release is None:
+                self.shared[version] = frozenset(
+                    part.row["id"]
+                    for part in self.ledger.parts
+                    if part.label is not None and part.label["seq"] <= row["last_seq"]
+                )
             space = self.spaces[version]
             weights = state["reducer.weights"]
             is_same = np.allclose(weights, space.weights, rtol=1e-6, atol=1e-9)
             self.expect("versions", f"weights of version {version}", is_same, True)
             is_same = np.array_equal(state["scale"], space.scale)
             self.expect("versions", f"scales of version {version}", is_same, True)
+
+    def _references(self, cell: int, version: int, at: Moment) -> set[str]:
+        """Return the decisions whose labels a cell counts at a moment, corrected or forgotten.
+
+        They are those that the version had when it was stored, and those of the cell. A label of
+        another cell that was brought back since then counts at once, too.
+        """
+        row = next((row for row in self.ledger.versions if row["version"] == version), None)
+        stored = (0.0 if row is None else row["time"], TOLD)
+        brought_back = {
+            part.row["id"]
+            for part in self.ledger.parts
+            for (_, before), (moment, now) in itertools.pairwise(part.corrections)
+            if before is None and now is not None and stored < moment < at
+        }
+        own = {p.row["id"] for p in self.ledger.of_cell(cell) if p.learned(at) != NEVER}
+        return own | self.shared[version] | brought_back
 
     def _train(self, row: dict[str, Any], state: dict[str, Any]) -> Space:
         """Return a trained version's spaces."""
@@ -348,7 +377,10 @@ class Recount:
         is_same = np.allclose(embedding, query, rtol=CLOSE, atol=CLOSE)
         self.expect("embeddings", row["id"], is_same, True)
         inside: list[tuple[int, bool]] = []
+        references = self._references(part.cell, row["model_version"], part.decided)
         for other in self.ledger.parts:
+            if other.row["id"] not in references:
+                continue
             if not other.teaches or self.hashes[other.row["id"]] == self.hashes[row["id"]]:
                 continue
             value = other.value_at(part.decided)
