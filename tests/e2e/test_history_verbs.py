@@ -2,7 +2,10 @@
 everything.
 """
 
+import re
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,111 +35,78 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(store: Path) -> None:
+def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(
+    store: Path, decisions: list[dict]
+) -> None:
     shown = succeed("history", store, "--last", 400, "--events").splitlines()
     assert max(map(len, shown)) <= TABLE_WIDTH == 120
-    newest = document("history", store, "--last", 1)["decisions"][0]
-    assert newest["id"] in shown[-1]
+    assert decisions[-1]["id"] in shown[-1]
     assert sum("  * retrain to version" in line for line in shown) >= 5
     assert any("  * safe mode ended:" in line for line in shown)
-    assert len([line for line in shown if newest["id"][:12] in line]) == 400
+    assert len([line for line in shown if decisions[-1]["id"][:12] in line]) == 400
 
 
 def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
-    asked = {"action": "accept", "reason": "certain", "label": "bad", "predicted": "accept"}
-    words = [
-        word
-        for name, value in asked.items()
-        for word in (f"--{name.replace('predicted', 'model')}", value)
-    ]
-    decisions = document("history", store, "--last", 1000, *words)["decisions"]
-    assert {tuple(item[name] for name in asked) for item in decisions} == {tuple(asked.values())}
-    assert document("history", store, "--since", "1h", "--last", 1000)["decisions"]
-    assert document("history", store, "--since", "2100-01-01")["decisions"] == []
+    asked = {"action": "accept", "reason": "certain", "label": "bad", "model": "accept"}
+    words = [word for name, value in asked.items() for word in (f"--{name}", value)]
+    names = ("action", "reason", "label", "predicted")
+    found = document("history", store, "--last", 1000, *words)["decisions"]
+    assert {tuple(item[name] for name in names) for item in found} == {tuple(asked.values())}
+    for words, some in (
+        ("--since 1h", True),
+        ("--since 2100-01-01", False),
+        ("--until 2001-01-01T10:00", False),
+    ):
+        assert bool(document("history", store, *words.split())["decisions"]) is some
     assert succeed("history", store, "--since", "2100-01-01") == "No decision of that kind.\n"
-    assert document("history", store, "--until", "2001-01-01T10:00")["decisions"] == []
 
 
-@pytest.mark.parametrize(
-    ("verb", "words", "expected"),
-    [
-        (
-            "history",
-            "--since yesterday",
-            "expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'",
-        ),
-        ("history", "--action pass", "'pass' is not one of"),
-        ("history", "--reason why", "'why' is not one of"),
-        ("history", "--last 0", "0 is not in the range"),
-        (
-            "explain",
-            "nonsense",
-            "or a decision's id, got 'nonsense', which is unknown; `dengine history STORE`",
-        ),
-    ],
-)
-def test_a_wrong_word_is_a_wrong_call(verb: str, words: str, expected: str, store: Path) -> None:
-    result = dengine(verb, store, *words.split())
-    assert result.exit_code == (1 if verb == "explain" else 2)
-    assert expected in result.stderr
-
-
-def ids(store: Path) -> dict[str, str]:
-    """The newest decision of each reason."""
-    return {
-        decision["reason"]: decision["id"]
-        for decision in document("history", store, "--last", 1000)["decisions"]
-    }
+def test_a_wrong_word_is_a_wrong_call(store: Path) -> None:
+    for line in WRONG.strip().splitlines():
+        call, expected = re.split("  +", line)
+        code, verb, *words = call.split()
+        result = dengine(verb, store, *words)
+        assert result.exit_code == int(code)
+        assert expected in result.stderr
 
 
 def test_every_reason_is_explained_in_80_columns_with_a_picture(
-    store: Path, tmp_path: Path
+    store: Path, newest: dict[str, str], tmp_path: Path
 ) -> None:
-    ids_by_reason = ids(store)
-    assert {"certain", "uncertain", "audit", "novel", "safe_mode", "no_model", "not_finite"} <= set(
-        ids_by_reason
-    )
-    for reason, id_ in ids_by_reason.items():
+    reasons = {"certain", "uncertain", "audit", "novel", "safe_mode", "no_model", "not_finite"}
+    assert reasons <= newest.keys()
+    for reason, id_ in newest.items():
         out = tmp_path / f"{reason}.png"
-        shown = succeed("explain", store, id_, "--out", out)
-        assert id_ in shown
+        assert id_ in succeed("explain", store, id_, "--out", out)
         assert out.read_bytes().startswith(b"\x89PNG")
         assert out.stat().st_size > 20_000
 
 
-def test_an_explanations_document_is_its_record(store: Path) -> None:
-    result = document("explain", store, ids(store)["certain"], "--neighbours", 4)
-    assert result["decision"]["id"] == ids(store)["certain"]
+def test_an_explanations_document_is_its_record(
+    store: Path, newest: dict[str, str], decisions: list[dict]
+) -> None:
+    result = document("explain", store, newest["certain"], "--neighbours", 4)
+    assert result["decision"]["id"] == newest["certain"]
     assert len(result["neighbours"]) == 4
     assert all(item["decision_id"] and "trace" not in item for item in result["neighbours"])
     assert result["bound"]["n_success"] == result["decision"]["n_success"]
     assert 0.0 <= result["envelope"]["outside"] <= 1.0
     assert result["sentences"][0].endswith("the bound meets the policy.")
-    newest = document("history", store, "--last", 1)["decisions"][0]
-    assert document("explain", store, "last")["decision"] | {"label": newest["label"]} == newest
+    last = document("explain", store, "last")["decision"]
+    assert last | {"label": decisions[-1]["label"]} == decisions[-1]
 
 
-def test_status_counts_the_newest_apart_from_all(store: Path) -> None:
+def test_status_counts_the_newest_apart_from_all(store: Path, decisions: list[dict]) -> None:
     result = document("status", store, "--last", 200)
-    decisions = document("history", store, "--last", 1000)["decisions"]
     for name, some in (("newest", decisions[-200:]), ("ever", decisions)):
-        span = result[name]
-        counts = {
-            "decisions": len(some),
-            "novel": sum(item["reason"] == "novel" for item in some),
-            "audits": sum(item["audit"] for item in some),
-            "quarantined": 1,
-        }
-        for action, counted in {"accept": "accepted", "reject": "rejected"}.items():
-            counts[counted] = sum(item["action"] == action for item in some)
-        counts["verified"] = len(some) - counts["accepted"] - counts["rejected"]
-        assert {key: span[key] for key in counts} == counts
-        labels = [item["label"] for item in some if item["action"] == "accept"]
-        bad, known = labels.count("bad"), labels.count("bad") + labels.count("good")
-        lower, upper = wilson_interval(known - bad, bad, 0.2)
-        accepts = span["bad_accepts"]
-        assert (accepts["n_known"], accepts["n_wrong"]) == (known, bad)
-        assert (accepts["lower"], accepts["upper"]) == pytest.approx((1 - upper, 1 - lower))
+        span, actions = result[name], Counter(item["action"] for item in some)
+        counted = [span[key] for key in ("accepted", "rejected", "verified", "decisions")]
+        assert counted == [actions[key] for key in ("accept", "reject", "verify")] + [len(some)]
+        assert span["novel"] == sum(item["reason"] == "novel" for item in some)
+        assert (span["audits"], span["quarantined"]) == (sum(item["audit"] for item in some), 1)
+        labels = Counter(item["label"] for item in some if item["action"] == "accept")
+        accepts = [span["bad_accepts"][key] for key in ("n_known", "n_wrong", "lower", "upper")]
+        assert accepts == share_of(labels["bad"], labels["bad"] + labels["good"], 0.2)
     assert result["newest"]["retrains"] < result["ever"]["retrains"] == len(result["retrains"])
     assert set(result["watch"]) == {"recovery", "accepts", "rejects", "novelty"}
     assert 0 <= result["new_labels"] <= result["recipe"]["retrain_every"] == 50
@@ -162,41 +132,27 @@ def test_known_escapes_stand_first_in_status_which_never_says_that_none_is_known
     stream: Dataset, tmp_path: Path
 ) -> None:
     with DataEngine(recipe=RECIPE, store=(store := tmp_path / "engine.db")) as engine:
-        cycles = drive(engine, stream, 0, 300)
-        accepted = next(
-            cycle
-            for cycle in reversed(cycles)
+        *_, accepted = (
+            cycle.decision.id
+            for cycle in drive(engine, stream, 0, 300)
             if cycle.decision.action is Action.ACCEPT and cycle.success is None
         )
-        engine.report(accepted.decision.id, False)
+        engine.report(accepted, False)
     words = " ".join(succeed("status", store).split())
-    assert (words.split("│")[1].strip(), document("status", store)["ever"]["false_accepts"]) == (
-        "accepted, and bad",
-        1,
-    )
+    assert words.split("│")[1].strip() == "accepted, and bad"
     assert "1 stop; else unknown" in words
+    assert document("status", store)["ever"]["false_accepts"] == 1
 
 
 def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
-    some, every = (
-        Policy(alpha=0.1, lower_bound=0.9),
-        Policy(alpha=0.1, lower_bound=0.9, stops="all"),
-    )
-    silent = Outcomes(50, 3, 0, 0, 0, 0, 0, 0)
-    assert (bad_accepts(silent, some).basis, bad_accepts(silent, some).upper) == ("", 1.0)
-    confirmed = Outcomes(50, 3, 47, 0, 0, 0, 0, 0)
-    assert bad_accepts(confirmed, some) == bad_accepts(confirmed, every)
-    assert (bad_accepts(confirmed, every).n_known, bad_accepts(confirmed, every).n_wrong) == (50, 3)
-    audited = Outcomes(50, 3, 0, 40, 0, 0, 0, 0)
-    assert (bad_accepts(audited, some).basis, bad_accepts(audited, some).n_known) == ("audits", 40)
-    assert bad_accepts(audited, some).verdict == "kept"
-    assert (
-        bad_accepts(Outcomes(50, 6, 0, 40, 0, 0, 0, 0), some).verdict == "open"
-    )  # as many as 6 of 50 are known to be bad
-    assert bad_accepts(Outcomes(50, 20, 0, 40, 0, 0, 0, 0), some).verdict == "broken"
-    assert bad_accepts(Outcomes(50, 30, 20, 0, 0, 0, 0, 0), every).verdict == "broken"
-    assert bad_accepts(Outcomes(10, 1, 9, 0, 0, 0, 0, 0), every).verdict == "open"
-    assert bad_accepts(Outcomes(*[0] * 8), every).upper == 1.0
+    for line in KNOWN.strip().splitlines():
+        stops, *counts = line[:16].split()
+        n_known, verdict = line[30:].split()
+        policy = Policy(alpha=0.1, lower_bound=0.9, stops=stops)
+        known = bad_accepts(Outcomes(*map(int, counts)), policy)
+        assert (known.basis, known.n_known) == (line[16:30].strip(), int(n_known)), line
+        assert known.verdict == verdict, line
+    assert bad_accepts(Outcomes(50, 3), policy).upper == bad_accepts(Outcomes(), policy).upper == 1
 
 
 def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(
@@ -205,23 +161,61 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     store = tmp_path / "engine.db"
     with DataEngine(recipe=RECIPE, store=store) as engine:
         drive(engine, stream, 0, 30)
-        assert "would accept │ none is known" in " ".join(succeed("status", store).split())
+        assert "would accept none is known" in line_of("status", store)
         engine.set_shadow(True)
         cycles = drive(engine, stream, 30, 300)
     certain = [cycle for cycle in cycles if cycle.decision.audit]
     result = document("status", store)
-    assert result["shadow"] is True
+    ever = result["ever"]
     for name, action in (("would_accept", Action.ACCEPT), ("would_reject", Action.REJECT)):
         true = [cycle.success for cycle in certain if cycle.decision.predicted is action]
         wrong = true.count(action is Action.REJECT)
-        span = result["ever"][name]
-        lower, upper = wilson_interval(len(true) - wrong, wrong, 0.05)  # whatever the policy's
-        assert (span["n"], span["n_wrong"]) == (len(true), wrong)
-        assert (span["lower"], span["upper"]) == pytest.approx((1 - upper, 1 - lower))
-    accept = result["ever"]["would_accept"]
-    assert (accept["n"] > 50, accept["verdict"]) == (True, "kept")
-    assert result["certificate"]["accepted"]["shadowed"]
-    assert result["ever"]["bad_accepts"]["n_known"] == 0  # nothing was accepted
-    n, words = len(certain), line_of("status", store, "--check-seconds", "60")
-    assert f"decided {n} of the {result['ever']['verified']} parts" in words
-    assert f": {60 * n} s of" in words
+        counted = [ever[name][key] for key in ("n", "n_wrong", "lower", "upper")]
+        assert counted == share_of(wrong, len(true), 0.05)  # whatever the policy's alpha is
+    assert ever["would_accept"]["n"] > 50
+    assert ever["would_accept"]["verdict"] == "kept"
+    assert result["shadow"] is result["certificate"]["accepted"]["shadowed"] is True
+    assert ever["bad_accepts"]["n_known"] == 0  # nothing was accepted
+    words = line_of("status", store, "--check-seconds", "60")
+    assert f"decided {len(certain)} of the {ever['verified']} parts" in words
+    assert f": {60 * len(certain)} s of" in words
+
+
+# Who tells of stops; parts that were accepted, bad ones among them, confirmed good ones, and audited ones; what is known.
+KNOWN = """
+some 50  3  0  0               0 open
+some 50  3 47  0 every outcome 50 open
+all  50  3 47  0 every outcome 50 open
+some 50  3  0 40 audits        40 kept
+some 50  6  0 40 audits        40 open
+some 50 20  0 40 audits        40 broken
+all  50 30 20  0 every outcome 50 broken
+all  10  1  9  0 every outcome 10 open
+"""
+
+
+def share_of(wrong: int, n: int, alpha: float) -> Any:
+    """A share and Wilson's interval of it, as a document has them."""
+    lower, upper = wilson_interval(n - wrong, wrong, alpha)
+    return pytest.approx([n, wrong, 1 - upper, 1 - lower])
+
+
+WRONG = """
+2 history --since yesterday  expected 30m, 12h, 7d or 2026-03-01T14:30, got 'yesterday'
+2 history --action pass      'pass' is not one of
+2 history --reason why       'why' is not one of
+2 history --last 0           0 is not in the range
+1 explain nonsense           or a decision's id, got 'nonsense', which is unknown; `dengine history
+"""
+
+
+@pytest.fixture(scope="module")
+def newest(decisions: list[dict]) -> dict[str, str]:
+    """The id of the newest decision of each reason."""
+    return {decision["reason"]: decision["id"] for decision in decisions}
+
+
+@pytest.fixture(scope="module")
+def decisions(store: Path) -> list[dict]:
+    """All decisions of the store, oldest first."""
+    return document("history", store, "--last", 1000)["decisions"]
