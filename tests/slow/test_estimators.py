@@ -29,7 +29,7 @@ from dengine.reducers.base import LabelFree, Reducer
 
 ESTIMATORS = (
     WilsonRadiusClassifier(),
-    ConvReducer(fit_steps=10),
+    ConvReducer(fit_steps=2),
     RocketReducer(),
     PcaReducer(),
     UmapReducer(
