@@ -51,10 +51,13 @@ def played(
     kind are the same in every shuffle.
     """
     action = ["verify"] * verified + ["accept"] * accepted + ["reject"] * rejected
-    truth = np.ones(len(action), dtype=bool)
-    truth[verified : verified + bad] = False
-    truth[verified + accepted + good :] = False
+    truth = [1] * verified + [0] * bad + [1] * (accepted - bad + good) + [0] * (rejected - good)
     return replay_of(action, truth, recipe=Recipe("pca", policy=policy), seed=seed)
+
+
+def four(policy: Policy, *counts: int, **others: int) -> dict[Policy, list[Replay]]:
+    """Four shuffles of the same."""
+    return {policy: [played(policy, seed, *counts, **others) for seed in range(4)]}
 
 
 def curve(
@@ -64,10 +67,7 @@ def curve(
     others were bad.
     """
     groups = {
-        policy: [
-            played(policy, seed, verified, 100 - verified, bad)
-            for seed, (verified, bad) in enumerate(item)
-        ]
+        policy: [played(policy, seed, n, 100 - n, bad) for seed, (n, bad) in enumerate(item)]
         for policy, item in ((LAX, lax), (STRICT, strict))
     }
     return curve_of(groups, COSTS)
@@ -82,16 +82,10 @@ def test_a_parts_cost_is_its_check_or_its_wrong_decision() -> None:
 
 def test_a_part_that_an_operators_limits_reject_was_not_checked_and_pays_for_no_policy() -> None:
     reason = np.array(["certain"] * 80 + ["outside"] * 20)
-    groups = {
-        policy: [
-            replace(played(policy, seed, 60, 15, 0, rejected=25), reason=reason)
-            for seed in range(4)
-        ]
-        for policy in (LAX, STRICT)
-    }
-    for row in curve_of(groups, COSTS).rows:
-        assert (row.verified, row.accepted + row.rejected) == pytest.approx((0.6, 0.2))
-        assert row.cost == pytest.approx(5 * 0.8)
+    (replays,) = four(LAX, 60, 15, 0, rejected=25).values()
+    (row,) = curve_of({LAX: [replace(item, reason=reason) for item in replays]}, COSTS).rows
+    assert (row.verified, row.accepted + row.rejected) == pytest.approx((0.6, 0.2))
+    assert row.cost == pytest.approx(5 * 0.8)
 
 
 def test_no_row_is_cheaper_than_the_marked_one_unless_a_sentence_says_that_this_is_chance() -> None:
@@ -116,9 +110,8 @@ def test_the_interval_moves_the_errors_to_their_ends_and_adds_the_luck_of_the_or
 
 
 def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everything() -> None:
-    clear = {LAX: [played(LAX, seed, 100, 2900, 10) for seed in range(4)]}
-    assert curve_of(clear, COSTS).verdict == "pays"
-    assert curve_of(clear, COSTS).missing is None
+    clear = curve_of(four(LAX, 100, 2900, 10), COSTS)
+    assert (clear.verdict, clear.missing) == ("pays", None)
     doubtful = curve(lax=[(50, 0)] * 4)
     assert (doubtful.verdict, doubtful.policy) == ("may pay", LAX)
     assert "may be bad, and accepting pays up to 5 %" in doubtful.sentence
@@ -141,20 +134,18 @@ def alone(
 def test_as_many_parts_as_are_missing_turn_may_pay_into_pays(kinds: dict[str, int]) -> None:
     result = alone(**kinds)
     missing = result.missing
-    assert missing is not None
     scale = 1 + missing.recordings / result.cycles
 
-    def times(n: int) -> CostCurve:
-        return alone(verified=50 * n, **{kind: n * count for kind, count in kinds.items()})
+    def verdict(n: int) -> str:
+        return alone(verified=50 * n, **{kind: n * m for kind, m in kinds.items()}).verdict
 
-    assert times(math.ceil(scale)).verdict == "pays"
-    assert times(math.ceil(scale) - 1).verdict == "may pay"
+    n = math.ceil(scale)
+    assert (verdict(n), verdict(n - 1)) == ("pays", "may pay")
     assert missing.accepted == pytest.approx(kinds["accepted"] * scale, rel=0.03, abs=1)
 
 
 def test_a_policy_whose_every_reject_was_wrong_has_a_verdict_and_a_sentence() -> None:
-    replays = [played(LAX, seed, 74, 75, 0, rejected=1, good=1) for seed in range(4)]
-    result = curve_of({LAX: replays}, Costs(5, 600, 30))
+    result = curve_of(four(LAX, 74, 75, 0, rejected=1, good=1), Costs(5, 600, 30))
     assert (result.verdict, result.rows[0].good.upper) == ("may pay", 1.0)
     assert result.missing is not None
     assert "Not certainly" in result.sentence
@@ -163,7 +154,6 @@ def test_a_policy_whose_every_reject_was_wrong_has_a_verdict_and_a_sentence() ->
 def test_what_is_missing_is_stated_in_parts_recordings_and_production() -> None:
     result = alone(50)
     missing = result.missing
-    assert missing is not None
     # Wilson's end z^2 / (n + z^2) of no bad one among n parts is 5 % at n = 19 z^2, z = 2.2414.
     assert (missing.accepted, missing.seen) == (math.ceil(19 * 2.241403**2), 50)
     assert (missing.recordings, missing.production, missing.audit_rate) == (91, 191, 1.0)
@@ -173,27 +163,24 @@ def test_what_is_missing_is_stated_in_parts_recordings_and_production() -> None:
         "count as 50: 91 more recordings, or 191 parts of production where every bad accepted part "
         "stops the line."
     ) in result.sentence
-    by_audits = alone(50, stops="some").missing
-    assert by_audits is not None
-    assert (by_audits.production, by_audits.audit_rate) == (191 * 20, 0.05)
-    assert "parts of production at an audit rate of 5 %" in alone(50, stops="some").sentence
+    by_audits = alone(50, stops="some")
+    assert by_audits.missing.production == 191 * 20
+    assert by_audits.missing.audit_rate == 0.05
+    assert "parts of production at an audit rate of 5 %" in by_audits.sentence
 
 
-@pytest.mark.parametrize("lax", [[(50, 5)] * 4, [(50, 3), (50, 2)] * 2])
+@pytest.mark.parametrize("lax", [[(50, 5)] * 4, [(50, 3), (50, 2)] * 2, [(100, 0)] * 4])
 def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: list[tuple[int, int]]) -> None:
     result = curve(lax)
     assert (result.verdict, result.policy) == ("does not pay", None)
-    assert result.sentence.startswith("Nothing pays: verifying everything costs 5 a part")
+    nothing = "Nothing pays: verifying everything costs 5 a part, and everything was verified."
+    assert result.sentence == f"{nothing} Record more."
     assert not result.to_frame()["chosen"].any()
-    nothing = curve(lax=[(100, 0)] * 4)
-    assert nothing.verdict == "does not pay"
-    assert nothing.sentence.endswith("everything was verified. Record more.")
 
 
 def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear() -> None:
-    groups = {LAX: [played(LAX, seed, 99, 1, 0) for seed in range(4)]}
     dear, cheap = (
-        curve_of(groups, Costs(check=5, escape=escape, false_reject=20)) for escape in (25, 15)
+        curve_of(four(LAX, 99, 1, 0), Costs(5, escape, false_reject=20)) for escape in (25, 15)
     )
     assert dear.marked.cost == cheap.marked.cost == 4.95
     assert (dear.verdict, cheap.verdict) == ("does not pay", "may pay")
@@ -201,17 +188,12 @@ def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear(
 
 
 def test_it_says_which_price_would_change_the_choice() -> None:
-    groups = {
-        LAX: [played(LAX, seed, 200, 800, 12) for seed in range(4)],
-        STRICT: [played(STRICT, seed, 600, 400, 0) for seed in range(4)],
-    }
-    result = curve_of(groups, COSTS)
+    result = curve_of(four(LAX, 200, 800, 12) | four(STRICT, 600, 400, 0), COSTS)
     assert result.policy == LAX  # 2.2, where the stricter one costs 3.0
     assert "with escape at 200, alpha 0.05, LB 95 %" in result.price_changes
     assert result.price_sentence.startswith("The choice depends on the prices: with ")
     assert not any("escape at 50," in change for change in result.price_changes)
-    steady = curve(lax=[(20, 0)] * 4)
-    assert "the choice stays" in steady.price_sentence
+    assert "the choice stays" in curve(lax=[(20, 0)] * 4).price_sentence
 
 
 def test_needed_neighbours_are_those_of_the_interval_and_needed_members_those_of_the_bet() -> None:
@@ -219,39 +201,38 @@ def test_needed_neighbours_are_those_of_the_interval_and_needed_members_those_of
     assert needed_parts(Policy(0.05, 0.95)) == 73
     assert needed_parts(Policy(0.05, 0.95, interval="clopper_pearson")) == 72
     pooled = Policy(0.05, 0.95, guarantee="pooled", stops="all")
-    rule = pooled.rule()
-    for _ in range(needed_parts(pooled)):
-        assert rule.action(0.99, 0.99) == 0
+    rule, n = pooled.rule(), 0
+    while rule.action(0.99, 0.99) == 0:
         rule.update(0.99, 0.99, True, 0, 1.0)
-    assert rule.action(0.99, 0.99) == 1
+        n += 1
+    assert needed_parts(pooled) == n
     assert needed_parts(Policy(prices=(5, 120, 47.5))) == 0
 
 
 def test_candidates_lie_around_break_even_and_have_the_audits_that_they_need() -> None:
     costs = Costs(0.5, 200, 5)
-    found = list(candidates(Contender.load("pca"), costs, (), ()))
-    by_kind = {kind: [c for c in found if c["guarantee"] == kind] for kind in ("local", "pooled")}
-    levels = [change["lower_bound"] for change in by_kind["local"]]
+
+    def tried(recipe: Any, alphas: Any = (), bounds: Any = ()) -> list[dict[str, Any]]:
+        return list(candidates(Contender.load(recipe), costs, alphas, bounds))
+
+    found = tried("pca")
+    levels = [change["lower_bound"] for change in found if change["guarantee"] == "local"]
     assert levels == [0.96, 0.98, 0.99, 0.995, 0.9975, 0.9987]  # break-even is 99.75 %
     assert {change["audit_rate"] for change in found if "audit_rate" in change} == {0.05}
     assert found[-1] == {"guarantee": "cost", "prices": (0.5, 200, 5), "audit_rate": 0.05}
-    silent = list(candidates(Contender.load(RECIPE), costs, (), ()))
-    assert silent[-1]["audit_rate"] == 0.0
-    stated = list(candidates(Contender.load("knn"), costs, (0.2, 0.05), (0.9,)))
-    assert stated == [
+    assert tried(RECIPE)[-1]["audit_rate"] == 0.0
+    assert tried("knn", (0.2, 0.05), (0.9,)) == [
         {"guarantee": "local", "alpha": alpha, "lower_bound": 0.9} for alpha in (0.2, 0.05)
     ]
 
 
 def test_a_policy_that_the_recordings_cannot_support_is_named_with_what_it_needs(data) -> None:
-    search = PolicySearch(data, "pca", Costs(0.5, 200, 0.9))
-    n_good = int(data.y.sum())
+    search, n_good = PolicySearch(data, "pca", Costs(0.5, 200, 0.9)), int(data.y.sum())
     needed = needed_parts(Policy(0.1, 0.9975))
     note = f"alpha 0.1, LB 99.75 % needs {needed:,} good neighbours, {n_good} good parts are played"
     assert note in search.out_of_reach
-    refused = [text for text in search.out_of_reach if text.startswith("guarantee cost: ")]
-    assert len(refused) == 1
-    assert "errors above two checks" in refused[0]
+    (refused,) = [text for text in search.out_of_reach if text.startswith("guarantee cost: ")]
+    assert "errors above two checks" in refused
     assert all(needed_parts(item.recipe.policy) <= n_good for item in search.remaining)
 
 
@@ -293,33 +274,35 @@ def cheaper_by_level(tasks: Sequence[Task]) -> list[Replay]:
     ]
 
 
+BOUNDS = (0.6, 0.7, 0.8, 0.85, 0.88, 0.9)
+
+
 def test_the_cheaper_half_plays_on_and_the_last_two_report_on_shuffles_that_chose_nothing(
     data: Dataset,
 ) -> None:
     rounds = []
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
-        rounds.append(tasks)
+        policies = {task.contender.recipe.policy for task in tasks}
+        rounds.append((len(policies), sorted({task.seed for task in tasks})))
         return cheaper_by_level(tasks)
 
-    bounds = (0.6, 0.7, 0.8, 0.85, 0.88, 0.9)
-    search = PolicySearch(data, "knn", COSTS, lower_bounds=bounds, alphas=(0.2,), repeats=3, seed=7)
+    search = PolicySearch(data, "knn", COSTS, lower_bounds=BOUNDS, alphas=(0.2,), repeats=3, seed=7)
     search.run(play)
-    numbers = [len({task.contender.recipe.policy for task in tasks}) for tasks in rounds]
-    seeds = [sorted({task.seed for task in tasks}) for tasks in rounds]
-    assert (numbers, seeds) == ([6, 3, 2], [[7, 8], [9, 10], [11, 12, 13]])
+    assert rounds == [(6, [7, 8]), (3, [9, 10]), (2, [11, 12, 13])]
     result = search.curve()
-    assert [row.policy.lower_bound for row in result.rows] == [0.6, 0.7]
-    assert sorted(row.policy.lower_bound for row in result.left_behind) == [0.8, 0.85, 0.88, 0.9]
+    rows = (*result.rows, *result.left_behind)
+    assert [row.policy.lower_bound for row in rows[:2]] == [0.6, 0.7]
+    assert sorted(row.policy.lower_bound for row in rows[2:]) == [0.8, 0.85, 0.88, 0.9]
     assert (result.shuffles, result.fresh) == (3, True)
     frame = result.to_frame()
-    assert list(frame["reported"]) == [True, True, False, False, False, False]
+    assert list(frame["reported"]) == [True] * 2 + [False] * 4
     assert frame["chosen"].sum() == 1
 
 
-@pytest.mark.parametrize(("n_rounds", "fresh"), [(1, False), (2, False), (3, True)])
+@pytest.mark.parametrize(("n_rounds", "fresh"), [(0, None), (1, False), (2, False), (3, True)])
 def test_a_search_that_is_interrupted_shows_what_was_finished(
-    n_rounds: int, fresh: bool, data: Dataset
+    n_rounds: int, fresh: bool | None, data: Dataset
 ) -> None:
     rounds = []
 
@@ -327,46 +310,46 @@ def test_a_search_that_is_interrupted_shows_what_was_finished(
         rounds.append(tasks)
         return cheaper_by_level(tasks if len(rounds) <= n_rounds else tasks[:1])
 
-    search = PolicySearch(data, "knn", COSTS, lower_bounds=(0.6, 0.7, 0.8, 0.85, 0.88, 0.9))
+    search = PolicySearch(data, "knn", COSTS, lower_bounds=BOUNDS)
     search.run(play)
     result = search.curve()
-    assert (len(rounds), result.fresh) == (min(3, n_rounds + 1), fresh)
-    assert ("these shuffles also chose the policy" in result.sentence) != fresh
-    nothing = PolicySearch(data, "knn", COSTS)
-    nothing.run(lambda tasks: cheaper_by_level(tasks[:1]))
-    assert nothing.curve() is None
+    assert len(rounds) == min(3, n_rounds + 1)
+    assert (result and result.fresh) is fresh
+    assert not result or ("these shuffles also chose the policy" in result.sentence) != fresh
 
 
-def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejected(
-    make_data: Callable[..., Dataset],
-) -> None:
-    data = make_data(160)
-    scores = replay(data, Recipe("rocket", policy=Policy(shadow=True)), 3)
-    for changes in (
+@pytest.mark.parametrize(
+    "changes",
+    [
         {"guarantee": "local", "alpha": 0.5, "lower_bound": 0.8},
         {"guarantee": "pooled", "lower_bound": 0.7},
         {"prices": (5, 20, 11), "audit_rate": 0.0},
-    ):
-        policy = Policy(stops="all").changed(**changes)
-        shared = replay_policy(scores, policy)
-        alone_ = replay(data, Recipe("rocket", policy=policy), 3)
-        first = int(np.argmax(np.append(alone_.action == "reject", True)))
-        assert (alone_.action[:first] != "verify").any(), changes
-        np.testing.assert_array_equal(shared.action[: first + 1], alone_.action[: first + 1])
-        assert shared.recipe.policy == policy
+    ],
+)
+def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejected(
+    changes: dict[str, Any], make_data: Callable[..., Dataset]
+) -> None:
+    data, recipe = make_data(110), Recipe("rocket", {"kernels": 6, "width": 8}, retrain_every=40)
+    policy = Policy(stops="all").changed(**changes)
+    shadow, whole = (replace(recipe, policy=item) for item in (Policy(shadow=True), policy))
+    shared, alone_ = replay_policy(replay(data, shadow, 3), policy), replay(data, whole, 3)
+    first = int(np.argmax(np.append(alone_.action == "reject", True)))
+    assert (alone_.action[:first] != "verify").any()
+    np.testing.assert_array_equal(shared.action[: first + 1], alone_.action[: first + 1])
+    assert shared.recipe.policy == policy
 
 
 def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data) -> None:
+    data = make_data(120)
     found = cost_curve(
-        make_data(160), recipe=RECIPE, alphas=(0.5,), lower_bounds=(0.8,), cycles=120, repeats=2,
-        **PRICES,
-    )  # fmt: skip
+        data, recipe=RECIPE, alphas=(0.5,), lower_bounds=(0.8,), cycles=90, repeats=2, **PRICES
+    )
     seeds = (2, 3)  # the first two shuffles chose
     for row in found.rows:
-        again = [replay(make_data(160), replace(RECIPE, policy=row.policy), s, 120) for s in seeds]
+        again = [replay(data, replace(RECIPE, policy=row.policy), seed, 90) for seed in seeds]
         assert row.policy.stops == "all"
         assert row.cost == pytest.approx(np.mean([part_costs(r, found.costs) for r in again]))
-    assert (found.cycles, found.shuffles, found.dataset) == (120, 2, "insertion-like")
+    assert (found.cycles, found.shuffles, found.dataset) == (90, 2, "insertion-like")
     kinds = {row.policy.guarantee for row in (*found.rows, *found.left_behind)}
     assert kinds == {"local", "pooled", "cost"}
 
@@ -392,8 +375,7 @@ def test_the_lines_that_are_shown_set_the_policy(policy: Policy) -> None:
 def test_the_picture_names_every_policy_and_marks_what_leaves_its_axes() -> None:
     lucky = replace(alone(50).marked, upper=80.0)
     result = replace(curve(lax=[(50, 0)] * 4), left_behind=(lucky,))
-    left = cost_picture(result, unit="EUR").axes[0]
-    rows = (*result.rows, lucky)
+    left, rows = cost_picture(result, unit="EUR").axes[0], (*result.rows, lucky)
     assert left.get_xlabel() == "cost a part [EUR]"
     names = [text.get_text() for text in left.get_yticklabels()]
     assert names == [policy_name(row.policy) for row in rows]
@@ -437,7 +419,6 @@ def recordings(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def test_the_verb_shows_a_table_and_writes_the_curve(recordings: Path) -> None:
     shown = succeed(*WORDS, "--out", "out")
-    assert max(map(len, shown.splitlines())) <= 80
     assert (recordings / "out" / "costs.png").stat().st_size > 10_000
     n_rows = (recordings / "out" / "costs.csv").read_text(encoding="utf-8").count("\n") - 1
     result, text = document(*WORDS), " ".join(shown.split())
