@@ -1,6 +1,5 @@
 """What an engine records is found at once and stored in its order, with a journal and without; what
-becomes of records that are damaged in the journal; recorder, drainer and index each alone.
-"""
+becomes of records that are damaged in the journal.
 
 import threading
 import time
@@ -15,14 +14,11 @@ import pytest
 from dengine.errors import NotTakenError, StoreError
 from dengine.records import Action, Reason, Source
 from dengine.store import NewLabel, SqlStore, StoredDecision, draining, lookup
-from dengine.store.draining import Drainer
 from dengine.store.journal import Journal
 from dengine.store.journalled import JournalledStore
-from dengine.store.lookup import DecisionIndex
 from dengine.store.memory import MemoryStore
 from dengine.store.opening import open_outbox
 from dengine.store.outbox import Outbox
-from dengine.store.recording import Recorder
 from tests.support.stores import decision, label, report, trace
 
 
@@ -59,8 +55,8 @@ def damage(folder: Path, *texts: bytes) -> None:
     file.write_bytes(content)
 
 
-def journal_events(box: Outbox) -> list[str]:
-    return [event.text for event in box.store.events.newest() if event.kind == "journal"]
+def events(box: Outbox, kind: str) -> list[str]:
+    return [event.text for event in box.store.events.newest() if event.kind == kind]
 
 
 def test_a_damaged_label_that_waits_alone_is_stored_from_memory(
@@ -73,12 +69,10 @@ def test_a_damaged_label_that_waits_alone_is_stored_from_memory(
     damage(tmp_path, b"NewLabel")
     assert box.request_label_drain()
     box.drain()
-    assert not box.request_label_drain()
-    assert box.fault == ""
-    assert box.is_drained
+    assert (box.request_label_drain(), box.fault, box.is_drained) == (False, "", True)
     assert box.store.decisions.get("part 1").success is True
     assert box.store.labels.newest() == 1
-    (text,) = journal_events(box)
+    (text,) = events(box, "journal")
     assert text.startswith("1 records of ")
     assert text.endswith("are stored from memory; decisions that are lost: none.")
 
@@ -88,24 +82,16 @@ def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(
 ) -> None:
     items = [box.record_decision(stored(f"part {i}")) for i in range(4)]
     box.record_labels([(item, label(item.decision.id)) for item in items[:2]])
-    box.record_event("hello", "the first")
-    box.record_event("hello", "the last")
+    for text in ("the first", "the last"):
+        box.record_event("hello", text)
     box.sync()
     damage(tmp_path, b'part 0", "action', b'part 2", "action', b"NewLabel", b"the last")
     box.drain()
-    assert box.store.decisions.newest_number() == 4
-    assert [box.store.decisions.get(f"part {i}").success for i in range(4)] == [
-        True,
-        True,
-        None,
-        None,
-    ]
-    np.testing.assert_array_equal(box.store.decisions.get("part 0").trace, items[0].trace)
-    assert [event.text for event in box.store.events.newest() if event.kind == "hello"] == [
-        "the first",
-        "the last",
-    ]
-    (text,) = journal_events(box)
+    found = [box.store.decisions.get(f"part {i}") for i in range(4)]
+    assert [item.success for item in found] == [True, True, None, None]
+    np.testing.assert_array_equal(found[0].trace, items[0].trace)
+    assert events(box, "hello") == ["the first", "the last"]
+    (text,) = events(box, "journal")
     assert text.startswith("4 records of ")
 
 
@@ -113,21 +99,18 @@ def test_a_damaged_decision_that_is_not_in_memory_any_more_is_named_in_an_event(
     box: Outbox, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lookup, "N_RECENT", 1)
-    lost = box.record_decision(stored("part 1"))
-    box.record_labels([(lost, label("part 1"))])
-    kept = box.record_decision(stored("part 2"))
-    box.record_labels([(kept, label("part 2"))])
+    for name in ("part 1", "part 2"):
+        box.record_labels([(box.record_decision(stored(name)), label(name))])
     box.sync()
+    assert box.find_decision("part 1").decision.id == "part 1"  # in the journal alone
     damage(tmp_path, b'part 1", "action')
     box.drain()
-    assert box.fault == ""
-    assert not box.request_label_drain()
-    assert box.store.decisions.get("part 1") is None
-    assert box.find_decision("part 1") is None
+    assert (box.fault, box.request_label_drain()) == ("", False)
+    assert box.store.decisions.get("part 1") is box.find_decision("part 1") is None
     assert box.store.decisions.get("part 2").success is True
-    (text,) = (event.text for event in box.store.events.newest() if event.kind == "lost")
+    (text,) = events(box, "lost")
     assert text.endswith("decisions that are lost: part 1.")
-    (letter,) = (event.text for event in box.store.events.newest() if event.kind == "dead letter")
+    (letter,) = events(box, "dead letter")
     assert "a label, success from verification, on 'part 1'" in letter
 
 
@@ -140,8 +123,24 @@ def test_a_journal_that_was_damaged_while_its_engine_ran_is_no_fault_at_the_next
     box.close()
     with opened(tmp_path) as again:
         assert again.find_decision("part 1") is not None
-        assert len(journal_events(again)) == 1
+        assert len(events(again, "journal")) == 1
         assert again.verify_all_reason == ""
+
+
+def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(
+    box: Outbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*records: object) -> list[int]:
+        raise StoreError("the disk is full")
+
+    monkeypatch.setattr(Journal, "append", fail)
+    box.record_decision(stored("a"))
+    with pytest.raises(NotTakenError, match="the disk is full"):
+        box.sync()
+    assert box.fault == "the disk is full"
+    monkeypatch.undo()
+    box.sync()
+    assert box.fault == ""
 
 
 @pytest.fixture(params=["memory", "file"])
@@ -174,7 +173,7 @@ def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either: Outbo
     labelled = either.store.labels.with_traces()
     assert (labelled.seq.tolist(), labelled.labels.tolist()) == ([1, 2], [0, 1])
     assert either.pop_label_numbers() == []
-    assert [event.text for event in either.store.events.newest()] == ["there"]
+    assert events(either, "hello") == ["there"]
     assert either.find_earlier("c").decision.id == "c"
     assert either.find_earlier("d") is None
     assert (either.is_drained, either.request_label_drain()) == (True, False)
@@ -182,9 +181,7 @@ def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either: Outbo
 
 
 def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either: Outbox) -> None:
-    accepted = StoredDecision(
-        decision("a", Action.ACCEPT, Reason.CERTAIN), trace(), 1, False, time.time()
-    )
+    accepted = replace(stored("a"), decision=decision("a", Action.ACCEPT, Reason.CERTAIN))
     item = either.record_decision(accepted)
     either.record_labels([(item, label("a", True, source=Source.CONFIRMED))])
     either.drain()
@@ -213,8 +210,8 @@ def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(
     either.check_usable()
     item = either.record_decision(stored("a"))
     either.record_labels([(item, *numbered(either, label("a")))])
-    either.close()
-    either.close()
+    for _ in range(2):
+        either.close()
     with pytest.raises(StoreError, match="after close"):
         either.check_usable()
     again = either.store
@@ -262,91 +259,3 @@ def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path: Path) -> 
         reader.record_event("export", "a file")
         reader.close()
         assert [event.text for event in owner.store.events.newest()] == ["a file"]
-
-
-@pytest.fixture
-def journal(tmp_path: Path) -> Iterator[Journal]:
-    created = Journal(tmp_path / "cell.journal")
-    yield created
-    created.close()
-
-
-@pytest.fixture
-def recorder(journal: Journal) -> Recorder:
-    return Recorder(journal, time.time, 10.0)
-
-
-def test_a_recorder_alone_syncs_records_in_their_order(recorder: Recorder) -> None:
-    recorder.record(stored("a"))
-    with pytest.raises(NotTakenError, match="no answer within 0 s"):
-        recorder.sync(0.0)  # nobody writes
-    assert (recorder.n_recorded, recorder.n_synced, recorder.oldest is None) == (1, 0, False)
-    recorder.start()
-    recorder.record_event("hello", "there")
-    recorder.sync()
-    assert recorder.n_synced == 2
-    first, second = recorder.synced
-    assert (first.decision_id, first.record, second.decision_id) == ("a", None, "")
-    assert 0 < first.offset < first.end <= second.offset < second.end
-    assert recorder.stop(10.0)
-
-
-def test_a_recorder_tries_again_after_a_failure_and_says_why(
-    recorder: Recorder, journal: Journal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(records: list[bytes], time: float) -> list[int]:
-        raise StoreError("the disk is full")
-
-    monkeypatch.setattr(journal, "append", fail)
-    recorder.start()
-    recorder.record(stored("a"))
-    with pytest.raises(NotTakenError, match="the disk is full"):
-        recorder.sync()
-    assert recorder.fault == "the disk is full"
-    monkeypatch.undo()
-    recorder.sync()
-    assert (recorder.fault, recorder.n_synced) == ("", 1)
-    assert recorder.stop(10.0)
-
-
-def test_a_drainer_alone_stores_what_is_synced_and_makes_calls(
-    recorder: Recorder, journal: Journal, tmp_path: Path
-) -> None:
-    store, index = SqlStore(str(tmp_path / "other.db")), DecisionIndex(journal)
-    drainer = Drainer(store, journal, recorder, index, 10.0)
-    records = [stored("a"), NewLabel("a", True, Source.VERIFICATION, 0, None)]
-    for record in records:
-        index.add(record, recorder.record(record))
-    assert (drainer.is_drained, index.has_undrained_labels) == (False, True)
-    recorder.start()
-    drainer.start()
-    drainer.drain()
-    assert (drainer.is_drained, index.has_undrained_labels, drainer.n_drained) == (True, False, 2)
-    assert drainer.wait_for_result(drainer.submit(store.decisions.newest_number)) == 1
-    with pytest.raises(ZeroDivisionError):
-        drainer.wait_for_result(drainer.submit(lambda: 1 // 0))
-    assert recorder.stop(10.0)
-    assert drainer.stop(10.0)
-    store.close()
-
-
-def test_an_index_finds_decisions_in_memory_and_in_the_journal_until_they_are_drained(
-    journal: Journal, recorder: Recorder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lookup, "N_RECENT", 1)
-    index = DecisionIndex(journal)
-    first, second = stored("a"), stored("b")
-    entry = recorder.record(first)
-    index.add(first, entry)
-    recorder.start()
-    recorder.sync()
-    index.add(second, recorder.record(second))
-    assert "a" not in index.recent
-    np.testing.assert_array_equal(index.find("a")[0].trace, first.trace)
-    assert (index.is_unsynced("a"), index.find("b")[0] is second) == (False, True)
-    index.remove_drained(entry)
-    assert index.find("a") == (None, None)
-    assert not index.is_new("c")  # not all ids are known
-    index.has_all_ids = True
-    assert [index.is_new(name) for name in "abc"] == [False, False, True]
-    assert recorder.stop(10.0)
