@@ -1,5 +1,6 @@
 """What an engine records is found at once and stored in its order, with a journal and without; what
 becomes of records that are damaged in the journal.
+"""
 
 import threading
 import time
