@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sklearn.base import clone
 from sklearn.decomposition import PCA
 from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.pipeline import make_pipeline
@@ -36,12 +37,8 @@ POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
 
 
 def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
-    engine = DataEngine(
-        recipe="conv", policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3
-    )
-    expected = replace(
-        RECIPES["conv"], policy=POLICY, radius=0.07, folds=3, retrain_every=20, budget=0.3
-    )
+    given = {"policy": POLICY, "radius": 0.07, "folds": 3, "retrain_every": 20, "budget": 0.3}
+    engine, expected = DataEngine(recipe="conv", **given), replace(RECIPES["conv"], **given)
     assert engine.recipe == expected
     assert engine.policy is engine.recipe.policy
     assert engine.store.settings.read()["recipe"] == expected.to_toml()
@@ -98,43 +95,34 @@ def test_the_loops_settings_and_those_of_a_policy_that_are_no_rule_count_for_a_b
 
 
 def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None:
-    url = tmp_path / "engine.db"
-    for start in (0, 50, 100):
-        with DataEngine.open_or_create(url, reducer="pca", policy=POLICY, radius=0.5) as engine:
+    url, given = tmp_path / "engine.db", {"reducer": "pca", "policy": POLICY, "retrain_every": 30}
+    for start in (0, 20, 40):
+        with DataEngine.open_or_create(url, **given) as engine:
             assert engine.resumed is (start > 0)
             assert engine.store.decisions.counts()["decisions"] == start
-            drive(engine, data, start, start + 50)
-    assert DataEngine.open(url).version > 0
+            drive(engine, data, start, start + 20)
+    assert engine.version > 0
 
 
-@pytest.mark.parametrize(
-    ("other", "named"),
-    [
-        ({"policy": Policy(0.1, 0.9)}, "lower_bound"),
-        ({"radius": 0.3}, "radius"),
-        ({"reducer": "conv"}, "reducer"),
-        ({"recipe": "umap"}, "reducer"),
-        ({"seed": 4}, "seed"),
-        ({"trace": TraceSpec(99)}, "trace"),
-    ],
-)
 def test_other_settings_than_the_stores_are_an_error_that_names_both(
-    other, named, data: Dataset, tmp_path: Path
+    data: Dataset, tmp_path: Path
 ) -> None:
-    url = tmp_path / "engine.db"
-    with DataEngine("pca", POLICY, radius=0.5, store=url) as engine:
+    url, given = tmp_path / "engine.db", {"reducer": "pca", "policy": POLICY, "radius": 0.5}
+    with DataEngine.open_or_create(url, **given) as engine:
         engine.decide(data.X[0])
-    with pytest.raises(
-        SettingError, match=rf"the store's own settings \(.*{named} .*\), got .*{named} "
+    for name, other, named in (
+        ("policy", Policy(0.1, 0.9), "lower_bound"),
+        ("radius", 0.3, "radius"),
+        ("reducer", "conv", "reducer"),
+        ("recipe", "umap", "reducer"),
+        ("seed", 4, "seed"),
+        ("trace", TraceSpec(99), "trace"),
     ):
-        DataEngine.open_or_create(url, **other)
-    for given in (
-        {"reducer": "pca"},
-        {"policy": POLICY},
-        {"radius": 0.5},
-        {"seed": 0},
-    ):  # the rest is not asked for
-        DataEngine.open_or_create(url, **given).close()
+        match = rf"the store's own settings \(.*{named} .*\), got .*{named} "
+        with pytest.raises(SettingError, match=match):
+            DataEngine.open_or_create(url, **{name: other})
+    for name, value in (given | {"seed": 0}).items():  # the rest is not asked for
+        DataEngine.open_or_create(url, **{name: value}).close()
 
 
 FIRST = TraceSpec(100, channels=2)
@@ -149,40 +137,40 @@ def test_a_rate_is_stated_later_and_contradicted_never(
     with DataEngine("pca", store=url, trace=first) as engine:
         engine.decide(make_data(1, channels=2).X[0])
         assert engine.trace == FIRST
-    for begin in (DataEngine.open_or_create, DataEngine.open):
-        with begin(url, trace=STATED) as engine:
-            assert engine.trace == STATED
-        for asked in (None, FIRST, TraceSpec(100, channels=2, unit="N, ")):  # they ask for nothing
+    nothing = (None, FIRST, TraceSpec(100, channels=2, unit="N, "))  # they ask for nothing
+    for asked in (STATED, *nothing):
+        for begin in (DataEngine.open_or_create, DataEngine.open)[: 1 + (asked is STATED)]:
             with begin(url, trace=asked) as engine:
                 assert engine.trace == STATED
-        for other in ({"rate_hz": 500.0}, {"unit": "N"}, {"samples": 99}, {"columns": ("a", "b")}):
-            with pytest.raises(SettingError, match=r"the store's own settings \(trace TraceSpec"):
-                begin(url, trace=replace(STATED, **other))
+    for other in ({"rate_hz": 500.0}, {"unit": "N"}, {"samples": 99}, {"columns": ("a", "b")}):
+        with pytest.raises(SettingError, match=r"the store's own settings \(trace TraceSpec"):
+            DataEngine.open(url, trace=replace(STATED, **other))
+
+
+def stored(url: Path, **settings: str) -> Path:
+    """A store whose settings an older version wrote."""
+    with DataEngine("pca", store=url) as engine:
+        engine.store.settings.save(engine.store.settings.read() | settings)
+    return url
 
 
 def test_a_store_keeps_the_rate_that_it_holds(make_data, tmp_path: Path) -> None:
-    url, data = tmp_path / "engine.db", make_data(1)
-    DataEngine("pca", store=url).close()
     old = '{"samples": 100, "rate_hz": 500.0, "channels": 1, "unit": "N", "limit": null, "columns": []}'
-    with DataEngine.open(url) as engine:
-        engine.store.settings.save(
-            engine.store.settings.read() | {"trace": old, "inferred": "true"}
-        )
+    url = stored(tmp_path / "engine.db", trace=old, inferred="true")
     with DataEngine.open_or_create(url, trace=TraceSpec(100)) as engine:
-        engine.decide(data.X[0])
+        engine.decide(make_data(1).X[0])
         assert engine.trace == TraceSpec(100, 500.0, unit="N")
     with pytest.raises(SettingError, match=r"rate_hz=500\.0"):
         DataEngine.open_or_create(url, trace=TraceSpec(100, 1000.0))
 
 
+LIMITED = Policy(force_limits=("0.02:0.1::1e9",))
+
+
 def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stated(
     make_data, tmp_path: Path
 ) -> None:
-    url = tmp_path / "engine.db"
-    limited = Recipe("pca", policy=Policy(force_limits=("0.02:0.1::1e9",)))
-    DataEngine("pca", store=url).close()
-    with DataEngine.open(url) as engine:
-        engine.store.settings.save(engine.store.settings.read() | {"recipe": limited.to_toml()})
+    url = stored(tmp_path / "engine.db", recipe=Recipe("pca", policy=LIMITED).to_toml())
     for begin in (DataEngine.open, DataEngine.open_or_create):
         with pytest.raises(SettingError, match="Expected the rate of the traces"):
             begin(url)
@@ -191,25 +179,23 @@ def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stat
 
 
 def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path: Path) -> None:
-    url, policy = tmp_path / "line.db", Policy(force_limits=("0.02:0.1::1e9",))
+    url = tmp_path / "line.db"
     for cell, trace in (("a", STATED), ("b", None)):
-        DataEngine("pca", policy, store=address(url, cell, "nut"), trace=trace).close()
+        with DataEngine("pca", LIMITED, store=address(url, cell, "nut"), trace=trace) as engine:
+            assert engine.trace == STATED
     with DataEngine.open(address(url, "b", "nut")) as engine:
         assert engine.trace == STATED
 
 
-def ours(**changes) -> ModelPrediction:
-    return ModelPrediction(
-        "pca",
-        WilsonRadiusClassifier(**({"radius": 0.5, "alpha": 0.2, "lower_bound": 0.8} | changes)),
-    )
+def ours(alpha: float = 0.2) -> ModelPrediction:
+    return ModelPrediction("pca", WilsonRadiusClassifier(0.5, alpha, 0.8))
 
 
 @pytest.mark.parametrize(
     ("first", "then"),
     [
         ({"model": ours(), "policy": Policy(audit_rate=0.1)}, {"model": ours(alpha=0.5)}),
-        ({"model": Counting(), "retrain_every": 30}, {"model": ours()}),
+        ({"model": Counting()}, {"model": ours()}),
         ({"reducer": "pca"}, {"model": ours()}),
         ({"recipe": Recipe(PCA(2), policy=POLICY)}, {"reducer": PCA(3)}),
         ({"reducer": PCA(2)}, {"reducer": LinearDiscriminantAnalysis()}),
@@ -219,12 +205,13 @@ def ours(**changes) -> ModelPrediction:
 def test_a_used_store_takes_the_object_it_was_made_with_and_no_other(
     first, then, data: Dataset, tmp_path: Path
 ) -> None:
-    with DataEngine.open_or_create(tmp_path / "engine.db", **first) as engine:
-        drive(engine, data, 0, 60)
+    url, given = tmp_path / "engine.db", first | {"retrain_every": 20}
+    with DataEngine.open_or_create(url, **given) as engine:
+        drive(engine, data, 0, 21)
     with pytest.raises(SettingError):
-        DataEngine.open_or_create(tmp_path / "engine.db", **then)
-    with DataEngine.open_or_create(tmp_path / "engine.db", **first) as engine:
-        assert (engine.resumed, engine.version > 0) == (True, True)
+        DataEngine.open_or_create(url, **then)
+    with DataEngine.open_or_create(url, **given) as engine:
+        assert (engine.resumed, engine.version) == (True, 1)
 
 
 OUTSIDE = """
@@ -252,52 +239,48 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
     outside, mine, data, tmp_path, monkeypatch
 ) -> None:
     module, ran, url = tmp_path / "theirs.py", tmp_path / "ran", str(tmp_path / "engine.db")
-    created = {"reducer": "pca", "policy": POLICY, "retrain_every": 40} | mine
-    with DataEngine(store=address(url, "a", "nut"), **created) as engine:
-        drive(engine, data, 0, 60)
+    a, b = (address(url, cell, "nut") for cell in "ab")
+    with DataEngine(store=a, **{"reducer": "pca", "retrain_every": 20, **mine}) as engine:
+        drive(engine, data, 0, 21)
     monkeypatch.delitem(sys.modules, "theirs")
-    module.write_text(module.read_text() + f"open({str(ran)!r}, 'w').close()\n")
+    module.write_text(f"{OUTSIDE}open({str(ran)!r}, 'w').close()\n")
 
-    def exit_code(verb: str, *words: str) -> int:
-        return dengine(verb, url, *words, "--cell", "a").exit_code
+    def exit_codes(*calls: str) -> list[int]:
+        return [dengine(*call.format(url).split(), "--cell", "a").exit_code for call in calls]
 
-    assert [
-        exit_code(*words) for words in (("status",), ("verify",), ("history",), ("explain", "last"))
-    ] == [0] * 4
-    assert [exit_code(verb) for verb in ("retrain", "policy")] == [2] * 2
+    assert exit_codes("status {}", "verify {}", "history {}", "explain {} last") == [0] * 4
+    assert exit_codes("retrain {}", "policy {}") == [2] * 2
+    match = r"theirs:.*, which .* names: name it again .*allow_import=True"
     for opened in (DataEngine.open, DataEngine.open_or_create):
-        with pytest.raises(
-            ImportRefusedError,
-            match=r"theirs:.*, which .* names: name it again .*allow_import=True",
-        ):
+        with pytest.raises(ImportRefusedError, match=match):
             opened(address(url, "a"))
     with pytest.raises(ImportRefusedError, match=r"theirs:.*, which a peer"):
-        DataEngine.open_or_create(address(url, "b", "nut"))
+        DataEngine.open_or_create(b)
     assert not ran.exists()
-    assert exit_code("policy", "--allow-import") == 0
+    assert exit_codes("policy {} --allow-import") == [0]
     assert ran.exists()
     monkeypatch.delitem(sys.modules, "theirs")
     DataEngine.open_or_create(address(url, "a"), **mine).close()
-    DataEngine.open_or_create(address(url, "b", "nut"), allow_import=True).close()
+    DataEngine.open_or_create(b, allow_import=True).close()
 
 
 def test_an_object_without_a_name_runs_and_is_handed_in_again(
     data: Dataset, tmp_path: Path
 ) -> None:
-    def pipeline():
-        return make_pipeline(StandardScaler(), PCA(2, random_state=0))
-
     for params in ({"segments": [1]}, {"a b": 1}, {"inner": PCA(2)}):  # that TOML cannot say
         with pytest.raises(SettingError, match="params of plain names and values"):
             Recipe("conv", params)
-    store = tmp_path / "engine.db"
-    with DataEngine(pipeline(), POLICY, store=store) as engine:
-        actions = {cycle.decision.action for cycle in drive(engine, data, 0, 150)}
+    store, pipeline = (
+        tmp_path / "engine.db",
+        make_pipeline(StandardScaler(), PCA(2, random_state=0)),
+    )
+    with DataEngine(pipeline, POLICY, store=store) as engine:
+        actions = {cycle.decision.action for cycle in drive(engine, data, 0, 100)}
         before = engine.decide(data.X[170])
     assert actions >= {"verify", "accept"}
     with pytest.raises(SettingError, match=r"object Pipeline, has no name in TOML: hand it in"):
         DataEngine.open(store)
-    with DataEngine.open(store, reducer=pipeline()) as engine:
+    with DataEngine.open(store, reducer=clone(pipeline)) as engine:
         assert engine.decide(data.X[170]).embedding == before.embedding
 
 
@@ -306,13 +289,12 @@ def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was
 ) -> None:
     for steps in (1, 3):
         engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
-        drive(engine, data, 0, 60)
+        drive(engine, data, 0, 31)
         assert {r.n_steps for r in engine.store.versions.retrains()} == {steps}
     ticks = count()
-    engine = DataEngine(
-        "conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks))
-    )  # a second a look
-    learn(engine, data, range(80))
+    # A second a look.
+    engine = DataEngine("conv", POLICY, retrain_every=1000, clock=lambda: float(next(ticks)))
+    learn(engine, data, range(30))
     before = next(ticks)
     report = engine.retrain()
     assert report.n_steps == 0  # its budget is over before the first step
