@@ -3,8 +3,6 @@ by hand.
 """
 
 import copy
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -105,17 +103,6 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
     successor.fit(X[40:], 1 - y[40:])
     baseline.predict_interval(X[:5])  # what it said last is remembered
     np.testing.assert_array_equal(baseline.predict_interval(X[120:]), before)
-
-
-@pytest.mark.merge  # it starts a process
-def test_the_table_imports_nothing() -> None:
-    code = "import sys; from dengine.experiments.baselines import BASELINES; print(*{'aeon'} & {*sys.modules})"
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], capture_output=True, text=True, check=True
-        ).stdout.split()
-        == []
-    )
 
 
 @pytest.mark.parametrize(

@@ -108,16 +108,16 @@ def test_labels_in_one_batch_are_numbered_in_the_order_given(store: SqlStore) ->
 
 
 def test_a_batch_longer_than_a_chunk_is_taken_whole(store: SqlStore) -> None:
-    names = [str(i) for i in range(1203)]
+    names = [str(i) for i in range(503)]
     store.apply_records(
         [
             StoredDecision(decision(name), np.zeros((1, 2), np.float32), int(name), False, 1.0)
             for name in names
         ]
     )
-    assert put_labels(store, *(label(name, silent=1) for name in names)) == list(range(1, 1204))
-    assert store.labels.with_traces().hashes.tolist() == list(range(1203))
-    assert store.labels.unreported_total() == 1203
+    assert put_labels(store, *(label(name, silent=1) for name in names)) == list(range(1, 504))
+    assert store.labels.with_traces().hashes.tolist() == list(range(503))
+    assert store.labels.unreported_total() == 503
 
 
 def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store: SqlStore) -> None:

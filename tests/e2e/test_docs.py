@@ -63,7 +63,6 @@ HEAVY = (
     "rich.table",
     "scipy.special",
     "sklearn.linear_model",
-    "umap",
 )
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(

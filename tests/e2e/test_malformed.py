@@ -68,7 +68,7 @@ def no_collection() -> Iterator[None]:
 
 @pytest.mark.usefixtures("no_collection")
 def test_a_setting_that_is_nested_too_deeply_is_refused() -> None:
-    for _key, text in SETTINGS:
+    for _key, text in (SETTINGS[0], SETTINGS[-1]):  # of a recipe, and of its policy
         assert "not TOML" in refusal(text.replace("{}", "[" * 500 + "]" * 500, 1))
 
 

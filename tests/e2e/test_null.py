@@ -23,18 +23,17 @@ from dengine.recipe import RECIPES
 from dengine.reducers.base import LabelFree, as_points
 
 POLICY = Policy(alpha=0.1, lower_bound=0.9)
-CYCLES = 600
-BY_CHANCE = (
-    4.0  # certain cycles of 600, on average: of 1503 0.1 to 0.8 were measured, in rare bursts
-)
+CYCLES = 300
+# Certain cycles of these, on average: of 1503 0.1 to 0.8 were measured, in rare bursts.
+BY_CHANCE = 2.0
 
 
-def noise_labels(make_data, seed: int, cycles: int = CYCLES) -> Dataset:
+def noise_labels(make_data, seed: int) -> Dataset:
     """Traces of two shapes, as real ones; labels, 80 % successes, that have nothing to do with
     them.
     """
-    data = make_data(cycles, samples=100, seed=seed, noise=2.0)
-    labels = np.random.default_rng(seed + 10_000).random(cycles) < 0.8
+    data = make_data(CYCLES, samples=100, seed=seed, noise=2.0)
+    labels = np.random.default_rng(seed + 10_000).random(CYCLES) < 0.8
     return Dataset(data.X, labels.astype(np.int8), name="noise labels")
 
 
@@ -42,27 +41,22 @@ def certain(played: Replay) -> int:
     return int((played.action != "verify").sum())
 
 
-def error_rate(played: list[Replay]) -> float:
+def error_rate(*played: Replay) -> float:
     """Share of the certain that were wrong."""
-    wrong = sum(
-        int(((p.action == "accept") & ~p.truth).sum() + ((p.action == "reject") & p.truth).sum())
-        for p in played
-    )
-    return wrong / max(1, sum(map(certain, played)))
+    right = sum(int((p.action == np.where(p.truth, "accept", "reject")).sum()) for p in played)
+    return 1.0 - right / max(1, sum(map(certain, played)))
 
 
 @pytest.mark.parametrize("name", ["conv", "pca", "umap"])
 def test_labels_of_noise_yield_next_to_nothing_certain(
     name: str, make_data, proof_repeats: int
 ) -> None:
-    recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9)
-    recipe = recipe.with_settings(retrain_every=30)
-    cycles = CYCLES // 2  # what conv's steps cost grows with them
+    recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9).with_settings(retrain_every=30)
+    repeats = proof_repeats // 2 if name == "conv" else proof_repeats  # it takes ten times as long
     played = [
-        replay(noise_labels(make_data, seed, cycles), recipe, seed=seed)
-        for seed in range(proof_repeats)
+        replay(noise_labels(make_data, seed), recipe, seed=seed) for seed in range(max(1, repeats))
     ]
-    assert np.mean([certain(p) for p in played]) <= BY_CHANCE / 2
+    assert np.mean([certain(p) for p in played]) <= BY_CHANCE
 
 
 class SeesEverything(LabelFree):
@@ -96,11 +90,11 @@ def test_the_same_labels_counted_where_they_were_fitted_are_caught(
     dishonest = [with_lda(False, data, seed) for seed, data in enumerate(streams)]
     assert np.mean([certain(p) for p in honest]) <= BY_CHANCE
     assert np.mean([certain(p) for p in dishonest]) > 5 * BY_CHANCE
-    assert error_rate(dishonest) > 1.5 * (1.0 - POLICY.lower_bound)
+    assert error_rate(*dishonest) > 1.5 * (1.0 - POLICY.lower_bound)
 
 
 def test_an_honest_engine_does_become_certain_where_the_trace_tells(make_data) -> None:
     # Or silence would pass the null test.
     played = with_lda(True, make_data(CYCLES, samples=100, noise=2.0), 0)
-    assert certain(played) > 150
-    assert error_rate([played]) <= 0.1
+    assert certain(played) > CYCLES / 4
+    assert error_rate(played) <= 0.1

@@ -101,6 +101,41 @@ def test_the_log_tells_when_the_first_retrain_begins(
     assert "the first retrain begins, on 30 labels" in begun
 
 
+@pytest.mark.merge
+def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while_it_imports(
+    process: RetrainingProcess, data: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pids = [process.submit(os.getpid).result(300)]
+    engine = DataEngine(recipe=PCA, executor=process)
+    os.kill(pids[0], signal.SIGKILL)
+    with pytest.raises(BrokenExecutor):
+        process.submit(os.getpid).result(300)
+    with monkeypatch.context() as patched:
+        patched.setattr(trainer, "HUNG", 0.001)  # one that still imports is not taken for hung
+        learn(engine, data, range(30))
+        assert engine.version == 1  # in line, and the process is started again
+        learn(engine, data, range(30, 60))
+        engine.set_policy(replace(engine.policy, alpha=0.2))
+        engine.forget(next(engine.history()).decision.id)
+        assert engine.state.is_retraining
+        assert not process.ready.done()  # to be ready takes it seconds
+    settle(engine)
+    reasons = [report.reason.partition(";")[0] for report in engine.store.versions.retrains()]
+    assert reasons == ["accepted", "another policy, the same model", "accepted"]
+    pids.append(process.submit(os.getpid).result(300))
+    process.submit(time.sleep, 600)
+    assert engine.retrain(wait=False) is None  # there
+    with monkeypatch.context() as patched:
+        patched.setattr(trainer, "HUNG", 0.0)
+        engine.poll()
+    assert engine.retrain(wait=False) is None
+    settle(engine)
+    pids.append(process.submit(os.getpid).result(300))
+    accepted = [report.accepted for report in engine.store.versions.retrains()[3:]]
+    assert (accepted, engine.version) == ([False, True], 4)
+    assert len({*pids}) == 3
+
+
 def test_it_ends_with_whoever_made_it_also_at_work(
     process: RetrainingProcess, running: list[RetrainingProcess]
 ) -> None:
@@ -112,53 +147,3 @@ def test_it_ends_with_whoever_made_it_also_at_work(
         os.kill(pid, 0)
     with pytest.raises(BrokenExecutor):
         at_work.result(0)
-
-
-@pytest.mark.merge
-def test_a_change_does_not_wait_for_a_process_that_still_imports_which_is_not_taken_for_hung(
-    data: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with RetrainingProcess() as process:
-        engine = DataEngine(recipe=PCA, executor=process)
-        with monkeypatch.context() as patched:
-            patched.setattr(trainer, "HUNG", 0.001)
-            learn(engine, data, range(40))
-            engine.set_policy(replace(engine.policy, alpha=0.2))
-            engine.forget(next(engine.history()).decision.id)
-            assert engine.state.is_retraining
-            assert not process.ready.done()  # to be ready takes it seconds
-        settle(engine)
-        assert (engine.version, engine.policy.alpha) == (1, 0.2)
-        assert [report.accepted for report in engine.store.versions.retrains()] == [True]
-
-
-@pytest.mark.merge
-def test_a_process_that_was_given_up_is_started_again_and_retrains(
-    data: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with RetrainingProcess() as process:
-        first = process.submit(os.getpid).result(300)
-        for fault in ("killed", "hung"):
-            engine = DataEngine(recipe=PCA, executor=process)
-            if fault == "killed":
-                os.kill(first, signal.SIGKILL)
-                with pytest.raises(BrokenExecutor):
-                    process.submit(os.getpid).result(300)
-                learn(engine, data, range(40))
-            else:
-                process.submit(time.sleep, 600)
-                learn(engine, data, range(40))
-                monkeypatch.setattr(trainer, "HUNG", 0.0)
-                engine.poll()
-                assert not engine.store.versions.retrains()[-1].accepted
-                engine.retrain(wait=False)
-                monkeypatch.undo()
-            settle(engine)
-            assert engine.version == 1
-            assert process.ready.result(300) is None
-            second = process.submit(os.getpid).result(300)
-            assert second != first
-            assert engine.retrain(wait=False) is None  # there
-            settle(engine)
-            assert engine.version == 2
-            first = second

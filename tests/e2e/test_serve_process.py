@@ -9,6 +9,7 @@ import threading
 import time
 import xmlrpc.client
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,12 @@ import pytest
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
 
 from dengine import Action, DataEngine, Dataset, Recipe
+from dengine.serve.auth import Token
+from dengine.serve.http import create_app
+from dengine.serve.service import CellService
 from tests.support.exports import trained
 from tests.support.robots import FakeController
-from tests.support.serving import REPO, WAIT, started
+from tests.support.serving import REPO, WAIT, served, started
 
 SAMPLES = 80
 APPROACH_SECONDS = 0.05  # of a robot, from its call of `begin` to the insertion
@@ -95,9 +99,8 @@ class Robots:
 def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(
     tmp_path, parts, name: str
 ) -> None:
-    recipe = Recipe(
-        "conv", radius=0.05, retrain_every=20, budget=3.0
-    )  # seconds: so that a retrain is met
+    # Seconds of the budget: so that a retrain is met.
+    recipe = Recipe("conv", radius=0.05, retrain_every=20, budget=1.5)
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
     with started(tmp_path, "--recipe", "recipe.toml") as process:
         robots = Robots(process.ask, parts)
@@ -222,34 +225,29 @@ def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_aw
 def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(
     tmp_path: Path, make_data
 ) -> None:
-    page, data, token = (
-        (REPO / "docs/howto/plc_and_robot.md").read_text("utf-8"),
-        make_data(200, samples=1000),
-        "t" * 24,
-    )
+    page = (REPO / "docs/howto/plc_and_robot.md").read_text("utf-8")
     (head,) = re.findall(r"```text\n(POST /decide.+?\n\n)```", page, flags=re.DOTALL)
     (node,) = re.findall(r"```python\n(from http.+?)```", page, flags=re.DOTALL)
-    (tmp_path / "token").write_text(token)
-    (tmp_path / "token").chmod(0o400)
-    with trained(data, tmp_path / "cell.db") as engine:
+    file, token = tmp_path / "cell.db", "t" * 24
+    data = make_data(200, samples=1000)
+    with trained(data, file) as engine:
         x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT).astype("<f4")
     pieces = [f"{line}\r\n".encode() for line in head.replace("TOKEN", token).splitlines()]
     pieces += [x[i : i + 250].tobytes() for i in range(0, 1000, 250)]
-    with started(tmp_path, "--token-file", "token") as server, socket.socket() as robot:
-        robot.settimeout(WAIT)
-        robot.connect(("127.0.0.1", server.port))
+    with (
+        closing(CellService(lambda: DataEngine.open(file), file, WAIT)) as service,
+        served(create_app(service, (Token(token),))) as port,
+        socket.create_connection(("127.0.0.1", port), WAIT) as robot,
+    ):
         for piece in pieces:
             robot.sendall(piece)
         answer = b""
         while not (action := re.search(rb'"action":"(\w+)"', answer)):
             answer += robot.recv(100)
+        assert action[1] == b"accept"
         scope: dict[str, Any] = {}
         exec(node, scope)
-        url = f"http://127.0.0.1:{server.port}"
+        url = f"http://127.0.0.1:{port}"
         asked = (url, token), (url, "another"), ("http://127.0.0.1:1", token)
-        assert [scope["decide"](x, "P-1", *item) for item in asked] == [
-            "accept",
-            "verify",
-            "verify",
-        ]
-        assert action[1] == b"accept"
+        decided = [scope["decide"](x, "P-1", *item) for item in asked]
+        assert decided == ["accept", "verify", "verify"]

@@ -8,7 +8,9 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,41 +24,6 @@ from dengine.store.journal import journal_path
 from tests.support.serving import REPO, WAIT
 
 HIDING = f"{REPO / 'tests' / 'support' / 'without_posix'}{os.pathsep}{REPO}"
-EVERY_MODULE = """
-import importlib, pkgutil
-import dengine
-def refused(name):
-    raise ImportError(name)
-for module in pkgutil.walk_packages(dengine.__path__, "dengine.", onerror=refused):
-    if not module.name.endswith("__main__"):
-        importlib.import_module(module.name)
-from dengine import replay
-from dengine.store import journal, owned_file
-assert not hasattr(owned_file.os, "pread") and not hasattr(journal.os, "O_NOFOLLOW")
-"""
-# A link in a journal's place, a token's file, a child of the process that has the cell, and a verb as it is typed.
-FILES = """
-import runpy, subprocess, sys
-from pathlib import Path
-from dengine import DataEngine
-from dengine.errors import StoreError
-from dengine.serve.auth import read_tokens
-folder = Path(sys.argv[1])
-try:
-    DataEngine("pca", store=folder / "linked.db")
-except StoreError as error:
-    print(" ".join(str(error).split()))
-print(len(read_tokens(folder / "token")), "token")
-engine = DataEngine("pca", store=folder / "engine.db")
-child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], close_fds=False)
-engine.close()
-DataEngine.open(folder / "engine.db").close()
-child.kill()
-child.wait()
-print("opened")
-sys.argv[1:] = ["status", str(folder / "engine.db")]
-runpy.run_module("dengine", run_name="__main__")
-"""
 REPORTING = """
 import sys, time
 from dengine import DataEngine
@@ -70,38 +37,68 @@ for i in range(40):
 print("done", flush=True)
 time.sleep(600)
 """
-# Opens the store while another process has it, says why it is refused, and again once a line comes.
+# Imports every module, and opens the store while another process has it, and again once a line comes. Then: a link in a
+# journal's place, a token's file, a child of the process that has the cell, verbs, and a verb as it is typed.
 SECOND = """
-import sys
+import importlib, json, pkgutil, runpy, subprocess, sys
+from pathlib import Path
+import dengine
+def refused(name):
+    raise ImportError(name)
+for module in pkgutil.walk_packages(dengine.__path__, "dengine.", onerror=refused):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
 from dengine import DataEngine
 from dengine.errors import StoreError
-try:
-    DataEngine.open(sys.argv[1])
-    print("nobody has it", flush=True)
-except StoreError as error:
-    print(" ".join(str(error).split()), flush=True)
+from dengine.serve.auth import read_tokens
+from dengine.store import journal, owned_file
+from tests.support.verbs import run
+assert not hasattr(owned_file.os, "pread") and not hasattr(journal.os, "O_NOFOLLOW")
+folder = Path(sys.argv[1])
+def why_not(open_, *words, **named):
+    try:
+        open_(*words, **named)
+    except StoreError as error:
+        return " ".join(str(error).split())
+print(why_not(DataEngine.open, folder / "engine.db"), flush=True)
 ids = sys.stdin.readline().split()
-engine = DataEngine.open(sys.argv[1])
-print(*[engine.find(id_).success for id_ in ids])
+with DataEngine.open(folder / "engine.db") as engine:
+    print(*[engine.find(id_).success for id_ in ids])
+print(why_not(DataEngine, "pca", store=folder / "linked.db"))
+print(len(read_tokens(folder / "token")), "token")
+engine = DataEngine("pca", store=folder / "other.db")
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], close_fds=False)
+engine.close()
+DataEngine.open(folder / "other.db").close()
+child.kill()
+child.wait()
+print(json.dumps([run(words.split()) for words in sys.argv[2].splitlines()]))
+sys.argv[1:] = ["status", str(folder / "other.db")]
+runpy.run_module("dengine", run_name="__main__")
+"""
+VERBS = """
+train --data FOLDER/parts.npz --store FOLDER/trained.db --reducer pca
+status FOLDER/trained.db
+history FOLDER/trained.db --last 3
+verify FOLDER/trained.db
+data FOLDER/trained.db
+backup FOLDER/trained.db --out FOLDER/copy.db
+run --cell replay --data FOLDER/parts.npz --cycles 5 --store FOLDER/run.db
+export FOLDER/trained.db --out FOLDER/model.ts
+replay --data FOLDER/parts.npz --reducer pca --repeats 1 --cycles 40
 """
 
 
-@pytest.fixture(autouse=True)
-def hidden(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PYTHONPATH", HIDING)
-
-
-def python(*words: object, code: int = 0) -> str:
-    """What a Python command prints, on either stream."""
-    done = subprocess.run(
-        [sys.executable, *map(str, words)], capture_output=True, text=True, timeout=600, check=False
-    )
-    assert done.returncode == code, done.stdout[-3000:] + done.stderr[-3000:]
-    return done.stdout + done.stderr
+def python(*words: object, **options: Any) -> subprocess.Popen[str]:
+    """A Python command in a process, from whose modules of dengine is hidden what Windows lacks."""
+    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
+    environment = os.environ | {"PYTHONPATH": HIDING}
+    command = [sys.executable, *map(str, words)]
+    return subprocess.Popen(command, text=True, env=environment, **pipes, **options)
 
 
 def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(journal, "IGNORES_CASE", True)
     url = make_url("sqlite:///line.db")
@@ -119,80 +116,60 @@ def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
         "tests/unit/test_incoming.py",
         "tests/e2e/test_retraining_process.py",
     )
-    text = python("-m", "pytest", "-q", "-p", "no:cacheprovider", *(REPO / test for test in tests))
+    with python("-m", "pytest", "-q", "-p", "no:cacheprovider", *tests, cwd=REPO) as process:
+        text, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, text[-3000:]
     assert "passed" in text or "[100%]" in text
 
 
-def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(tmp_path: Path) -> None:
-    pipes = dict.fromkeys(("stdin", "stdout"), subprocess.PIPE)
-    commands = [
-        [sys.executable, "-c", code, tmp_path / "engine.db"] for code in (REPORTING, SECOND)
-    ]
-    with subprocess.Popen(commands[0], stdout=subprocess.PIPE, text=True) as process:
-        lines = [line.split() for line in iter(process.stdout.readline, "done\n")]
-        with subprocess.Popen(commands[1], text=True, **pipes) as second:
-            refused = second.stdout.readline()
-            process.kill()
-            process.wait(WAIT)
-            answers, _ = second.communicate(" ".join(id_ for id_, _ in lines) + "\n", timeout=WAIT)
-    assert f"process {process.pid} on " in refused
-    assert len(lines) == 40
-    assert (second.returncode, answers.split()[-40:]) == (
-        0,
-        [str(label == "1") for _, label in lines],
-    )
+@dataclass
+class Cell:
+    """What two processes printed, of which the first is killed while it has the cell."""
+
+    folder: Path
+    pid: int
+    labels: list[list[str]]
+    refusal: str
+    lines: list[str]
 
 
-def test_every_module_imports_and_files_of_the_system_are_used_as_elsewhere(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory, make_data) -> Cell:
+    folder, data = tmp_path_factory.mktemp("cell"), make_data(60, samples=80)
+    np.savez(folder / "parts.npz", X=data.X, y=data.y)
+    (folder / "mine").write_bytes(b"my notes")
+    (folder / "linked.db.cell.journal").symlink_to(folder / "mine")
+    (folder / "token").write_text("t" * 32, encoding="utf-8")
+    (folder / "token").chmod(0o666)
+    verbs = VERBS.strip().replace("FOLDER", str(folder))
+    with python("-c", REPORTING, folder / "engine.db") as first:
+        labels = [line.split() for line in iter(first.stdout.readline, "done\n")]
+        with python("-c", SECOND, folder, verbs) as second:
+            refusal = second.stdout.readline()
+            first.kill()
+            first.wait(WAIT)
+            text, _ = second.communicate(" ".join(id_ for id_, _ in labels) + "\n")
+    assert second.returncode == 0, text[-3000:]
+    return Cell(folder, first.pid, labels, refusal, text.splitlines())
+
+
+def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(cell: Cell) -> None:
+    assert f"process {cell.pid} on " in cell.refusal
+    assert len(cell.labels) == 40
+    assert cell.lines[0].split() == [str(label == "1") for _, label in cell.labels]
+
+
+def test_every_module_imports_and_files_of_the_system_are_used_as_elsewhere(cell: Cell) -> None:
     """A link in a journal's place is refused, a token's bits say nothing of who may read it, and a
     child process does not keep the cell.
     """
-    (tmp_path / "mine").write_bytes(b"my notes")
-    (tmp_path / "linked.db.cell.journal").symlink_to(tmp_path / "mine")
-    (tmp_path / "token").write_text("t" * 32, encoding="utf-8")
-    (tmp_path / "token").chmod(0o666)
-    text = python("-c", EVERY_MODULE + FILES, tmp_path)
-    assert "Could not use the journal" in text
-    assert "\n1 token\nopened\n" in text
-    assert "What it is" in text  # of a status
-    assert (tmp_path / "mine").read_bytes() == b"my notes"
+    assert "Could not use the journal" in cell.lines[1]
+    assert cell.lines[2] == "1 token"
+    assert (cell.folder / "mine").read_bytes() == b"my notes"
 
 
-def test_the_verbs_do_their_work(tmp_path: Path, make_data) -> None:
-    data = make_data(60, samples=80)
-    np.savez(tmp_path / "parts.npz", X=data.X, y=data.y)
-    store = tmp_path / "engine.db"
-    commands = [
-        ("train", "--data", tmp_path / "parts.npz", "--store", store, "--reducer", "pca"),
-        ("status", store),
-        ("history", store, "--last", 3),
-        ("verify", store),
-        ("data", store),
-        ("backup", store, "--out", tmp_path / "copy.db"),
-        (
-            "run",
-            "--cell",
-            "replay",
-            "--data",
-            tmp_path / "parts.npz",
-            "--cycles",
-            5,
-            "--store",
-            tmp_path / "run.db",
-        ),
-        ("export", store, "--out", tmp_path / "model.ts"),
-        (
-            "replay",
-            "--data",
-            tmp_path / "parts.npz",
-            "--reducer",
-            "pca",
-            "--repeats",
-            1,
-            "--cycles",
-            40,
-        ),
-    ]
-    words = json.dumps([[str(word) for word in command] for command in commands])
-    results = json.loads(python("-m", "tests.support.verbs", words).splitlines()[-1])
+def test_the_verbs_do_their_work(cell: Cell) -> None:
+    results = json.loads(cell.lines[3])
+    assert len(results) == 9
     assert [result for result in results if result["exit_code"] != 0] == []
+    assert "What it is" in "".join(cell.lines[4:])  # of a status, as it is typed

@@ -18,9 +18,9 @@ import pytest
 
 import dengine
 
-HEAVY = {"matplotlib", "mujoco", "numba", "onnx", "onnxruntime", "umap"}
+HEAVY = {"aeon", "matplotlib", "mujoco", "numba", "onnx", "onnxruntime", "umap"}
 USE = """
-import dengine, numpy as np, sys
+import dengine, dengine.experiments.baselines, numpy as np, sys
 from dengine import DataEngine, Recipe, load_dataset, replay
 print(dengine.__file__)
 DataEngine(recipe=Recipe("pca")).decide(np.random.default_rng(0).normal(size=100))
@@ -153,7 +153,9 @@ def test_the_wheel_works_where_there_is_no_checkout(used: list[str], installed: 
 
 
 @pytest.mark.merge
-def test_an_engine_with_pca_in_memory_loads_nothing_heavy(used: list[str]) -> None:
+def test_an_engine_with_pca_in_memory_and_the_table_of_baselines_load_nothing_heavy(
+    used: list[str],
+) -> None:
     loaded = {*used[1].split()}
     assert {"dengine", "torch"} <= loaded
     assert HEAVY & loaded == set(), "import it in the function that uses it"

@@ -110,5 +110,6 @@ inline std::int64_t position(const std::vector<std::string>& names, std::string_
 // Checked, loaded, its golden trace reproduced. Each runtime has its own.
 std::unique_ptr<Model> open_model(const std::string& path, const std::string& key);
 
-// Which runtime that is.
+// Which runtime that is, and the name of its program.
 extern const char* const RUNTIME;
+extern const char* const PROGRAM;

@@ -7,6 +7,7 @@
 #include "ort.hpp"
 
 const char* const RUNTIME = "onnxruntime";
+const char* const PROGRAM = "dengine-onnx";
 
 static std::vector<std::string> libraries() {
     if (const char* named = std::getenv("DENGINE_ONNXRUNTIME"); named != nullptr && *named != '\0') return {named};

@@ -9,6 +9,7 @@
 #include "model.hpp"
 
 const char* const RUNTIME = "libtorch";
+const char* const PROGRAM = "dengine-cell";
 
 // What a model knows a part by: 64-bit FNV-1a (Fowler, Noll and Vo) of its number's bytes, as in Python. Never 0, which is
 // a part of unknown number: that one is known by its trace.
