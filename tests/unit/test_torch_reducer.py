@@ -1,12 +1,13 @@
 """The trainer of PyTorch networks, with the shipped network and with a user's own."""
 
-import logging
 from functools import partial
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from scipy.special import expit, logit
 from sklearn.base import clone
 from torch import nn
 
@@ -23,12 +24,13 @@ from dengine.datasets.importing import import_labelled
 from dengine.decision.scripting import script
 from dengine.errors import SettingError, StoreError
 from dengine.folds import content_fold
+from dengine.records import RetrainReport
 from dengine.reducers.base import StopRule
 from dengine.reducers.checkpoints import load_checkpoint, save_checkpoint
 from dengine.reducers.conv import HEAD_STEPS, ConvNetwork
 from dengine.reducers.encoder import Members
 from dengine.reducers.torch_reducer import Augmentation, draw_batches
-from dengine.testing import check_reducer, toy_traces
+from dengine.testing import toy_traces
 from tests.support.command_line import dengine
 
 
@@ -57,6 +59,10 @@ class PythonNetwork(SmallNetwork):
         return super().forward(torch.from_numpy(np.asarray(x.detach()))) + 0.0 * x.sum()
 
 
+X, Y = toy_traces(60)
+FOLDS = content_fold(X, 3)
+
+
 def quick(**params: Any) -> ConvReducer:
     return ConvReducer(**{"folds": 3, "steps": 4, "fit_steps": 30} | params)
 
@@ -65,143 +71,117 @@ def own_reducer(network: Any = SmallNetwork) -> TorchReducer:
     return TorchReducer(network=network, folds=2, steps=4, fit_steps=30)
 
 
-@pytest.mark.parametrize("make", [quick, lambda: own_reducer()], ids=["conv", "own network"])
+@pytest.mark.parametrize("make", [quick, own_reducer], ids=["conv", "own network"])
 def test_labels_of_fold_k_move_nothing_in_space_k_over_warm_starts_weights_averages_and_statistics(
     make: Any,
 ) -> None:
     X, y = toy_traces(120)
     reducer, other = make(), make()
     folds, rng = content_fold(X, reducer.folds), np.random.default_rng(1)
-    k = 1
     for n in (40, 80, 120):
-        labels = y.copy()
-        labels[folds == k] = rng.integers(2, size=(folds == k).sum())
+        labels = np.where(folds == 1, rng.integers(2, size=120), y)
         reducer.train(X[:n], y[:n], folds[:n])
         other.train(X[:n], labels[:n], folds[:n])
         first, two = reducer.embed(X), other.embed(X)
-        np.testing.assert_array_equal(first[:, k], two[:, k])
+        np.testing.assert_array_equal(first[:, 1], two[:, 1])
         assert not np.array_equal(first, two)  # the other members did see these labels
 
 
-def test_a_users_own_network_keeps_the_whole_contract_of_a_reducer() -> None:
-    check_reducer(own_reducer())
-
-
-def test_from_its_state_a_reducer_answers_and_trains_on_bit_for_bit() -> None:
-    X, y = toy_traces(90)
+def test_from_its_state_a_reducer_trains_on_bit_for_bit() -> None:
     reducer = quick()
-    folds = content_fold(X, 3)
-    for n in (50, 70):
-        reducer.train(X[:n], y[:n], folds[:n])
-    state = reducer.get_state()
-    restored = clone(reducer).set_state(state)
-    np.testing.assert_array_equal(restored.embed(X), reducer.embed(X))
-    np.testing.assert_array_equal(restored.train(X, y, folds), reducer.train(X, y, folds))
+    for n in (40, 50):
+        reducer.train(X[:n], Y[:n], FOLDS[:n])
+    restored = clone(reducer).set_state(reducer.get_state())
+    np.testing.assert_array_equal(restored.train(X, Y, FOLDS), reducer.train(X, Y, FOLDS))
     np.testing.assert_array_equal(restored.embed(X), reducer.embed(X))
     assert restored.n_steps_ == reducer.n_steps_ > 0
 
 
 def test_a_retrain_goes_on_with_the_moments_of_the_optimizer() -> None:
-    X, y = toy_traces(60)
-    reducer, folds = quick(), content_fold(X, 3)
-    reducer.train(X, y, folds)
+    reducer = quick()
+    reducer.train(X, Y, FOLDS)
     state = reducer.get_state()
-    moments = {name for name in state if name.startswith("optimizer.")}
-    assert moments
-    without = clone(reducer).set_state({name: state[name] for name in state if name not in moments})
-    assert not np.array_equal(without.train(X, y, folds), reducer.train(X, y, folds))
+    kept = {name: state[name] for name in state if not name.startswith("optimizer.")}
+    assert len(kept) < len(state)
+    without = clone(reducer).set_state(kept)
+    assert not np.array_equal(without.train(X, Y, FOLDS), reducer.train(X, Y, FOLDS))
 
 
 def test_references_lie_where_the_same_traces_are_embedded_later() -> None:
-    X, y = toy_traces(90)
-    reducer, folds = quick(), content_fold(X, 3)
-    points = reducer.train(X, y, folds)
-    np.testing.assert_allclose(points, reducer.embed_references(X, folds), atol=1e-5)
+    reducer = quick()
+    points = reducer.train(X, Y, FOLDS)
+    np.testing.assert_allclose(points, reducer.embed_references(X, FOLDS), atol=1e-5)
 
 
 @pytest.mark.parametrize(("make", "n_steps"), [(quick, 0), (own_reducer, 2)])  # of the network
 def test_no_step_begins_after_the_deadline_and_the_reducer_answers_all_the_same(
     make: Any, n_steps: int
 ) -> None:
-    X, y = toy_traces(60)
-    ticks = iter(range(1000))
-    reducer = make()
-    folds = content_fold(X, reducer.folds)
-    reducer.train(X, y, folds, StopRule(deadline=2.0, clock=lambda: float(next(ticks))))
+    reducer, folds = make(), content_fold(X, make().folds)
+    reducer.train(X, Y, folds, StopRule(deadline=2.0, clock=count(0.0).__next__))
     assert reducer.report.n_steps == n_steps
     assert np.isfinite(reducer.embed(X)).all()
 
 
 def test_conv_averages_the_logits_of_its_network_and_of_rocket() -> None:
-    X, y = toy_traces(60)
-    folds = content_fold(X, 3)
-    conv = quick(random_state=3).fit(X, y, folds=folds)
+    both = quick(random_state=3)
     network = TorchReducer(network=ConvNetwork, folds=3, steps=4, fit_steps=30, random_state=3)
     rocket = RocketReducer(folds=3, random_state=3, max_iter=HEAD_STEPS)
-    logits = [
-        np.log(p / (1 - p))
-        for reducer in (network, rocket)
-        for p in [reducer.fit(X, y, folds=folds).embed(X)[:, :, 0].astype(float)]
-    ]
-    expected = 1 / (1 + np.exp(-np.mean(logits, axis=0)))
-    np.testing.assert_allclose(conv.embed(X)[:, :, 0], expected, atol=1e-5)
-    np.testing.assert_array_equal(conv.embed(X)[:, :, 1], network.embed(X)[:, :, 1])
+    for reducer in (both, network, rocket):
+        reducer.fit(X, Y, folds=FOLDS)
+    logits = [logit(part.embed(X)[:, :, 0].astype(float)) for part in (network, rocket)]
+    np.testing.assert_allclose(both.embed(X)[:, :, 0], expit(np.mean(logits, 0)), atol=1e-5)
+    np.testing.assert_array_equal(both.embed(X)[:, :, 1], network.embed(X)[:, :, 1])
 
 
 def test_a_conv_that_was_stored_without_rocket_is_refused_with_what_to_do() -> None:
-    X, y = toy_traces(60)
-    state = quick().fit(X, y).get_state()
+    state = quick().fit(X, Y).get_state()
     old = {name: array for name, array in state.items() if not name.startswith("rocket.")}
     with pytest.raises(StoreError, match="learn from them anew, by `dengine train"):
         quick().set_state(old)
 
 
 def test_a_retrain_takes_its_steps_and_twice_as_many_where_training_is_behind() -> None:
-    X, y = toy_traces(120)
-    reducer, folds = quick(steps=5, fit_steps=22), content_fold(X, 3)
-    taken = []
+    reducer, taken = quick(steps=5, fit_steps=22), []
     for _ in range(4):
-        reducer.train(X, y, folds)
+        reducer.train(X, Y, FOLDS)
         taken.append((reducer.report.n_steps, reducer.report.n_steps_left))
     assert taken == [(10, 12), (10, 2), (5, 0), (5, 0)]
 
 
-def test_an_engine_waits_for_enough_labels_and_drops_no_retrain(tmp_path: Any) -> None:
-    X, y = toy_traces(40)
+def learn(engine: DataEngine, rows: Any) -> list[RetrainReport]:
+    """Report the labels of these traces; return the retrains that they set off."""
+    reports = [engine.report(engine.decide(X[i]).id, bool(Y[i])) for i in rows]
+    return [report for report in reports if report is not None]
+
+
+def test_an_engine_waits_for_enough_labels_and_drops_no_retrain() -> None:
     recipe = Recipe("conv", {"folds": 2, "steps": 4, "fit_steps": 8}, radius=0.07, retrain_every=10)
-    engine = DataEngine(recipe=recipe, replaying=True)
-    reports = []
-    for x, good in zip(X, y, strict=True):
-        reports.append(engine.report(engine.decide(x).id, bool(good)))
-    trained_on = [report.n_traces for report in reports if report is not None]
-    assert trained_on == [20, 30, 40]
-    assert all(report.accepted for report in engine.store.versions.retrains())
+    reports = learn(DataEngine(recipe=recipe, replaying=True), range(40))
+    assert [(r.n_traces, r.accepted) for r in reports] == [(20, True), (30, True), (40, True)]
 
 
 def test_grouped_members_compute_what_separate_networks_of_the_same_weights_compute() -> None:
-    together = ConvNetwork(4, 90, members=3).eval()
+    together, alone = ConvNetwork(4, 90, members=3).eval(), ConvNetwork(4, 90).eval()
     x = torch.randn(5, 3, 4, 90, generator=torch.Generator().manual_seed(0))
-    joint = together(x.flatten(1, 2)).view(5, 3, -1)
+    joint, whole = together(x.flatten(1, 2)).view(5, 3, -1), together.state_dict()
     for k in range(3):
-        alone = ConvNetwork(4, 90).eval()
         for name, value in alone.state_dict().items():
             if value.dim():
-                whole = together.state_dict()[name]
-                value.copy_(whole.chunk(3)[k])
+                value.copy_(whole[name].chunk(3)[k])
         torch.testing.assert_close(alone(x[:, k]), joint[:, k])
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-@pytest.mark.parametrize("samples", [2, 3, 9, 64, 152, 5000])
+@pytest.mark.parametrize(
+    ("samples", "channels"), [(2, 1), (2, 3), (3, 1), (9, 3), (64, 1), (152, 3), (5000, 1)]
+)
 def test_traces_of_any_shape_are_embedded_finitely_and_alike_when_scripted(
     samples: int, channels: int
 ) -> None:
-    rng = np.random.default_rng(0)
-    X = rng.normal(size=(24, channels, samples)).cumsum(2).astype(np.float32)
+    X = np.random.default_rng(0).normal(size=(24, channels, samples)).cumsum(2).astype(np.float32)
     reducer = quick(steps=1)
     reducer.train(X, np.arange(24) % 2, np.arange(24) % 3)
-    embedded = reducer.embed(X)
-    assert np.isfinite(embedded).all()
+    assert np.isfinite(reducer.embed(X)).all()
     eager = reducer.module()
     module = script(eager)
     for x in torch.from_numpy(X[:3]):
@@ -211,43 +191,33 @@ def test_traces_of_any_shape_are_embedded_finitely_and_alike_when_scripted(
 
 
 def test_a_checkpoint_that_is_missing_is_named_at_every_training() -> None:
-    X, y = toy_traces(60)
     reducer = quick(checkpoint="missing.pt")
-    folds = content_fold(X, 3)
-    for _ in range(2):
+    for call, *arguments in [(reducer.precompute, X, FOLDS), (reducer.train, X, Y, FOLDS)] * 2:
         with pytest.raises(SettingError, match="missing"):
-            reducer.precompute(X, np.arange(60))
-        with pytest.raises(SettingError, match="missing"):
-            reducer.train(X, y, folds)
+            call(*arguments)
 
 
 def test_batches_hold_each_row_outside_the_fold_as_often_as_any_other() -> None:
     folds = np.arange(50) % 5
-    batches = torch.stack(
-        list(draw_batches(folds, 5, 8, 10, np.random.default_rng(0)))
-    ).numpy()  # (steps, B, K)
-    for k in range(5):
+    batches = torch.stack([*draw_batches(folds, 5, 8, 10, np.random.default_rng(0))]).numpy()
+    for k in range(5):  # (steps, B, K)
         rows, times = np.unique(batches[:, :, k], return_counts=True)
-        assert set(rows) == set(np.flatnonzero(folds != k))
+        assert rows.tolist() == np.flatnonzero(folds != k).tolist()
         assert times.tolist() == [2] * 40
 
 
 def test_an_augmentation_of_nothing_changes_nothing_and_a_shift_moves_a_trace_in_time() -> None:
     x = torch.randn(6, 2, 3, 40, generator=torch.Generator().manual_seed(0))
     y = (torch.arange(12.0) % 2).view(6, 2)
-    same_x, same_y = Augmentation(0, 0.0, 0.0, 0.0)(x, y, np.random.default_rng(0))
-    assert torch.equal(same_x, x)
-    assert torch.equal(same_y, y)
+    same = Augmentation(0, 0.0, 0.0, 0.0)(x, y, np.random.default_rng(0))
+    assert all(map(torch.equal, same, (x, y)))
     moved, _ = Augmentation(3, 0.0, 0.0, 0.0)(x, y, np.random.default_rng(0))
     for first, other in zip(moved.flatten(0, 1), x.flatten(0, 1), strict=True):
-        inner = [torch.equal(first[:, 3:-3], other[:, 3 + by : 37 + by]) for by in range(-3, 4)]
-        assert any(inner)
+        assert any(torch.equal(first[:, 3:-3], other[:, 3 + by : 37 + by]) for by in range(-3, 4))
 
 
 def test_mixed_traces_and_labels_lie_between_those_of_the_same_member() -> None:
-    x = (
-        torch.arange(4.0).repeat(2, 1)[..., None, None].expand(2, 4, 1, 5).contiguous()
-    )  # member k has traces of k
+    x = torch.arange(4.0)[:, None, None].repeat(2, 1, 1, 5)  # member k has traces of k
     y = torch.tensor([[0.0] * 4, [1.0] * 4])
     mixed, labels = Augmentation(0, 0.0, 0.0, 0.5)(x, y, np.random.default_rng(0))
     assert torch.equal(mixed, x)  # nothing of another member comes in
@@ -257,19 +227,18 @@ def test_mixed_traces_and_labels_lie_between_those_of_the_same_member() -> None:
 
 @pytest.mark.parametrize("network", [ConvNetwork, SmallNetwork])
 def test_every_member_starts_from_the_weights_of_a_checkpoint(network: Any, tmp_path: Any) -> None:
-    single = Members(network, 2, 120, 1)
+    single, several = (Members(network, 2, 120, n).eval() for n in (1, 3))
     save_checkpoint(single, tmp_path / "encoder.pt")
-    several = Members(network, 2, 120, 3)
     load_checkpoint(several, tmp_path / "encoder.pt")
     x = torch.randn(4, 1, 2, 120, generator=torch.Generator().manual_seed(0))
-    expected = single.eval()(x).expand(-1, 3)
-    torch.testing.assert_close(several.eval()(x.expand(-1, 3, -1, -1)), expected)
+    expected = single(x).expand(-1, 3)
+    torch.testing.assert_close(several(x.expand(-1, 3, -1, -1)), expected)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"no checkpoint", "of named dense tensors alone"),
+        (b"no checkpoint", NO_WEIGHTS),
         (None, "cannot be read"),
         (b"\x80\x02a.", "of named dense tensors alone"),  # a pickle whose stack is empty
         ("other", "finite weights of this network"),
@@ -319,8 +288,7 @@ def residual(channels: int, samples: int) -> nn.Module:
 
 @pytest.mark.parametrize("network", [LayersInAnotherOrder, residual])
 def test_a_users_network_answers_as_its_own_forward_says(network: Any) -> None:
-    X, y = toy_traces(60)
-    reducer = own_reducer(network).fit(X, y)
+    reducer = own_reducer(network).fit(X, Y)
     x = reducer.preprocessor_(torch.from_numpy(X)).unsqueeze(1).expand(-1, 2, -1, -1)
     with torch.no_grad():
         expected = reducer.averaged_members_(x).sigmoid()  # trained, and never compiled
@@ -334,29 +302,27 @@ class ImageNorm(nn.BatchNorm2d):
         return super().forward(x.unsqueeze(2)).squeeze(2)
 
 
-class ImageNormNetwork(SmallNetwork):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
-        self.layers[1] = ImageNorm(6)
+def image_norm_network(channels: int, samples: int) -> nn.Module:
+    network = SmallNetwork(channels, samples)
+    network.layers[1] = ImageNorm(6)
+    return network
 
 
 def test_batch_normalisation_of_images_answers_with_statistics_of_the_labelled_traces() -> None:
-    X, y = toy_traces(60)
-    points = [own_reducer(n).fit(X, y).embed(X) for n in (SmallNetwork, ImageNormNetwork)]
+    points = [own_reducer(n).fit(X, Y).embed(X) for n in (SmallNetwork, image_norm_network)]
     np.testing.assert_allclose(*points, atol=1e-5)
 
 
-class MaximumNetwork(SmallNetwork):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
-        self.layers[3] = nn.AdaptiveMaxPool1d(4)
+def maximum_network(channels: int, samples: int) -> nn.Module:
+    network = SmallNetwork(channels, samples)
+    network.layers[3] = nn.AdaptiveMaxPool1d(4)
+    return network
 
 
 def test_another_network_with_weights_of_the_same_sizes_is_not_restored() -> None:
-    X, y = toy_traces(60)
-    state = own_reducer().fit(X, y).get_state()
+    state = own_reducer().fit(X, Y).get_state()
     with pytest.raises(StoreError, match="the same sizes and is another one"):
-        own_reducer(MaximumNetwork).set_state(state)
+        own_reducer(maximum_network).set_state(state)
 
 
 def gives(output: Any) -> Any:
@@ -390,44 +356,43 @@ def gives(output: Any) -> Any:
 def test_what_is_no_network_of_features_is_refused_in_a_sentence(
     network: Any, message: str
 ) -> None:
-    X, y = toy_traces(30)
     with pytest.raises(SettingError, match=message):
-        own_reducer(network).fit(X, y)
+        own_reducer(network).fit(X, Y)
 
 
 def test_a_retrain_does_not_try_again_whether_a_partial_network_compiles(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    X, y = toy_traces(60)
-    engine = DataEngine(reducer=own_reducer(partial(PythonNetwork)), replaying=True, radius=0.07)
-    with caplog.at_level(logging.WARNING):
-        for n, (x, good) in enumerate(zip(X, y, strict=True)):
-            engine.report(engine.decide(x).id, bool(good))
-            if n == 30:
-                caplog.clear()
-        assert engine.version > 2
+    reducer = own_reducer(partial(PythonNetwork))
+    engine = DataEngine(reducer=reducer, replaying=True, retrain_every=20)
+    learn(engine, range(30))
+    assert "cannot be compiled" in caplog.text
+    caplog.clear()
+    learn(engine, range(30, 60))
+    assert engine.version > 2
     assert "cannot be compiled" not in caplog.text
 
 
+def imported(recipe: Recipe, folder: Any) -> str:
+    """A store with 40 labels that were imported."""
+    url = str(folder / "cell.db")
+    import_labelled(url, Dataset(X[:40, 0], Y[:40].astype(np.int8)), recipe)
+    return url
+
+
 def test_a_retrain_without_time_for_a_step_is_not_repeated_at_every_part(tmp_path: Any) -> None:
-    X, y = toy_traces(140, seed=3)
     recipe = Recipe("conv", {"folds": 2}, retrain_every=1000, budget=1e-3)
-    url = str(tmp_path / "cell.db")
-    import_labelled(url, Dataset(X[:100, 0], y[:100].astype(np.int8)), recipe)
-    with DataEngine.open(url) as engine:
+    with DataEngine.open(imported(recipe, tmp_path)) as engine:
         assert engine.retrain().n_steps == 0
-        for x, good in zip(X[100:], y[100:], strict=True):
-            engine.report(engine.decide(x).id, bool(good))
+        learn(engine, range(40, 60))
         assert engine.version == 1
 
 
 def test_a_network_that_does_not_compile_answers_in_python_and_says_so(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    X, y = toy_traces(60)
-    with caplog.at_level(logging.WARNING):
-        reducer = own_reducer(PythonNetwork).fit(X, y)
-        assert reducer.module() is None
+    reducer = own_reducer(PythonNetwork).fit(X, Y)
+    assert reducer.module() is None
     assert "PythonNetwork cannot be compiled by TorchScript" in caplog.text
     assert reducer.embed(X).shape == (60, 2, 2)
 
@@ -437,20 +402,16 @@ def test_two_networks_of_one_name_in_one_process_answer_each_for_itself() -> Non
 
     def network(sign: float) -> type:
         class Network(SmallNetwork):
-            def __init__(self, channels: int, samples: int) -> None:
-                super().__init__(channels, samples)
-                self.sign = sign
+            factor = sign
 
             def forward(self, x: torch.Tensor) -> torch.Tensor:
-                features: torch.Tensor = self.sign * self.layers(x)
-                return features
+                return self.factor * self.layers(x)
 
         return Network
 
-    X, y = toy_traces(60)
     points = []
     for sign in (1.0, -1.0):
-        model = ModelPrediction(own_reducer(network(sign)), folds=2).fit(X, y)
+        model = ModelPrediction(own_reducer(network(sign)), folds=2).fit(X, Y)
         points.append([prediction.embedding for prediction in model.predict_many(X[:5])])
         np.testing.assert_allclose(points[-1], model.spaces.embed(X[:5]), atol=1e-6)
     assert not np.allclose(*points)
@@ -459,28 +420,22 @@ def test_two_networks_of_one_name_in_one_process_answer_each_for_itself() -> Non
 def test_an_engine_trains_on_after_an_import_a_retrain_per_cycle_until_its_steps_are_complete(
     tmp_path: Any,
 ) -> None:
-    X, y = toy_traces(140, seed=3)
-    recipe = Recipe(
-        "conv", {"folds": 2, "steps": 4, "fit_steps": 20}, radius=0.07, retrain_every=1000
-    )
-    url = str(tmp_path / "cell.db")
-    import_labelled(url, Dataset(X[:100, 0], y[:100].astype(np.int8)), recipe)
-    left = []
+    params = {"folds": 2, "steps": 4, "fit_steps": 20}
+    recipe, left = Recipe("conv", params, radius=0.07, retrain_every=1000), []
+    url = imported(recipe, tmp_path)
     with DataEngine.open(url, replaying=True) as engine:
         assert engine.retrain().accepted
         assert "12 steps to go" in dengine("status", url, "--json").output
-        for x, good in zip(X[100:], y[100:], strict=True):
+        for i in range(40, 47):
             left.append(engine.model.report.n_steps_left)
-            engine.report(engine.decide(x).id, bool(good))
+            learn(engine, [i])
             engine.poll()
-    assert left[:4] == [12, 4, 0, 0]
-    assert set(left[3:]) == {0}
+    assert left == [12, 4, 0, 0, 0, 0, 0]
 
 
 def test_members_that_share_the_weights_of_one_module_are_refused_since_they_see_every_label() -> (
     None
 ):
-    X, y = toy_traces(60)
     shared = SmallNetwork(2, 120)
     with pytest.raises(SettingError, match="for each member, with weights of its own"):
-        own_reducer(lambda channels, samples: shared).fit(X, y)
+        own_reducer(lambda channels, samples: shared).fit(X, Y)
