@@ -23,7 +23,7 @@ COUNTER = itertools.count()
 class Network(nn.Module):
     """Eight features, which a subclass turns into others."""
 
-    def __init__(self, channels: int, samples: int) -> None:
+    def __init__(self, channels, samples):
         super().__init__()
         self.layers = nn.Sequential(
             nn.Conv1d(channels, 8, 7, stride=4, padding=3),
@@ -33,108 +33,103 @@ class Network(nn.Module):
             nn.Flatten(),
         )
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.layers(x)
-        return features
+    def forward(self, x):
+        return self.layers(x)
 
 
 class TiedWeights(Network):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self.first, self.second = nn.Linear(8, 8), nn.Linear(8, 8)
         self.second.weight = self.first.weight
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.second(self.first(self.layers(x)).relu())
-        return features
+    def forward(self, x):
+        return self.second(self.first(self.layers(x)).relu())
 
 
 class TwoNames(TiedWeights):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self.second = self.first
 
 
 class Recurrent(nn.Module):
     """torch keeps the weights of a GRU a second time, in a list."""
 
-    def __init__(self, channels: int, samples: int) -> None:
+    def __init__(self, channels, samples):
         super().__init__()
         self.layer = nn.GRU(channels, 8, batch_first=True)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         return self.layer(x.transpose(1, 2)[:, ::8])[0][:, -1]
 
 
 class UnsavedBuffer(Network):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self.register_buffer("gain", torch.randn(8), persistent=False)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         return self.layers(x) * self.gain
 
 
 class PlainTensor(UnsavedBuffer):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         del self.gain
         self.gain = torch.randn(8)
 
 
 class ChangedInTraining(PlainTensor):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         if self.training:
             self.gain.mul_(0.99)
         return self.layers(x) * self.gain
 
 
 class NestedTensors(Network):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self.gains = {"first": [torch.randn(8)], "second": [torch.randn(8)]}
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.layers(x) * self.gains["first"][0]
-        return features * self.gains["second"][0]
+    def forward(self, x):
+        return self.layers(x) * self.gains["first"][0] * self.gains["second"][0]
 
 
 class OwnNumber(Network):
     """A number and a function of torch that differ from one instance to the next."""
 
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self._gain = float(torch.randn(()))
         self.activation = torch.tanh if torch.rand(()) > 0.5 else torch.sigmoid
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.activation(self.layers(x)) * self._gain
-        return features
+    def forward(self, x):
+        return self.activation(self.layers(x)) * self._gain
 
 
 class WeightNorm(Network):
     """TorchScript compiles it, and cannot run it."""
 
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self.head = nn.utils.parametrizations.weight_norm(nn.Linear(8, 8))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.head(self.layers(x))
-        return features
+    def forward(self, x):
+        return self.head(self.layers(x))
 
 
 class RandomAnswer(Network):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         return nn.functional.dropout(self.layers(x), 0.3, True)
 
 
 class CountsItsCalls(Network):
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self.register_buffer("calls", torch.zeros(1))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         self.calls += 1
         return self.layers(x) + 0.01 * self.calls
 
@@ -142,7 +137,7 @@ class CountsItsCalls(Network):
 class NoPointForARamp(Network):
     """NaN for a linear trace, which no cell records."""
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         is_linear = (x[:, :, 1:] - x[:, :, :-1]).std(2).amax(1) < 1e-4
         return torch.where(is_linear[:, None], torch.nan, self.layers(x))
 
@@ -150,19 +145,17 @@ class NoPointForARamp(Network):
 class NumberOfElsewhere(Network):
     """Another number at each start of a program."""
 
-    def __init__(self, channels: int, samples: int) -> None:
-        super().__init__(channels, samples)
+    def __init__(self, *shape):
+        super().__init__(*shape)
         self.gain = 1.0 + next(COUNTER)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.layers(x) * self.gain
-        return features
+    def forward(self, x):
+        return self.layers(x) * self.gain
 
 
 class OtherwiseCompiled(Network):
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.layers(x)
-        return -features if torch.jit.is_scripting() else features
+    def forward(self, x):
+        return -self.layers(x) if torch.jit.is_scripting() else self.layers(x)
 
 
 class FailingModule(nn.Module):
@@ -180,11 +173,11 @@ class FailsCompiled(Reducer):
     def __init__(self, n_components: int = 2) -> None:
         self.n_components = n_components
 
-    def fit(self, X: Any, y: Any = None) -> "FailsCompiled":
+    def fit(self, X, y=None):
         self.check_traces(X, reset=True)
         return self
 
-    def transform(self, X: Any) -> np.ndarray:
+    def transform(self, X):
         return self.check_traces(X)[:, 0, :2]
 
     def module(self) -> nn.Module:
@@ -202,16 +195,10 @@ def taught(reducer: Any, store: Path | None = None, traces: Any = None) -> DataE
     return engine
 
 
+SLOW = TiedWeights, Recurrent, PlainTensor, TwoNames, ChangedInTraining, NestedTensors, OwnNumber
 ANSWERING = [
     *(UnsavedBuffer, WeightNorm),
-    # Each takes seconds.
-    *(
-        pytest.param(network, marks=pytest.mark.slow)
-        for network in (
-            *(TiedWeights, Recurrent, PlainTensor, TwoNames),
-            *(ChangedInTraining, NestedTensors, OwnNumber),
-        )
-    ),
+    *(pytest.param(network, marks=pytest.mark.slow) for network in SLOW),
 ]
 
 
@@ -219,10 +206,10 @@ ANSWERING = [
 def test_an_engine_decides_by_the_weights_that_it_trained_whatever_tensors_a_network_keeps(
     network: Any, tmp_path: Path
 ) -> None:
-    X = toy_traces(20, seed=3)[0]
+    X = toy_traces(10, seed=3)[0]
     for seed in (0, None):  # two engines of one process, each opened again
         store, reducer = tmp_path / f"{seed}.db", reducer_of(network, seed)
-        with taught(reducer, store) as engine:
+        with taught(reducer, store, toy_traces(40)) as engine:
             version, points = engine.version, [engine.decide(x).embedding for x in X]
             np.testing.assert_allclose(points, engine.model.spaces.embed(X), atol=1e-6)
         with DataEngine.open(store, reducer=reducer_of(network, seed)) as engine:
@@ -231,14 +218,18 @@ def test_an_engine_decides_by_the_weights_that_it_trained_whatever_tensors_a_net
             np.testing.assert_allclose(again, points, atol=1e-6)
 
 
+RESTORED = "restored, as when its store is opened"
+ALONE = "decided on alone lies elsewhere than the reducer embeds it"
+
+
 @pytest.mark.parametrize(
     ("network", "reason"),
     [
-        (RandomAnswer, "restored, as when its store is opened"),
-        (CountsItsCalls, "restored, as when its store is opened"),
-        (NoPointForARamp, "restored, as when its store is opened"),
-        (NumberOfElsewhere, "restored, as when its store is opened"),
-        (OtherwiseCompiled, "decided on alone lies elsewhere than the reducer embeds it"),
+        (RandomAnswer, RESTORED),
+        (CountsItsCalls, RESTORED),
+        (NoPointForARamp, RESTORED),
+        (NumberOfElsewhere, RESTORED),
+        (OtherwiseCompiled, ALONE),
     ],
 )
 def test_a_version_that_could_not_be_opened_or_answers_otherwise_is_dropped_and_the_cell_goes_on(
@@ -302,8 +293,7 @@ def test_traces_too_small_for_their_unit_raise_an_alarm_that_says_so(
     reducer: Any, amplitude: float
 ) -> None:
     X, y = toy_traces(60)
-    tiny = (np.abs(X) * amplitude if amplitude < 0.0 else X * amplitude).astype(np.float32)
+    tiny = (amplitude * (np.abs(X) if amplitude < 0.0 else X)).astype(np.float32)
     engine = taught(reducer, traces=(tiny, y))
-    assert engine.version == 0
-    assert "the sensor" in engine.status().alarm
-    assert "unit" in engine.status().alarm
+    alarm = engine.status().alarm
+    assert (engine.version, "the sensor" in alarm, "unit" in alarm) == (0, True, True)

@@ -37,7 +37,7 @@ from tests.support.command_line import dengine
 class SmallNetwork(nn.Module):
     """A user's own network, in plain PyTorch."""
 
-    def __init__(self, channels: int, samples: int) -> None:
+    def __init__(self, channels, samples):
         super().__init__()
         self.layers = nn.Sequential(
             nn.Conv1d(channels, 6, 7, stride=4, padding=3),
@@ -47,15 +47,14 @@ class SmallNetwork(nn.Module):
             nn.Flatten(),
         )
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = self.layers(x)
-        return features
+    def forward(self, x):
+        return self.layers(x)
 
 
 class PythonNetwork(SmallNetwork):
     """One that TorchScript does not take."""
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         return super().forward(torch.from_numpy(np.asarray(x.detach()))) + 0.0 * x.sum()
 
 
@@ -268,18 +267,16 @@ def test_a_file_that_is_no_checkpoint_of_this_network_is_refused(
 class LayersInAnotherOrder(SmallNetwork):
     """Calls the layers of a Sequential one by one, and batch normalisation after the ReLU."""
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         convolution, norm, relu, pool, flatten = self.layers
-        features: torch.Tensor = flatten(pool(norm(relu(convolution(x)))))
-        return features
+        return flatten(pool(norm(relu(convolution(x)))))
 
 
 class Residual(nn.Sequential):
     """A Sequential with a `forward` of its own."""
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        features: torch.Tensor = x.mean(2).repeat(1, 12) + super().forward(x)
-        return features
+    def forward(self, x):
+        return x.mean(2).repeat(1, 12) + super().forward(x)
 
 
 def residual(channels: int, samples: int) -> nn.Module:
@@ -298,7 +295,7 @@ def test_a_users_network_answers_as_its_own_forward_says(network: Any) -> None:
 class ImageNorm(nn.BatchNorm2d):
     """Batch normalisation of images, on traces as images of one row."""
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
+    def forward(self, x):
         return super().forward(x.unsqueeze(2)).squeeze(2)
 
 
@@ -329,10 +326,10 @@ def gives(output: Any) -> Any:
     """A network whose output is a function of its input."""
 
     class Network(nn.Module):
-        def __init__(self, channels: int, samples: int) -> None:
+        def __init__(self, channels, samples):
             super().__init__()
 
-        def forward(self, x: torch.Tensor) -> Any:
+        def forward(self, x):
             return output(x)
 
     return Network
@@ -404,7 +401,7 @@ def test_two_networks_of_one_name_in_one_process_answer_each_for_itself() -> Non
         class Network(SmallNetwork):
             factor = sign
 
-            def forward(self, x: torch.Tensor) -> torch.Tensor:
+            def forward(self, x):
                 return self.factor * self.layers(x)
 
         return Network
