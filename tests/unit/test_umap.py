@@ -20,9 +20,7 @@ from dengine import (
     UmapLearnReducer,
     UmapReducer,
     WilsonRadiusClassifier,
-    export_torchscript,
     load_dataset,
-    load_exported,
 )
 from dengine.decision.scripting import script
 from dengine.errors import SettingError, StoreError
@@ -248,7 +246,6 @@ def test_both_exports_decide_as_the_model_does(
 ) -> None:
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    from dengine.export import export_onnx, load_onnx
 
     data, new = make_data(300), make_data(100, seed=9).X
     classifier = WilsonRadiusClassifier(0.5, 0.2, 0.8)
