@@ -246,16 +246,19 @@ def test_both_exports_decide_as_the_model_does(
 ) -> None:
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
+    from dengine.export import export_onnx, export_torchscript, load_exported, load_onnx
 
     data, new = make_data(300), make_data(100, seed=9).X
     classifier = WilsonRadiusClassifier(0.5, 0.2, 0.8)
     model = ModelPrediction("umap", classifier).fit(data.X, data.y)
     expected = model.predict_many(new)
     actions = [prediction.action for prediction in expected]
-    places = np.array([prediction.embedding for prediction in expected])
-    assert {Action.ACCEPT, Action.REJECT} <= set(actions)
-    for exported in (exported_onnx, two):
-        decided = [*map(exported.decide, new.X)]
+    assert {Action.ACCEPT, Action.REJECT} <= {*actions}
+    for exported in (
+        load_onnx(export_onnx(model, tmp_path / "model.onnx")),
+        load_exported(export_torchscript(model, tmp_path / "model.ts")),
+    ):
+        decided = [*map(exported.decide, new)]
         assert [decision.action for decision in decided] == actions
         places = [[item.embedding for item in items] for items in (decided, expected)]
         np.testing.assert_allclose(*places, rtol=1e-4, atol=1e-5)
