@@ -9,7 +9,7 @@ from ...errors import listed
 from ..checks import LEAST_RATE_HZ, MOST_RATE_HZ
 from ..dataset import Fault
 from ..description import UNKNOWN
-from ..read.clock import UNITS, check_steps, scale_of, times_of
+from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
 from .columns import Column, Floats, Proposal, Tables
@@ -47,16 +47,19 @@ ANSWERS = (  # to a clock that the reader would refuse
 def propose_clock(p: Proposal) -> None:
     """Find the column of the clock, and its form, and set them in `p`.
 
-    If several columns may be the clock, or no header names the columns, `time.column` is set to
-    `?`, with a note. If none may be, only a note says that the rate is unknown.
+    If several columns may be the clock or a part of it, as a date is, or no header names the
+    columns, `time.column` is set to `?`, with a note. If none may be, only a note says that the
+    rate is unknown.
     """
     stated = p.description.time.column
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if stated:
         clocks = [p.columns[name] for name in stated if name in p.columns]
     every = p.columns.values() if clocks or "c0" in p.description.text.names else ()
-    names = [c.name for c in every if c.forms or c in clocks or not clocks]
-    if clocks and (stated or len(clocks) == 1):
+    has_days = any(has_day(form) for column in clocks for form in column.forms)
+    coarse = [] if has_days else [c for c in p.unused if c.forms or is_coarse(c)]
+    names = [c.name for c in every if c in clocks or c in coarse or not clocks]
+    if clocks and (stated or len(names) == 1):
         p.put("time.column", [column.name for column in clocks])
         p.put("time.format", [form_of(column, p, len(clocks) == 1) for column in clocks])
     elif names and "time.column" not in p.stated:
@@ -76,6 +79,14 @@ def is_clock(column: Column) -> bool:
     if column.forms or (is_named and column.odd):
         return not column.fixed
     return is_named and is_rising(column)
+
+
+def is_coarse(column: Column) -> bool:
+    """Return whether a column is named like a clock and changes only from recording to recording.
+
+    Seconds beside a column of nanoseconds may do so.
+    """
+    return NAME.search(column.name) is not None and len({*column.fixed}) > 1
 
 
 def is_rising(column: Column) -> bool:
