@@ -9,14 +9,13 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dengine import DataEngine, Dataset, SqlStore
-from dengine.errors import StoreError
 from dengine.store import backup_store, verify_history
 from tests.support.command_line import dengine, document, line_of
 from tests.support.driving import learn
@@ -39,8 +38,8 @@ def in_use(tmp_path: Path, data: Dataset) -> Iterator[DataEngine]:
             other.execute("ROLLBACK")
 
 
-def labels_of(file: Path) -> list[int]:
-    with SqlStore(str(file)) as store:
+def labels_of(file: Path, cell: str = "cell") -> list[int]:
+    with SqlStore(str(file), cell) as store:
         return store.labels.with_traces().labels.tolist()
 
 
@@ -55,21 +54,23 @@ def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_ve
     assert list(copy.parent.iterdir()) == [copy]  # one file, and nothing beside it
     assert labels_of(copy) == data.y[:n].tolist()
     assert verify_history(str(copy)).ok
+    text = line_of("backup", copy, "--out", tmp_path / "again.db")
+    assert "No journal of cell cell lies beside" in text
     learn(in_use, data, range(n, n + 1))  # it goes on meanwhile
-    with DataEngine.open(str(copy)) as engine:
+    with DataEngine.open(copy) as engine:
         assert engine.status().labels == n
 
 
 def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(
     tmp_path: Path, data: Dataset
 ) -> None:
-    store, acknowledged, ended = tmp_path / "engine.db", list[str](), threading.Event()
+    acknowledged, ended = list[str](), threading.Event()
 
     def work() -> None:
-        with DataEngine("pca", retrain_every=10**6, store=str(store)) as engine:
+        with DataEngine("pca", retrain_every=10**6, store=tmp_path / "engine.db") as engine:
             for i in itertools.count():
                 decision = engine.decide(data.X[i % len(data)] + np.float32(1e-6 * i))
-                engine.report(decision.id, bool(data.y[i % len(data)]))
+                engine.report(decision.id, True)
                 acknowledged.append(decision.id)
                 if ended.is_set():
                     return
@@ -81,13 +82,12 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
                 while len(acknowledged) < 20 * n and working.running():
                     time.sleep(0.01)
                 before, copy = set(acknowledged), str(tmp_path / f"{n}.db")
-                backup_store(store, copy)
+                assert len(before) >= 20 * n
+                backup_store(tmp_path / "engine.db", copy)
                 assert verify_history(copy).ok
                 with SqlStore(copy) as copied:
-                    labels = {label.decision_id for label in copied.labels.past(0)}
+                    assert before <= {label.decision_id for label in copied.labels.past(0)}
                     kinds = [event.kind for event in copied.events.newest()]
-                assert len(before) >= 20 * n
-                assert before <= labels
                 assert "dead letter" not in kinds
         finally:
             ended.set()
@@ -97,49 +97,31 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
 def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(
     tmp_path: Path, in_use: DataEngine
 ) -> None:
-    journal = tmp_path / "engine.db.cell.journal"
-    kept = journal.read_bytes()
-    first = backup_store(tmp_path / "engine.db", tmp_path / "first.db")
-    (tmp_path / "first.db.cell.journal").write_bytes(kept)  # what it holds is in that store by now
-    second = backup_store(tmp_path / "first.db", tmp_path / "second.db")
+    names = [tmp_path / name for name in ("engine.db", "first.db", "second.db")]
+    first = backup_store(*names[:2])
+    # What the journal holds is in the first copy by now.
+    shutil.copy(f"{names[0]}.cell.journal", f"{names[1]}.cell.journal")
+    second = backup_store(*names[1:])
     assert (second.decisions, second.labels) == (first.decisions, first.labels)
-    assert labels_of(tmp_path / "second.db") == labels_of(tmp_path / "first.db")
-    with SqlStore(str(tmp_path / "second.db")) as store:
-        assert [event.kind for event in store.events.newest() if event.kind == "dead letter"] == []
+    assert labels_of(names[2]) == labels_of(names[1])
+    with SqlStore(str(names[2])) as store:
+        assert "dead letter" not in [event.kind for event in store.events.newest()]
 
 
 def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_none(
     tmp_path: Path, in_use: DataEngine
 ) -> None:
     store, copy = tmp_path / "engine.db", tmp_path / "plain.db"
-    text = line_of("verify", store)
-    assert f"The journal of cell cell holds {2 * IN_JOURNAL} records" in text
     for suffix in ("", "-wal"):
         shutil.copyfile(f"{store}{suffix}", f"{copy}{suffix}")
-    text = line_of("verify", copy)
-    assert "The journal of cell cell is not here" in text
-    assert "dengine backup" in text
-    assert document("verify", copy)["cells"][0]["waiting"] is None
-    assert document("verify", store)["cells"][0]["waiting"] == 2 * IN_JOURNAL
-
-
-def test_a_plain_copy_of_the_file_alone_is_refused_where_its_tables_are_in_the_log(
-    tmp_path: Path,
-) -> None:
-    with DataEngine("pca", store=str(tmp_path / "engine.db")):
-        shutil.copyfile(tmp_path / "engine.db", tmp_path / "plain.db")
-        result = dengine("verify", tmp_path / "plain.db")
-    assert result.exit_code == 1
-    assert "dengine backup" in result.output
-
-
-def test_a_backup_of_a_copy_says_that_it_has_no_journal(tmp_path: Path, in_use: DataEngine) -> None:
-    backup_store(tmp_path / "engine.db", tmp_path / "copy.db")
-    assert document("backup", tmp_path / "copy.db", "--out", tmp_path / "again.db")[
-        "without_journal"
-    ] == ["cell"]
-    text = line_of("backup", tmp_path / "copy.db", "--out", tmp_path / "third.db")
-    assert "No journal of cell cell lies beside" in text
+    for file, text, n in (
+        (store, f"The journal of cell cell holds {2 * IN_JOURNAL} records", 2 * IN_JOURNAL),
+        (copy, "The journal of cell cell is not here", None),
+    ):
+        assert text in line_of("verify", file)
+        assert document("verify", file)["cells"][0]["waiting"] == n
+    alone = shutil.copyfile(store, tmp_path / "alone.db")  # without the log, which has its tables
+    assert "dengine backup" in dengine("verify", alone).stderr
 
 
 def test_a_cell_moves_to_another_machine_by_backup_and_restore(
@@ -152,7 +134,7 @@ def test_a_cell_moves_to_another_machine_by_backup_and_restore(
     verified = document("verify", there)
     assert (verified["ok"], verified["cells"]) == (True, [restored["cells"][0] | {"waiting": 0}])
     caplog.clear()
-    with DataEngine.open(str(there)) as engine:
+    with DataEngine.open(there) as engine:
         assert engine.status().labels == IN_STORE + IN_JOURNAL
         assert (engine.status().alarm, engine.store.events.newest()) == ("", [])
         learn(engine, data, range(70, 80))
@@ -173,6 +155,7 @@ def test_a_copy_whose_history_was_changed_is_not_restored(
     assert not there.exists()
 
 
+# Of a journal that cannot be read no backup is made.
 @pytest.mark.parametrize(
     ("store", "out", "words"),
     [
@@ -182,6 +165,7 @@ def test_a_copy_whose_history_was_changed_is_not_restored(
         ("engine.db", "missing/copy.db", "choose a folder that exists"),
         ("nothing.db", "copy.db", "found no file"),
         ("notes.txt", "copy.db", "something else"),
+        ("other.db", "copy.db", "found another file"),
     ],
 )
 def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
@@ -190,7 +174,8 @@ def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
     monkeypatch.chdir(tmp_path)
     for name in ("engine.db", "other.db"):
         DataEngine("pca", store=name).close()
-    Path("notes.txt").write_text("mine\n" * 100, encoding="utf-8")
+    for name in ("notes.txt", "other.db.cell.journal"):
+        Path(name).write_text("mine\n" * 100, encoding="utf-8")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     result = dengine("backup", store, "--out", out)
     assert result.exit_code == 1
@@ -198,33 +183,21 @@ def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_a_journal_that_cannot_be_read_makes_no_backup(tmp_path: Path) -> None:
-    DataEngine("pca", store=str(tmp_path / "engine.db")).close()
-    (tmp_path / "engine.db.cell.journal").write_bytes(b"no journal at all")
-    with pytest.raises(StoreError, match="found another file"):
-        backup_store(tmp_path / "engine.db", tmp_path / "copy.db")
-    assert not (tmp_path / "copy.db").exists()
-
-
 def test_every_cell_of_a_file_is_in_its_backup(tmp_path: Path, data: Dataset) -> None:
-    file = str(tmp_path / "line.db")
-    engines = [
-        DataEngine("pca", retrain_every=1000, store=SqlStore(file, f"cell {name}")) for name in "AB"
-    ]
-    with closing(sqlite3.connect(file, isolation_level=None)) as other:
-        for engine, first in zip(engines, (0, 10), strict=True):
-            learn(
-                engine, data, [first]
-            )  # the first trace sets the contract, which waits for the store
+    file, copy = str(tmp_path / "line.db"), tmp_path / "copy.db"
+    parts = {"A": range(10), "B": range(10, 30)}
+    with ExitStack() as cells:
+        engines = [
+            cells.enter_context(DataEngine("pca", retrain_every=1000, store=SqlStore(file, name)))
+            for name in parts
+        ]
+        for engine, rows in zip(engines, parts.values(), strict=True):
+            learn(engine, data, rows[:1])  # it sets the contract, which waits for the store
             engine.store.flush()
+        other = cells.enter_context(closing(sqlite3.connect(file, isolation_level=None)))
         other.execute("BEGIN IMMEDIATE")
-        for engine, rows in zip(engines, (range(1, 10), range(11, 30)), strict=True):
-            learn(engine, data, rows)
-        report = backup_store(file, tmp_path / "copy.db")
-        other.execute("ROLLBACK")
-    for engine in engines:
-        engine.close()
+        for engine, rows in zip(engines, parts.values(), strict=True):
+            learn(engine, data, rows[1:])
+        report = backup_store(file, copy)
     assert (report.decisions, report.labels, report.without_journal) == (30, 30, ())
-    for name, n in (("A", 10), ("B", 20)):
-        with SqlStore(str(tmp_path / "copy.db"), f"cell {name}") as store:
-            assert len(store.labels.with_traces().labels) == n
+    assert {name: len(labels_of(copy, name)) for name in parts} == {"A": 10, "B": 20}

@@ -3,6 +3,7 @@ it remembers.
 """
 
 import asyncio
+import json
 import logging
 import re
 import socket
@@ -50,7 +51,21 @@ JSON, PROBLEM = "application/json", "application/problem+json"
 RAW = "application/octet-stream"
 SAMPLES = 60
 COUNTED = "action", "n_success", "n_failure", "lower", "upper"
-Client = Any
+
+
+class Client(httpx.Client):
+    """Asks a server as a robot does."""
+
+    def ask(self, path: str, **body: Any) -> Any:
+        return self.post(path, json=body)
+
+    def decide(self, x: np.ndarray, request: str | None = None, **body: Any) -> Any:
+        return self.ask("/decide", trace=x.tolist(), request=request, **body)
+
+    def listed(self, **query: Any) -> list[str]:
+        """The ids of the decisions that a query finds."""
+        page = self.get("/decisions", params=query).json()
+        return [decision["id"] for decision in page["decisions"]]
 
 
 @contextmanager
@@ -60,7 +75,7 @@ def running(
     """A client of a server in front of this service."""
     with (
         served(create_app(service, tokens), **options) as port,
-        httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60, trust_env=False) as client,
+        Client(base_url=f"http://127.0.0.1:{port}", timeout=60, trust_env=False) as client,
     ):
         yield client
 
@@ -114,29 +129,25 @@ def must_be_problem(answer: Any, status: int) -> dict[str, Any]:
 def test_a_cell_over_http_is_the_cell_without_it(client: Client, stream: Dataset) -> None:
     with DataEngine(recipe=RECIPE) as engine:
         for x, good in zip(stream.X[:60], stream.y.astype(bool).tolist(), strict=False):
-            here = engine.decide(x)
-            there = client.post("/decide", json={"trace": x.tolist()}).json()
+            here, there = engine.decide(x), client.decide(x).json()
             assert [there[name] for name in COUNTED] == [getattr(here, name) for name in COUNTED]
             if here.action == "verify":
                 engine.report(here.id, good)
-                body = {"id": there["id"], "success": good}
-                assert client.post("/report", json=body).json()["success"] is good
+                assert client.ask("/report", id=there["id"], success=good).json()["success"] is good
         status = client.get("/status").json()
         assert engine.version == status["version"] == 1
         assert status["claim"] == engine.certificate().sentence
 
 
-def forms(trace: np.ndarray, request: str) -> dict[str, dict[str, Any]]:
-    """The same trace as each form has it."""
+def forms(trace: np.ndarray, request: str) -> Iterator[dict[str, Any]]:
+    """The same trace in JSON, and as raw float32."""
     raw, text = trace.astype("<f4").tobytes(), {"request": request, "part": "P1"}
-    return {
-        "JSON": {"json": {"trace": trace.tolist(), **text}},
-        "float32": {
-            "content": raw,
-            "params": text | {"channels": 1},
-            "headers": {"content-type": RAW},
-        },
-    }
+    yield {"json": {"trace": trace.tolist(), **text}}
+    yield typed(raw, RAW, channels=1, **text)
+
+
+def typed(content: bytes, kind: str, **params: Any) -> dict[str, Any]:
+    return {"content": content, "headers": {"content-type": kind}, "params": params}
 
 
 @given(arrays(np.float32, st.integers(1, 60), elements=st.floats(-1e4, 1e4, width=32)))
@@ -159,34 +170,34 @@ def test_a_sample_that_is_missing_is_null_and_the_part_is_verified(
 
 
 def test_asked_again_it_answers_the_same(client: Client, stream: Dataset) -> None:
-    first = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"]).json()
-    for form in forms(stream.X[0], "order-0").values():
-        again = client.post("/decide", **form).json()
-        validate(again, "DecideResponse", client)
-        assert again | {"seconds": 0} == first | {"seconds": 0}
-    problem = must_be_problem(client.post("/decide", **forms(stream.X[1], "order-0")["JSON"]), 409)
+    answers = [client.post("/decide", **form).json() for form in forms(stream.X[0], "order-0")]
+    for answer in answers:
+        validate(answer, "DecideResponse", client)
+        assert answer | {"seconds": 0} == answers[0] | {"seconds": 0}
+    problem = must_be_problem(client.decide(stream.X[1], "order-0"), 409)
     assert "got another; give it an id of its own" in problem["detail"]
 
 
 def test_a_label_is_taken_once_and_not_against_itself(client: Client, stream: Dataset) -> None:
-    client.post("/decide", json={"trace": (stream.X[2] * 9).tolist(), "request": "label-0"})
-    assert client.get("/decisions?open=true").json()["decisions"][0]["id"] == "label-0"
+    client.decide(stream.X[2] * 9, "label-0")
+    assert client.listed(open=True)[0] == "label-0"
     for repeated in (False, True):
-        answer = client.post("/report", json={"id": "label-0", "success": True}).json()
+        answer = client.ask("/report", id="label-0", success=True).json()
         validate(answer, "ReportResponse", client)
         assert answer["repeated"] is repeated
-    must_be_problem(client.post("/report", json={"id": "label-0", "success": False}), 409)
-    must_be_problem(client.post("/report", json={"id": "nobody", "success": True}), 404)
-    must_be_problem(client.post("/report", json={"id": "label-0", "success": "OK"}), 422)
-    must_be_problem(client.post("/report", json={"id": "", "success": True}), 422)
-    assert "label-0" not in [
-        decision["id"] for decision in client.get("/decisions?open=true").json()["decisions"]
-    ]
+    for id_, success, status in (
+        ("label-0", False, 409),
+        ("nobody", True, 404),
+        ("label-0", "OK", 422),
+        ("", True, 422),
+    ):
+        must_be_problem(client.ask("/report", id=id_, success=success), status)
+    assert "label-0" not in client.listed(open=True)
     assert client.get("/decisions/label-0").json()["source"] == "verification"
 
 
 def test_what_can_be_looked_at_is_as_the_document_says(client: Client, stream: Dataset) -> None:
-    newest = client.post("/decide", json={"trace": stream.X[9].tolist()}).json()["id"]
+    newest = client.decide(stream.X[9]).json()["id"]
     for path, schema in {
         "status?watch=true&last=7": "Status",
         "healthz": "Health",
@@ -198,60 +209,55 @@ def test_what_can_be_looked_at_is_as_the_document_says(client: Client, stream: D
         "me": "Me",
         "events?limit=3": "Events",
     }.items():
-        validate(client.get(f"/{path}").json(), schema, client)
-    for path in ("decisions/nobody", "explanations/nobody", "decisions?before=nobody"):
-        must_be_problem(client.get(f"/{path}"), 404)
-    queries = ("limit=0", "limit=x", "open=yes", "label=fine", "since=monday", "limit=9999")
-    every = [
-        path.format(id="nobody")
-        for path, how in client.get("/openapi.json").json()["paths"].items()
-        if "get" in how
-    ]
-    wrong = [f"decisions?{query}" for query in queries] + [f"{path[1:]}?prat=7" for path in every]
-    for path in (*wrong, "events?limit=0", "status?last=0", "course?hours=5e-324"):
-        must_be_problem(client.get(f"/{path}"), 422)
+        validate(client.get(path).json(), schema, client)
+    for path in ["decisions/nobody", "explanations/nobody", "decisions?before=nobody"]:
+        must_be_problem(client.get(path), 404)
+    paths = client.get("/openapi.json").json()["paths"].items()
+    wrong = [path.format(id="nobody") + "?prat=7" for path, how in paths if "get" in how]
+    wrong += ["events?limit=0", "status?last=0", "course?hours=5e-324"]
+    queries = ["limit=0", "limit=x", "open=yes", "label=fine", "since=monday", "limit=9999"]
+    for path in (*wrong, *(f"decisions?{query}" for query in queries)):
+        must_be_problem(client.get(path), 422)
 
 
 def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another(
     stream: Dataset,
 ) -> None:
-    def listed(**query: Any) -> list[str]:
-        page = client.get("/decisions", params=query).json()
-        return [decision["id"] for decision in page["decisions"]]
-
     with serving() as (_, client):
         for i, x in enumerate(stream.X[:7]):
-            body = {"trace": x.tolist(), "request": f"found-{i}", "part": f"F{i % 6}"}
-            client.post("/decide", json=body)
-        client.post("/report", json={"id": "found-1", "success": False})
-        assert listed(part="F0") == ["found-6", "found-0"]
-        assert listed(part="F1", label="bad", action="verify") == ["found-1"]
-        assert listed(part="F1", action="reject") == listed(part="F1", until=1.0) == []
-        assert listed(limit=3) + listed(limit=4, before="found-4") == listed(limit=7)
-        assert client.get("/decisions?limit=3").json()["older"] == "found-4"
-        assert client.get("/decisions?limit=7").json()["older"] is None
+            client.decide(x, f"found-{i}", part=f"F{i % 6}")
+        client.ask("/report", id="found-1", success=False)
+        assert client.listed(part="F0") == ["found-6", "found-0"]
+        assert client.listed(part="F1", label="bad", action="verify") == ["found-1"]
+        assert client.listed(part="F1", action="reject") == client.listed(part="F1", until=1) == []
+        older = client.listed(limit=4, before="found-4")
+        assert client.listed(limit=3) + older == client.listed(limit=7)
+        pages = [client.get(f"/decisions?limit={n}").json()["older"] for n in (3, 7)]
+        assert pages == ["found-4", None]
 
 
-@pytest.mark.parametrize("path", ["report", "correct"])
+@pytest.mark.parametrize("path", ["/report", "/correct"])
 def test_a_part_that_comes_back_is_named_by_its_number_unless_it_has_several_decisions(
     path: str, stream: Dataset
 ) -> None:
     with serving() as (_, client):
         for i, x in enumerate(stream.X[:3]):
-            body = {"trace": x.tolist(), "request": f"found-{i}", "part": f"F{i % 2}"}
-            client.post("/decide", json=body)
-            if path == "correct":
-                client.post("/report", json={"id": f"found-{i}", "success": True})
-        asked = {"success": False, "author": "Kim"}
-        problem = must_be_problem(client.post(f"/{path}", json=asked | {"part": "F0"}), 409)
-        assert "found-2, found-0" in problem["detail"]
-        client.post(f"/{path}", json=asked | {"part": "F1"}).raise_for_status()
+            client.decide(x, f"found-{i}", part=f"F{i % 2}")
+            if path == "/correct":
+                client.ask("/report", id=f"found-{i}", success=True)
+        for named, status in (
+            ({"part": "F0"}, 409),
+            ({"part": "nobody"}, 404),
+            ({}, 422),
+            ({"id": "found-0", "part": "F0"}, 422),
+        ):
+            refused = client.ask(path, success=False, author="Kim", **named)
+            detail = must_be_problem(refused, status)["detail"]
+            assert status != 409 or "found-2, found-0" in detail
+        client.ask(path, success=False, author="Kim", part="F1").raise_for_status()
         assert client.get("/decisions/found-1").json()["success"] is False
         assert client.get("/events?limit=1").json()["events"][0]["author"] == "Kim"
         assert client.get("/explanations/F1").json()["decision"]["id"] == "found-1"
-        must_be_problem(client.post(f"/{path}", json=asked | {"part": "nobody"}), 404)
-        for both in ({}, {"id": "found-0", "part": "F0"}):
-            must_be_problem(client.post(f"/{path}", json=asked | both), 422)
 
 
 CHANGES = [
@@ -268,68 +274,69 @@ def test_a_label_and_a_policy_are_put_right_by_name_and_nothing_is_done_twice(
 ) -> None:
     with serving() as (service, client):
         for i in range(3):
-            client.post("/decide", json={"trace": stream.X[i].tolist(), "request": f"wrong-{i}"})
-            client.post("/report", json={"id": f"wrong-{i}", "success": True})
+            client.decide(stream.X[i], f"wrong-{i}")
+            client.ask("/report", id=f"wrong-{i}", success=True)
         for path, asked in CHANGES:
-            changed = client.post(f"/{path}", json=asked | {"author": " Kim  Lee "}).json()
+            changed = client.ask(path, **asked, author=" Kim  Lee ").json()
             validate(changed, "Changed", client)
             assert changed["event"] is not None
-            again = client.post(f"/{path}", json=asked | {"author": "Kim Lee"}).json()
-            assert again["event"] is None
+            assert client.ask(path, **asked, author="Kim Lee").json()["event"] is None
         events = client.get("/events").json()["events"]
-        kinds = ["policy", "policy", "policy", "forget", "correct"]
-        assert [(item["kind"], item["author"]) for item in events] == [
-            (kind, "Kim Lee") for kind in kinds
-        ]
+        kinds = [item["kind"] for item in events if item["author"] == "Kim Lee"]
+        assert kinds == ["policy", "policy", "policy", "forget", "correct"]
         assert (service.engine.policy.alpha, service.engine.policy.shadow) == (0.2, True)
         labels = [client.get(f"/decisions/wrong-{i}").json()["success"] for i in range(3)]
         assert labels == [False, None, None]
 
 
-NOT_PUT_RIGHT = [
-    (422, "correct", {"id": "label-0", "success": False}),
-    (422, "correct", {"id": "label-0", "success": False, "author": "  "}),
-    (422, "forget", {"ids": [], "author": "Kim"}),
-    (422, "retrain", {"author": "x" * 300}),
-    (422, "retrain", {"author": "Kim\u202e"}),
-    (422, "correct", {"id": "label-0", "success": "bad", "author": "Kim"}),
-    (404, "correct", {"id": "nobody", "success": False, "author": "Kim"}),
-    (404, "rollback", {"version": 7, "author": "Kim"}),
-    (422, "release", {"version": 7, "author": "Kim"}),
-    (422, "rollback", {"version": "../1", "author": "Kim"}),
-    (422, "policy", {"alpha": 7, "author": "Kim"}),
-    # Nothing is imported since a request names it.
-    (422, "policy", {"guarantee": "os:system", "author": "Kim"}),
-    (422, "policy", {"force_limits": ["0.1:0.2:high"], "author": "Kim"}),
-]
+# Where no author is named, it is Kim.
+NOT_PUT_RIGHT = """
+422 correct  {"id": "label-0", "success": false, "author": "  "}
+422 correct  {"id": "label-0", "success": "bad"}
+422 forget   {"ids": []}
+422 retrain  {"author": "LONG"}
+422 retrain  {"author": "Kim\\u202e"}
+404 correct  {"id": "nobody", "success": false}
+404 rollback {"version": 7}
+422 rollback {"version": "../1"}
+422 release  {"version": 7}
+422 policy   {"alpha": 7}
+422 policy   {"guarantee": "os:system"}
+422 policy   {"force_limits": ["0.1:0.2:high"]}
+"""  # a rule is not imported since a request names it
 
 
 def test_what_cannot_be_put_right_so_is_refused_and_leaves_no_event() -> None:
     with serving() as (_, client):
-        for status, path, asked in NOT_PUT_RIGHT:
-            refused = must_be_problem(client.post(f"/{path}", json=asked), status)
+        for line in NOT_PUT_RIGHT.strip().splitlines():
+            status, path, text = line.split(maxsplit=2)
+            asked = {"author": "Kim"} | json.loads(text.replace("LONG", "x" * 300))
+            refused = must_be_problem(client.post(path, json=asked), int(status))
             assert "--" not in refused["detail"]  # no option of the command line
             elsewhere = {"origin": "http://evil.example"}
-            must_be_problem(client.post(f"/{path}", json=asked, headers=elsewhere), 403)
+            must_be_problem(client.post(path, json=asked, headers=elsewhere), 403)
+        must_be_problem(client.ask("/correct", id="label-0", success=False), 422)  # by nobody
         assert client.get("/events").json()["events"] == []
 
 
-def test_whoever_listens_is_told_of_changes_and_not_of_looks(stream: Dataset) -> None:
+def test_whoever_listens_is_told_of_changes_and_not_of_looks(
+    stream: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dengine.serve.http.TICK", 0.5)
     with serving() as (service, client), client.stream("GET", "/changes") as answer:
-        events = (
-            line.removeprefix("event: ")
-            for line in answer.iter_lines()
-            if line.startswith("event: ")
-        )
+        names = (line.partition("event: ")[2] for line in answer.iter_lines())
+        events = filter(None, names)
         assert [next(events), next(events)] == ["hello", "changed"]
         for _ in range(3):
             client.get("/status")
             client.get("/decisions")
-        assert next(events) == "tick"  # five seconds of quiet
-        client.post("/decide", json={"trace": stream.X[0].tolist()})
-        assert next(events) == "changed"
+        assert next(events) == "tick"  # half a second of quiet
+        client.decide(stream.X[0])
+        while (event := next(events)) == "tick":  # on a busy machine another half second is over
+            pass
+        assert event == "changed"
         service.end_listening()
-        assert list(events) == []
+        assert {*events} <= {"tick"}
 
 
 def test_the_page_is_files_that_may_ask_nobody_else(client: Client) -> None:
@@ -349,39 +356,33 @@ def test_the_document_names_every_route_and_every_example_is_served(
     service: CellService, client: Client
 ) -> None:
     document = client.get("/openapi.json").json()
-    served_here = [
-        route
-        for route in create_app(service).routes
-        if isinstance(route, Route) and route.path not in (RPC, *VIEWS)
-    ]
+    app = create_app(service)
     routes = {
-        (route.path.replace(":path", ""), m)
-        for route in served_here
-        for m in route.methods - {"HEAD"}
+        (route.path.replace(":path", ""), method.lower())
+        for route in app.routes
+        if isinstance(route, Route) and route.path not in (RPC, *VIEWS)
+        for method in route.methods - {"HEAD"}
     }
-    assert routes == {
-        (path, m.upper()) for path, methods in document["paths"].items() for m in methods
-    }
-    for path, methods in document["paths"].items():
-        for content in methods.get("post", {}).get("requestBody", {}).get("content", {}).values():
+    named = {(path, method) for path, methods in document["paths"].items() for method in methods}
+    assert routes == named
+    for path, method in named:
+        contents = document["paths"][path][method].get("requestBody", {}).get("content", {})
+        for content in contents.values():
+            schema = {**content["schema"], "components": document["components"]}
             for example in content.get("examples", {}).values():
-                jsonschema.validate(
-                    example["value"], {**content["schema"], "components": document["components"]}
-                )
+                jsonschema.validate(example["value"], schema)
                 answer = client.post(path, json=example["value"])
-                assert answer.status_code in (200, 404, 422), (
-                    answer.text
-                )  # of another contract, or unknown here
-                words = ("unknown", "does not hold", "samples", "channel")
-                assert any(word in answer.text for word in words)
+                # Of another contract, or unknown here.
+                assert answer.status_code in (200, 404, 422), answer.text
+                assert re.search("unknown|does not hold|samples|channel", answer.text)
     assert client.get("/docs").headers["content-type"].startswith("text/html")
 
 
 def test_prometheus_reads_what_was_answered(stream: Dataset) -> None:
     with serving() as (_, client):
         for i in range(3):
-            client.post("/decide", **forms(stream.X[i], f"m-{i}")["JSON"])
-        client.post("/report", json={"id": "m-0", "success": True})
+            client.decide(stream.X[i], f"m-{i}")
+        client.ask("/report", id="m-0", success=True)
         families = text_string_to_metric_families(client.get("/metrics").text)
     result = {(s.name, *sorted(s.labels.values())): s.value for f in families for s in f.samples}
     expected = {
@@ -392,42 +393,37 @@ def test_prometheus_reads_what_was_answered(stream: Dataset) -> None:
         ("dengine_safe_mode",): 0,
         ("dengine_store_fault",): 0,
     }
-    assert {key: result[key] for key in expected} == expected
+    assert expected.items() <= result.items()
     assert 0 <= result["dengine_store_lag_seconds",] < 60
 
 
-def typed(content: bytes, kind: str, **params: Any) -> dict[str, Any]:
-    return {"content": content, "headers": {"content-type": kind}, "params": params}
-
-
-ONE = {"trace": [1.0] * SAMPLES}
-REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
-    "no type": (415, {"content": b"1"}),
-    "another type": (415, typed(b"1", "text/csv")),
-    "nothing": (400, typed(b"", JSON)),
-    "no UTF-8": (400, typed(b'{"trace": [1], "request": "\xff"}', JSON)),
-    "NaN": (400, typed(b'{"trace": [NaN]}', JSON)),
-    "a name twice": (400, typed(b'{"trace": [1], "trace": [2]}', JSON)),
-    "too deep": (422, typed(b'{"trace": ' + b"[" * 100_000, JSON)),
-    "digits": (422, typed(b'{"trace": [' + b"1" * 5000 + b"]}", JSON)),
-    "a list": (422, {"json": [1.0]}),
-    "no trace": (422, {"json": {"request": "a"}}),
-    "an unknown name": (422, {"json": ONE | {"reqest": "a"}}),
-    "an empty trace": (422, {"json": {"trace": []}}),
-    "a bool among numbers": (422, {"json": {"trace": [1.0, True]}}),
-    "unequal channels": (422, {"json": {"trace": [[1.0] * SAMPLES, [1.0]]}}),
-    "another length": (422, {"json": {"trace": [1.0] * (SAMPLES - 1)}}),
-    "a text": (422, {"json": {"trace": "abc"}}),
-    "a text in base64": (422, {"json": {"trace": "abcd"}}),
-    "a request that is a number": (422, {"json": ONE | {"request": 7}}),
-    "a request that ends a line": (422, {"json": ONE | {"request": "a\nb"}}),
-    "a request too long": (422, {"json": ONE | {"request": "a" * 201}}),
-    "a part that is a bool": (422, {"json": ONE | {"part": True}}),
-    "half a float": (422, typed(b"12345", RAW)),
-    "float64": (422, typed(np.linspace(0.0, 9.0, SAMPLES).tobytes(), RAW)),
-    "no channels": (422, typed(b"1234", RAW, channels="0")),
-    "an unknown query": (422, typed(b"1234", RAW, path="/etc")),
-    "a query twice": (422, typed(b"1234", RAW, part=["1", "2"])),
+REFUSED = {  # the status, the media type, and the body, in which ONE stands for a trace
+    "no type": (415, "", "1"),
+    "another type": (415, "text/csv", "1"),
+    "nothing": (400, JSON, ""),
+    "no UTF-8": (400, JSON, '{"trace": [1], "request": "\xff"}'),
+    "NaN": (400, JSON, '{"trace": [NaN]}'),
+    "a name twice": (400, JSON, '{"trace": [1], "trace": [2]}'),
+    "too deep": (422, JSON, '{"trace": ' + "[" * 100_000),
+    "digits": (422, JSON, f'{{"trace": [{"1" * 5000}]}}'),
+    "a list": (422, JSON, "[1.0]"),
+    "no trace": (422, JSON, '{"request": "a"}'),
+    "an unknown name": (422, JSON, '{"trace": ONE, "reqest": "a"}'),
+    "an empty trace": (422, JSON, '{"trace": []}'),
+    "a bool among numbers": (422, JSON, '{"trace": [1.0, true]}'),
+    "unequal channels": (422, JSON, '{"trace": [ONE, [1.0]]}'),
+    "another length": (422, JSON, '{"trace": [1.0, 2.0]}'),
+    "a text": (422, JSON, '{"trace": "abc"}'),
+    "a text in base64": (422, JSON, '{"trace": "abcd"}'),
+    "a request that is a number": (422, JSON, '{"trace": ONE, "request": 7}'),
+    "a request that ends a line": (422, JSON, '{"trace": ONE, "request": "a\\nb"}'),
+    "a request too long": (422, JSON, f'{{"trace": ONE, "request": "{"a" * 201}"}}'),
+    "a part that is a bool": (422, JSON, '{"trace": ONE, "part": true}'),
+    "half a float": (422, RAW, "12345"),
+    "float64": (422, RAW, np.linspace(0.0, 9.0, SAMPLES).tobytes().decode("latin-1")),
+    "no channels": (422, RAW, "1234", "channels=0"),
+    "an unknown query": (422, RAW, "1234", "path=/etc"),
+    "a query twice": (422, RAW, "1234", "part=1&part=2"),
 }
 
 
@@ -435,16 +431,18 @@ REFUSED: dict[str, tuple[int, dict[str, Any]]] = {
 def test_what_is_no_trace_is_refused_and_leaves_nothing(
     client: Client, stream: Dataset, name: str
 ) -> None:
-    client.post("/decide", json={"trace": stream.X[0].tolist(), "request": "the contract"})
+    client.decide(stream.X[0], "the contract")
     before = client.get("/status").json()["ever"]["decisions"]
-    status, request = REFUSED[name]
-    answer = client.post("/decide", **request)
-    must_be_problem(answer, status)
+    status, kind, body, *query = REFUSED[name]
+    content = body.replace("ONE", str([1.0] * SAMPLES)).encode("latin-1")
+    path = "?".join(["/decide", *query])
+    answer = client.post(path, content=content, headers={"content-type": kind} if kind else {})
+    detail = must_be_problem(answer, status)["detail"]
     assert client.get("/status").json()["ever"]["decisions"] == before
     if "text" in name:
-        assert re.search("list.? of numbers, or raw float32", answer.json()["detail"])
+        assert re.search("list.? of numbers, or raw float32", detail)
     if name == "another length":  # in the words of who sends it, and of who serves it
-        assert f"--fit strict does not allow; resample the trace to {SAMPLES}" in answer.text
+        assert f"--fit strict does not allow; resample the trace to {SAMPLES}" in detail
 
 
 def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header(
@@ -466,7 +464,7 @@ def test_paths_and_methods_that_there_are_not_are_problems_too_with_every_header
 def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None:
     with serving(most=1) as (service, client), busy_engine(service):
         service.submit(lambda engine: None)
-        answer = client.post("/decide", **forms(stream.X[0], "order-0")["JSON"])
+        answer = client.decide(stream.X[0], "order-0")
         must_be_problem(answer, 503)
         assert int(answer.headers["retry-after"]) >= 1
         assert service.busy == 1
@@ -475,37 +473,27 @@ def test_a_full_line_says_verify_and_when_to_come_again(stream: Dataset) -> None
         asyncio.run(service.decide(stream.X[0]))
 
 
-def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dataset) -> None:
-    with serving((Token(TOKEN, name="Kim"), Token("a-viewer-s-password", operates=False))) as (
-        _,
-        client,
-    ):
+def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks() -> None:
+    viewer = Token("a-viewer-s-password", operates=False)
+    with serving((Token(TOKEN, name="Kim"), viewer)) as (_, client):
         for text in ("", "Bearer other", "Basic !", f"Bearer {TOKEN}x", TOKEN):
             refused = client.get("/status", headers={"authorization": text} if text else {})
             must_be_problem(refused, 401)
             asked = refused.headers.get_list("www-authenticate")
-            assert [item.split()[0] for item in asked] == [
-                "Basic",
-                "Bearer",
-            ]  # a line each, or no browser asks for it
-        assert client.get("/me", auth=("anybody", TOKEN)).json() == {
-            "name": "Kim",
-            "operates": True,
-        }
-        kim, viewer = (
-            {"authorization": f"Bearer {item}"} for item in (TOKEN, "a-viewer-s-password")
-        )
-        for asked, headers, status in (
-            ({}, kim, 200),
-            ({"author": "Robin"}, kim, 422),
-            ({"author": "Kim"}, viewer, 403),
+            kinds = [item.split()[0] for item in asked]
+            assert kinds == ["Basic", "Bearer"]  # a line each, or no browser asks for it
+        me = client.get("/me", auth=("anybody", TOKEN)).json()
+        assert me == {"name": "Kim", "operates": True}
+        for asked, secret, status in (
+            ({}, TOKEN, 200),
+            ({"author": "Robin"}, TOKEN, 422),
+            ({"author": "Kim"}, viewer.secret, 403),
         ):
-            assert (
-                client.post("/policy", json={"shadow": True} | asked, headers=headers).status_code
-                == status
-            )
-        (event,) = client.get("/events", headers=viewer).json()["events"]
+            client.headers["authorization"] = f"Bearer {secret}"
+            assert client.ask("/policy", shadow=True, **asked).status_code == status
+        (event,) = client.get("/events").json()["events"]
         assert (event["kind"], event["author"]) == ("policy", "Kim")
+        del client.headers["authorization"]
         assert client.get("/healthz").status_code == 200
         named = client.get("/me", auth=("anybody", TOKEN), headers={"host": "cell.example"})
         assert named.status_code == 200  # who has the token may call it by any name
@@ -514,33 +502,33 @@ def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks(stream: Dat
 
 
 def test_pages_of_other_sites_are_not_served(client: Client, stream: Dataset) -> None:
-    here, body = str(client.base_url).rstrip("/"), {"json": {"trace": stream.X[0].tolist()}}
-    for headers in (
-        {"origin": "http://evil.example"},
-        {"origin": "null"},
-        {"sec-fetch-site": "cross-site"},
+    here, body = str(client.base_url).rstrip("/"), {"trace": stream.X[0].tolist()}
+    for name, value, status in (
+        ("origin", "http://evil.example", 403),
+        ("origin", "null", 403),
+        ("sec-fetch-site", "cross-site", 403),
+        ("origin", here, 200),
+        ("sec-fetch-site", "same-origin", 200),
+        ("sec-fetch-site", "none", 200),
     ):
-        must_be_problem(client.post("/decide", headers=headers, **body), 403)
-    for headers in (
-        {"origin": here},
-        {"sec-fetch-site": "same-origin"},
-        {"sec-fetch-site": "none"},
-    ):
-        assert client.post("/decide", headers=headers, **body).status_code == 200
+        answer = client.post("/decide", headers={name: value}, json=body)
+        assert answer.status_code == status
     for host in ("evil.example", "127.0.0.1.evil.example", "a@b", "[", "192.168.0.7"):
         must_be_problem(client.get("/healthz", headers={"host": host}), 421)
     for host in ("localhost", "Localhost:8000", "[::1]:8000", "127.0.0.1"):
         assert client.get("/healthz", headers={"host": host}).status_code == 200
 
 
+def connected(client: Client) -> socket.socket:
+    return socket.create_connection((client.base_url.host, client.base_url.port), timeout=60)
+
+
 def test_sizes_and_connections_are_limited() -> None:
     with serving(limit_concurrency=3) as (_, client), ExitStack() as others:
-        must_be_problem(client.post("/decide", **typed(b"0" * (MAX_BODY + 1), RAW)), 413)
-        pieces = iter([b"0" * (MAX_BODY // 2 + 1)] * 2)
-        must_be_problem(client.post("/decide", content=pieces, headers={"content-type": RAW}), 413)
-        at = client.base_url.host, client.base_url.port
+        for content in (b"0" * (MAX_BODY + 1), iter([b"0" * (MAX_BODY // 2 + 1)] * 2)):
+            must_be_problem(client.post("/decide", **typed(content, RAW)), 413)
         for _ in range(2):
-            others.enter_context(socket.create_connection(at, timeout=60))
+            others.enter_context(connected(client))
         assert client.get("/healthz").status_code == 503
         others.close()
         until(lambda: client.get("/healthz").status_code == 200)
@@ -555,17 +543,14 @@ def until(true: Callable[[], bool]) -> None:
 
 
 def test_a_hundred_idle_clients_keep_nobody_out(stream: Dataset) -> None:
-    asked = b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n\r\n"
     with serving((Token(TOKEN),)) as (_, robot), ExitStack() as others:
         robot.headers["authorization"] = f"Bearer {TOKEN}"
-        at = robot.base_url.host, robot.base_url.port
         for _ in range(150):
-            other = others.enter_context(socket.create_connection(at, timeout=60))
-            other.sendall(asked)
+            other = others.enter_context(connected(robot))
+            other.sendall(half("GET /healthz", "\r\n"))
             assert other.recv(1000).startswith(b"HTTP/1.1 200 ")
-        for i, x in enumerate(stream.X[:20]):
-            body = {"trace": x.tolist(), "request": f"{i}"}
-            assert robot.post("/decide", json=body).json()["reason"] == "no_model"
+        for x in stream.X[:20]:
+            assert robot.decide(x).json()["reason"] == "no_model"
 
 
 def half(head: str, body: str) -> bytes:
