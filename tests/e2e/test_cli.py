@@ -18,7 +18,6 @@ from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
-from dengine.store import SqlStore
 from tests.support.command_line import dengine, document, example_of, line_of, succeed, well
 from tests.support.driving import easy_parts
 from tests.support.exports import cell_journal
@@ -198,16 +197,6 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(
         assert engine.decide(easy_parts(1, 0).X[0]).predicted != "verify"
 
 
-def test_an_interrupted_import_goes_on_and_bad_and_equal_traces_are_events_of_their_own() -> None:
-    easy, store = easy_parts(160, 0), SqlStore()
-    X, y = easy.X, easy.y
-    X[0, 3], X[1], X[2:8], y[2:8] = np.nan, 7.0, X[2], y[2]
-    first, report = import_labelled(store, (X[:70], y[:70]), "pca"), import_labelled(store, (X, y))
-    assert (first.imported, first.quarantined, report.imported, report.repeated) == (68, 2, 90, 70)
-    kept = store.labels.with_traces().labels  # bad ones are kept, and never trained on
-    assert kept.tolist() == y[2:].tolist()
-
-
 def test_a_store_goes_on_with_a_reducer_of_this_folder(
     data: Path, own_folder: Path, monkeypatch
 ) -> None:
@@ -353,24 +342,6 @@ def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_fold
     assert document("status", "e.db")["ever"]["decisions"] == done > 0
 
 
-def test_an_interrupted_import_says_how_far_it_came_and_keeps_that(
-    data: Path, tmp_path: Path, monkeypatch
-) -> None:
-    def interrupted(*args: object) -> object:
-        os.kill(os.getpid(), signal.SIGINT)
-        return import_labelled(*args)
-
-    monkeypatch.setattr(importing, "CHUNK", 70)
-    monkeypatch.setattr(importing, "import_labelled", interrupted)
-    result = dengine("train", "--data", data, "--store", tmp_path / "e.db", "--reducer", "conv")
-    assert result.exit_code == INTERRUPTED
-    text = " ".join(result.stderr.split())
-    done = re.search(r"Interrupted: (\d+) of 160 traces are in .*the same command", text)[1]
-    stored = document("status", tmp_path / "e.db")
-    assert (stored["version"], stored["labels"]) == (0, int(done))
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
 WRONG = """
 nonsense                          No such command
 replay --guarantee global         'global' is not one of 'local', 'pooled'
@@ -384,3 +355,32 @@ compare --reducers pca,pca        a name of its own
 compare --intervals wald          'wald' is not one of 'wilson', 'binomial'
 train                             Missing option
 """
+
+
+def test_an_interrupted_import_says_how_far_it_came_and_goes_on_there(
+    tmp_path: Path, monkeypatch
+) -> None:
+    easy = easy_parts(160, 0)
+    easy.X[0, 3], easy.X[1], easy.X[2:8] = np.nan, 7.0, easy.X[2]  # bad, and equal ones
+    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
+
+    def interrupted(*args: object) -> object:
+        os.kill(os.getpid(), signal.SIGINT)
+        return import_labelled(*args)
+
+    words = ["train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db"]
+    with monkeypatch.context() as patched:
+        patched.setattr(importing, "CHUNK", 70)
+        patched.setattr(importing, "import_labelled", interrupted)
+        result = dengine(*words, "--reducer", "pca")
+    assert result.exit_code == INTERRUPTED
+    text = " ".join(result.stderr.split())
+    done = re.search(r"Interrupted: (\d+) of 160 traces are in .*the same command", text)[1]
+    stored = document("status", tmp_path / "e.db")
+    assert (stored["version"], stored["labels"]) == (0, int(done))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    again = document(*words)["import"]
+    assert again["imported"] + again["repeated"] + again["quarantined"] == 160, again
+    with DataEngine.open(tmp_path / "e.db") as engine:
+        kept = engine.store.labels.with_traces().labels
+    assert kept.tolist() == easy.y[2:].tolist()  # bad ones are kept, and never trained on

@@ -20,7 +20,6 @@ from dengine import Action, DataEngine, Dataset, Decision, TraceSpec
 from dengine.store.records import KEEP
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
-from tests.support.driving import RECIPE
 from tests.support.serving import a_service, served, started
 
 CHROMIUM = shutil.which("chromium")
@@ -152,6 +151,15 @@ def confirmed(page: Page, button: str, author: str = "") -> None:
     expect(page.get_by_role("dialog")).to_be_hidden(timeout=PATIENT)
 
 
+@contextmanager
+def cell(
+    file: Path, tokens: tuple[Token, ...] = (), trace: TraceSpec | None = None
+) -> Iterator[tuple[CellService, DemoCell]]:
+    """A service in this process, and where its page is."""
+    with a_service(file, trace=trace) as service, served(create_app(service, tokens)) as port:
+        yield service, DemoCell(f"http://127.0.0.1:{port}", file)
+
+
 def test_a_decision_appears_and_the_next_one_takes_its_place(page: Page, demo: DemoCell) -> None:
     opened(page, demo)
     expect(page.locator("#decision")).to_have_text(
@@ -172,17 +180,18 @@ def test_a_decision_appears_and_the_next_one_takes_its_place(page: Page, demo: D
 def test_the_map_is_gone_over_by_the_keyboard_alone(page: Page, demo: DemoCell) -> None:
     with_a_model(page, demo)
     page.locator(".skip").focus()
+    focused = "document.activeElement.matches('a.mark') && document.activeElement.id"
     for _ in range(30):
         page.keyboard.press("Tab")
-        if page.evaluate("document.activeElement.matches('a.mark')"):
+        if first := page.evaluate(focused):
             break
-    first = page.evaluate("document.activeElement.id")
     for key in ("ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown"):
         page.keyboard.press(key)
-        if page.evaluate("document.activeElement.id") != first:
+        if (other := page.evaluate(focused)) != first:
             break
-    assert page.evaluate("document.activeElement.matches('a.mark')")
-    assert page.evaluate("document.activeElement.id") != first
+    assert first
+    assert other
+    assert first != other
     page.keyboard.press("Enter")
     expect(page.locator("#part-title")).to_be_focused(timeout=PATIENT)
     expect(page.locator("#part .chart canvas").first).to_be_visible()
@@ -193,26 +202,24 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(
     page: Page, demo: DemoCell
 ) -> None:
     with demo.store() as store:
-        labelled = next(
-            past for past in store.decisions.select(HistoryFilter(label="good"), 1, newest=False)
-        )
+        good = HistoryFilter(label="good")
+        (labelled,) = store.decisions.select(good, 1, newest=False)
     opened(page, demo, f"part?id={labelled.decision.id}")
-    page.get_by_role("button", name="It was bad").focus()
-    page.keyboard.press("Enter")
-    expect(page.get_by_label("Your name")).to_be_focused()
-    page.keyboard.press("Escape")
-    expect(page.get_by_role("button", name="It was bad")).to_be_focused()
-    page.keyboard.press("Enter")
-    expect(page.get_by_label("Your name")).to_be_focused()
-    page.keyboard.press("Enter")  # without a name nothing is done
-    expect(page.get_by_role("dialog")).to_be_visible()
+    button, name = page.get_by_role("button", name="It was bad"), page.get_by_label("Your name")
+    button.focus()
+    for key in ("Escape", "Enter"):
+        page.keyboard.press("Enter")
+        expect(name).to_be_focused()
+        page.keyboard.press(key)
+        if key == "Escape":
+            expect(button).to_be_focused()
+    expect(page.get_by_role("dialog")).to_be_visible()  # without a name nothing is done
     page.keyboard.type(AUTHOR)
     page.keyboard.press("Enter")
     expect(page.get_by_role("dialog")).to_be_hidden(timeout=PATIENT)
     expect(page.locator("#result")).to_contain_text("counts as a failure, was a success")
-    expect(page.locator("#part .story")).to_contain_text(
-        f"corrected from good to bad by {AUTHOR}", timeout=PATIENT
-    )
+    story = f"corrected from good to bad by {AUTHOR}"
+    expect(page.locator("#part .story")).to_contain_text(story, timeout=PATIENT)
     assert page.title().startswith("Part")  # what was typed stayed text
     with demo.store() as store:
         assert store.decisions.get(labelled.decision.id, trace=False).success is False
@@ -263,11 +270,10 @@ def test_a_dialog_offers_what_there_is_now_and_not_when_the_page_was_opened(
         page.get_by_role("button", name="Cancel").click()
         return values
 
-    file = tmp_path / "cell.db"
-    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
+    with cell(tmp_path / "cell.db") as (service, demo), looking(browser) as page:
         played(service, stream, 40)
         service.submit(DataEngine.retrain).result()
-        opened(page, DemoCell(f"http://127.0.0.1:{port}", file), "actions")
+        opened(page, demo, "actions")
         expect(page.get_by_role("button", name="Roll back")).to_be_enabled()
         for _ in range(2 * KEEP):  # those that were there at first are kept no longer
             service.submit(DataEngine.retrain).result()
@@ -286,67 +292,56 @@ TOKEN = "correct-horse-battery-staple"
 STRANGE = "<img src=x onerror=alert(1)> 7"
 
 
-def played(service: CellService, data: Dataset, n: int = 70, broken: int | None = None) -> Decision:
-    """The newest accepted one of n parts with strange numbers, up to a safe mode.
+def played(service: CellService, data: Dataset, n: int = 70) -> Decision:
+    """The newest accepted one of n parts with strange numbers, of which nothing is heard."""
 
-    broken : from this part on accepted ones are said to have stopped the line; None: nothing is
-    heard of accepted ones.
-    """
-
-    async def cell() -> Decision:
+    async def play() -> Decision:
         newest = None
         for i in range(n):
             decision = (await service.decide(data.X[i], f"order-{i}", f"{STRANGE}-{i}")).decision
-            accepted = decision.action is Action.ACCEPT
-            newest = decision if accepted else newest
-            if decision.action is Action.VERIFY or (accepted and broken is not None):
-                await service.report(
-                    decision.id, bool(data.y[i]) and not (accepted and i >= broken)
-                )
-            if service.engine.safe_mode:
-                break
+            if decision.action is Action.ACCEPT:
+                newest = decision
+            elif decision.action is Action.VERIFY:
+                await service.report(decision.id, bool(data.y[i]))
         return newest
 
     with ThreadPoolExecutor(1) as thread:  # in this one Playwright's own loop runs
-        return thread.submit(asyncio.run, cell()).result()
+        return thread.submit(asyncio.run, play()).result()
 
 
 def test_an_operators_day(browser: Browser, tmp_path: Path, stream: Dataset) -> None:
-    tokens = Token("a-viewer-s-password", False, "Line display"), Token(TOKEN, True, "Kim")
-    file = tmp_path / "cell.db"
+    viewer, kim = Token("a-viewer-s-password", False, "Line display"), Token(TOKEN, True, "Kim")
     trace = TraceSpec(60, rate_hz=500.0)  # which limits in seconds need
-    with a_service(file, trace=trace) as service, served(create_app(service, tokens)) as port:
-        demo, part = DemoCell(f"http://127.0.0.1:{port}", file), played(service, stream).part
+    with cell(tmp_path / "cell.db", (viewer, kim), trace) as (service, demo):
+        part = played(service, stream).part
         with (
             pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"),
             looking(browser) as page,
         ):  # it asks for a password
             page.goto(demo.url)
-        with looking(
-            browser, http_credentials={"username": "wall", "password": tokens[0].secret}
-        ) as page:
+        with looking(browser, http_credentials=signed_in(viewer)) as page:
             opened(page, demo, "actions")
             expect(page.locator("#me")).to_contain_text("Line display")
             expect(page.get_by_role("button", name="Verify everything")).to_be_disabled()
-        with looking(browser, http_credentials={"username": "kim", "password": TOKEN}) as page:
+        with looking(browser, http_credentials=signed_in(kim)) as page:
             a_day(page, demo, part, tmp_path / "list.csv")
             for nothing in ("part?id=nobody", "history?action=nonsense"):
                 opened(page, demo, nothing)
                 expect(page.locator("h1")).to_have_text("That cannot be shown")
     with demo.store() as store:
         answers = [(event.kind, event.author) for event in store.events.newest(4)]
-    assert answers == [
-        ("report", "Kim"),
-        ("policy", "Kim"),
-        ("policy", "Kim"),
-        ("policy", "Kim"),
-    ]  # nobody typed a name
+    kinds = ("report", "policy", "policy", "policy")
+    assert answers == [(kind, "Kim") for kind in kinds]  # nobody typed a name
 
 
 def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     """A part that came back is found by its number, reported, and looked at; the cell verifies all
     for a while.
     """
+
+    def shown(selector: str, text: Any) -> None:
+        expect(page.locator(selector)).to_contain_text(text, timeout=PATIENT)
+
     opened(page, demo, "history")
     expect(page.locator("#history tbody tr")).to_have_count(50)
     page.get_by_role("link", name="Older").click()
@@ -355,44 +350,34 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     page.get_by_label("Part's number").fill(f" {part} ")  # as a scanner, or a copy, gives it
     page.get_by_role("button", name="Show", exact=True).click()
     expect(page.locator("#history tbody tr")).to_have_count(1)
-    expect(page.locator("#history")).to_contain_text("1 decision shown.")
     page.locator("#history").get_by_role("link", name=part).click()
     confirmed(page, "It was bad")
-    expect(page.locator("#result")).to_have_text("Recorded: bad.", timeout=PATIENT)
+    shown("#result", "Recorded: bad.")
     opened(page, demo, "overview")
-    expect(page.locator("#saved")).to_contain_text("line stops, not subtracted: 1")
-    expect(page.locator("#bad p").first).to_have_text("1 known bad")
+    shown("#saved", "line stops, not subtracted: 1")
+    shown("#bad", "1 known bad")
     page.locator("#escapes").get_by_role("link", name=part).click()
-    expect(page.locator("h1")).to_have_text(f"Part {part}")
-    expect(page.locator("#part .why")).to_contain_text("The part turned out bad (stop)")
+    shown("h1", f"Part {part}")
+    shown("#part .why", "The part turned out bad (stop)")
     opened(page, demo, "actions")
     confirmed(page, "Verify everything")
-    expect(page.locator("#banner")).to_contain_text("every part is verified", timeout=PATIENT)
+    shown("#banner", "every part is verified")
     opened(page, demo, "overview")
-    expect(page.locator("#would")).to_contain_text(
-        re.compile(r"Predicted in shadow mode\s*0 of \d\d verified parts")
-    )
+    shown("#would", re.compile(r"Predicted in shadow mode\s*0 of \d\d verified parts"))
     opened(page, demo, "actions")
     confirmed(page, "Let the model decide again")
-    expect(page.locator("#mode")).to_contain_text("Decides", timeout=PATIENT)
+    shown("#mode", "Decides")
     page.get_by_role("button", name="Change the policy").click()
     page.get_by_label("Force limits").fill("0.01:0.05::30:reject")
     page.get_by_role("button", name="Do it").click()
     opened(page, demo, "overview?by=hour")
     page.locator("#escapes").get_by_role("link", name=part).click()
-    expect(page.locator("#part figcaption")).to_contain_text(
-        "the operator's limits are at most 30.0, else reject"
-    )
+    shown("#part figcaption", "the operator's limits are at most 30.0, else reject")
     opened(page, demo, "history?label=bad")
-    with page.expect_download() as download:
-        page.get_by_role("button", name="Download these as CSV").click()
-    download.value.save_as(file)
-    rows = {
-        row["part"]: row for row in csv.DictReader(file.read_text(encoding="utf-8").splitlines())
-    }
-    assert datetime.fromisoformat(rows[part]["time"]) < datetime.fromisoformat(
-        rows[part]["label_time"]
-    )
+    downloaded(page, "Download these as CSV", file)
+    rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
+    (row,) = (row for row in rows if row["part"] == part)
+    assert datetime.fromisoformat(row["time"]) < datetime.fromisoformat(row["label_time"])
 
 
 def test_dark_is_dark_and_programs_find_the_document(page: Page, demo: DemoCell) -> None:
@@ -407,19 +392,15 @@ def test_dark_is_dark_and_programs_find_the_document(page: Page, demo: DemoCell)
 def test_each_channel_is_drawn_in_its_own_unit_and_is_no_force_for_being_drawn(
     browser: Browser, tmp_path: Path, stream: Dataset
 ) -> None:
-    file, spec = (
-        tmp_path / "cell.db",
-        TraceSpec(stream.X.shape[-1], channels=2, unit=("kN", "mm"), columns=("FZ", "SZ")),
-    )
-    DataEngine(recipe=RECIPE, store=file, trace=spec).close()
-    with a_service(file) as service, served(create_app(service)) as port, looking(browser) as page:
-        played(service, Dataset(np.stack([stream.X, stream.X[::-1]], axis=1), stream.y), 40)
-        opened(page, DemoCell(f"http://127.0.0.1:{port}", file))
+    spec = TraceSpec(60, channels=2, unit=("kN", "mm"), columns=("FZ", "SZ"))
+    data = Dataset(np.stack([stream.X, stream.X[::-1]], axis=1), stream.y)
+    with cell(tmp_path / "cell.db", trace=spec) as (service, demo), looking(browser) as page:
+        played(service, data, 40)
+        opened(page, demo)
         expect(page.locator("#trace h2")).to_have_text("The trace, and good and bad parts")
-        for i, (name, unit) in enumerate([("FZ", "kN"), ("SZ", "mm")]):
-            expect(page.locator("#trace figcaption").nth(i)).to_contain_text(
-                re.compile(rf"{name} over .* {unit}\. ")
-            )
+        captions = page.locator("#trace figcaption")
+        for i, text in enumerate((r"FZ over .* kN\. ", r"SZ over .* mm\. ")):
+            expect(captions.nth(i)).to_contain_text(re.compile(text))
         must_be_above_the_fold(page)
 
 
@@ -460,3 +441,15 @@ def test_a_page_that_is_cut_off_says_so_and_comes_back(browser: Browser) -> None
         with served(create_app(service), port):
             expect(page.locator("#link")).to_have_attribute("data-state", "live", timeout=PATIENT)
             expect(page.locator("#cut")).to_be_hidden()
+
+
+def signed_in(token: Token) -> dict[str, str]:
+    return {"username": "anybody", "password": token.secret}
+
+
+def downloaded(page: Page, button: str, file: Path) -> Path:
+    """The file that a button brings."""
+    with page.expect_download() as download:
+        page.get_by_role("button", name=button).click()
+    download.value.save_as(file)
+    return file
