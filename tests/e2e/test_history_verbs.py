@@ -49,16 +49,11 @@ def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(
 def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
     asked = {"action": "accept", "reason": "certain", "label": "bad", "model": "accept"}
     words = [word for name, value in asked.items() for word in (f"--{name}", value)]
+    found = document("history", store, "--last", 1000, "--since", "1h", *words)["decisions"]
     names = ("action", "reason", "label", "predicted")
-    found = document("history", store, "--last", 1000, *words)["decisions"]
     assert {tuple(item[name] for name in names) for item in found} == {tuple(asked.values())}
-    for words, some in (
-        ("--since 1h", True),
-        ("--since 2100-01-01", False),
-        ("--until 2001-01-01T10:00", False),
-    ):
-        assert bool(document("history", store, *words.split())["decisions"]) is some
-    assert succeed("history", store, "--since", "2100-01-01") == "No decision of that kind.\n"
+    for words in ("--since 2100-01-01", "--until 2001-01-01T10:00"):
+        assert succeed("history", store, *words.split()) == "No decision of that kind.\n"
 
 
 def test_a_wrong_word_is_a_wrong_call(store: Path) -> None:
@@ -101,9 +96,7 @@ def test_status_counts_the_newest_apart_from_all(store: Path, decisions: list[di
     for name, some in (("newest", decisions[-200:]), ("ever", decisions)):
         span, actions = result[name], Counter(item["action"] for item in some)
         counted = [span[key] for key in ("accepted", "rejected", "verified", "decisions")]
-        assert counted == [actions[key] for key in ("accept", "reject", "verify")] + [len(some)]
-        assert span["novel"] == sum(item["reason"] == "novel" for item in some)
-        assert (span["audits"], span["quarantined"]) == (sum(item["audit"] for item in some), 1)
+        assert counted == [*map(actions.get, ("accept", "reject", "verify")), len(some)]
         labels = Counter(item["label"] for item in some if item["action"] == "accept")
         accepts = [span["bad_accepts"][key] for key in ("n_known", "n_wrong", "lower", "upper")]
         assert accepts == share_of(labels["bad"], labels["bad"] + labels["good"], 0.2)

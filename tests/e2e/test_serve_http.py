@@ -220,22 +220,6 @@ def test_what_can_be_looked_at_is_as_the_document_says(client: Client, stream: D
         must_be_problem(client.get(path), 422)
 
 
-def test_decisions_are_found_by_part_and_kind_and_older_pages_follow_one_another(
-    stream: Dataset,
-) -> None:
-    with serving() as (_, client):
-        for i, x in enumerate(stream.X[:7]):
-            client.decide(x, f"found-{i}", part=f"F{i % 6}")
-        client.ask("/report", id="found-1", success=False)
-        assert client.listed(part="F0") == ["found-6", "found-0"]
-        assert client.listed(part="F1", label="bad", action="verify") == ["found-1"]
-        assert client.listed(part="F1", action="reject") == client.listed(part="F1", until=1) == []
-        older = client.listed(limit=4, before="found-4")
-        assert client.listed(limit=3) + older == client.listed(limit=7)
-        pages = [client.get(f"/decisions?limit={n}").json()["older"] for n in (3, 7)]
-        assert pages == ["found-4", None]
-
-
 @pytest.mark.parametrize("path", ["/report", "/correct"])
 def test_a_part_that_comes_back_is_named_by_its_number_unless_it_has_several_decisions(
     path: str, stream: Dataset

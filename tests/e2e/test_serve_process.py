@@ -1,16 +1,16 @@
 """`dengine serve` as a process of its own: how it ends, and a robot whose force it records."""
 
 import http.client
-import queue
 import re
 import signal
 import socket
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,10 @@ from dengine.serve.auth import Token
 from dengine.serve.http import create_app
 from dengine.serve.service import CellService
 from tests.support.exports import trained
-from tests.support.robots import FakeController
+from tests.support.robots import FakeController, Signals
 from tests.support.serving import REPO, WAIT, served, started
 
 SAMPLES = 80
-APPROACH_SECONDS = 0.05  # of a robot, from its call of `begin` to the insertion
 NAMES = "action", "reason", "lower"
 
 
@@ -143,82 +142,26 @@ def test_a_server_that_is_killed_leaves_no_retraining_process_behind(
         thread.join(WAIT)
 
 
-class Insertions:
-    """A robot's program that inserts when it is told to; its register 25 is on meanwhile."""
-
-    place = None
-
-    def __init__(self) -> None:
-        self._told: queue.SimpleQueue[np.ndarray] = queue.SimpleQueue()
-        self._force: Iterator[float] = iter(())
-        self._over: threading.Event | None = None
-
-    def insert(self, trace: np.ndarray) -> None:
-        """Move for some control cycles, play a trace (T,), and return when it is over.
-
-        The recorder sees the register go on only if it was off since the recorder was armed.
-        """
-        time.sleep(APPROACH_SECONDS)
-        self._over = threading.Event()
-        self._told.put(trace)
-        assert self._over.wait(WAIT)
-
-    def step(self, inputs: dict[str, float]) -> dict[str, float]:
-        force = next(self._force, None)
-        if force is None and not self._told.empty():
-            self._force = iter(self._told.get().tolist())
-            force = next(self._force)
-        elif force is None and self._over is not None:
-            self._over.set()
-        return {
-            "actual_TCP_force[2]": force or 0.0,
-            "output_int_register_25": float(force is not None),
-        }
-
-
-def inserted(robot: Any, program: Insertions, trace: np.ndarray) -> dict[str, Any]:
-    """The answer to what was recorded of an insertion; another one where the recording came too
-    late, on a busy machine.
-    """
-
-    def decided() -> dict[str, Any] | None:
-        part = robot.begin()
-        program.insert(trace)
-        answer: dict[str, Any] = robot.decide_recorded(part)
-        return answer if answer["id"] == part else None
-
-    return until(decided)
-
-
-def test_a_robots_force_is_recorded_and_decided_on_though_its_controller_goes_away_in_between(
-    tmp_path, parts
-) -> None:
-    program = Insertions()
+def test_a_robots_force_is_recorded_and_decided_on(tmp_path, parts) -> None:
+    """What becomes of it when the controller goes away is tried in test_ur.py and test_xmlrpc.py."""
+    rest, force = np.zeros(SAMPLES), parts.X[0]
+    program = Signals(
+        FZ_Base=np.concatenate([rest, force]),
+        output_int_register_25=np.concatenate([rest, np.ones(SAMPLES)]),
+    )
     with FakeController(program) as fake:
         robot_at = ("--robot", f"127.0.0.1:{fake.port}", "--samples", str(SAMPLES))
         with started(tmp_path, "--reducer", "pca", *robot_at) as process:
             robot = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{process.port}/RPC2")
-            for i in range(2):
-                answer = inserted(robot, program, parts.X[i])
-                assert (answer["action"], answer["reason"]) == (0, "no_model")
-                assert robot.decide_recorded(answer["id"]) == answer  # asked again
-                assert robot.report(answer["id"], bool(parts.y[i])) is True
-                record = process.ask(f"/decisions/{answer['id']}?trace=true")
-                assert record["success"] is bool(parts.y[i])
-                np.testing.assert_array_equal(
-                    np.float32(record["trace"]).ravel(), parts.X[i]
-                )  # as it was sent
-            fake.close()
-            unknown = robot.decide_recorded(robot.begin())
-            assert (unknown["action"], unknown["id"], unknown["reason"]) == (0, "", "not_recorded")
-            assert robot.report(unknown["id"], True) is False
-            with FakeController(program, port=fake.port):
-                answer = inserted(robot, program, parts.X[2])
-                record = process.ask(f"/decisions/{answer['id']}?trace=true")
-                np.testing.assert_array_equal(np.float32(record["trace"]).ravel(), parts.X[2])
-                assert process.ask("/status")["ever"]["decisions"] >= 3
+            answers = (robot.decide_recorded(robot.begin()) for _ in count())
+            # On a busy machine a recording may come too late.
+            answer = next(answer for answer in answers if answer["id"])
+            assert (answer["action"], answer["reason"]) == (0, "no_model")
+            assert robot.report(answer["id"], True) is True
+            record = process.ask(f"/decisions/{answer['id']}?trace=true")
+            assert record["success"] is True
+            assert np.float32(record["trace"]).ravel().tolist() == force.tolist()  # as it was sent
             assert process.end() == 0
-    assert "no recording of" in process.output
     assert "Traceback" not in process.output
 
 

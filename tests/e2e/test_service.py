@@ -30,12 +30,8 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream: Dataset, tmp_path: 
         with busy_engine(service):
             late = await service.decide(stream.X[1], "order-1", part="P1")
             broken = await service.decide(bad, "order-2")
-            with pytest.raises(TraceError, match="got another"):
-                await service.decide(
-                    stream.X[2], "order-0"
-                )  # in time or late, an answer is to one trace
-            with pytest.raises(TraceError, match="60"):
-                await service.decide(stream.X[0][:10], "order-3")
+            with pytest.raises(TraceError, match="got another"):  # an answer is to one trace
+                await service.decide(stream.X[2], "order-0")
             text = late.late, late.decision.action, late.decision.reason, broken.decision.reason
             assert text == (True, "verify", Reason.LATE, Reason.NOT_FINITE)
             free.set()

@@ -26,7 +26,6 @@ from dengine.cells.ur.cell import (
     encode_message,
 )
 from dengine.cells.ur.protocol import (
-    CHANNELS,
     Package,
     PackageReader,
     PackageType,
@@ -36,7 +35,7 @@ from dengine.cells.ur.stream import RtdeClient, RtdeStream
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError, DengineError
 from tests.support.command_line import dengine, document, line_of, succeed
-from tests.support.robots import FORCE, FakeController, RobotProgram, Trouble
+from tests.support.robots import FORCE, FakeController, RobotProgram, Signals, Trouble
 
 SAMPLES = 80
 WAIT = 60.0  # seconds, for what takes milliseconds here: a machine may be busy
@@ -147,22 +146,6 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(
     assert cell.incomplete == len(hit | {12})
     assert (report.reconnects, report.repeated, report.restarts) == (4, 1, 1)
     assert report.missing >= len(fake.lost)
-
-
-class Signals:
-    """Plays columns of numbers, again and again, with a rest between."""
-
-    place = None
-
-    def __init__(self, **columns: np.ndarray) -> None:
-        names = {name: CHANNELS.get(name, name) for name in columns}
-        length = len(next(iter(columns.values())))
-        self._rows = [{names[n]: float(c[i]) for n, c in columns.items()} for i in range(length)]
-        self._cycle = 0
-
-    def step(self, inputs: dict) -> dict:
-        self._cycle += 1
-        return self._rows[self._cycle % len(self._rows)]
 
 
 def contact() -> np.ndarray:

@@ -16,6 +16,8 @@ from itertools import repeat
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from dengine import Dataset
 from dengine.cells.ur.cell import (
     ANSWER,
@@ -28,6 +30,7 @@ from dengine.cells.ur.cell import (
     encode_message,
 )
 from dengine.cells.ur.protocol import (
+    CHANNELS,
     IN_USE,
     NOT_FOUND,
     Package,
@@ -302,3 +305,19 @@ class FakeController(AbstractContextManager["FakeController"]):
             client.send(self._delayed)
             self._delayed = b""
         return True
+
+
+class Signals:
+    """Plays columns of numbers, again and again, with a rest between."""
+
+    place = None
+
+    def __init__(self, **columns: np.ndarray) -> None:
+        names = {name: CHANNELS.get(name, name) for name in columns}
+        length = len(next(iter(columns.values())))
+        self._rows = [{names[n]: float(c[i]) for n, c in columns.items()} for i in range(length)]
+        self._cycle = 0
+
+    def step(self, inputs: dict) -> dict:
+        self._cycle += 1
+        return self._rows[self._cycle % len(self._rows)]
