@@ -25,7 +25,7 @@ from dengine.serve.http import create_app
 from dengine.serve.service import CellService
 from tests.support.exports import trained
 from tests.support.robots import FakeController, Signals
-from tests.support.serving import REPO, WAIT, served, started
+from tests.support.serving import REPO, WAIT, Process, served, started
 
 SAMPLES = 80
 NAMES = "action", "reason", "lower"
@@ -93,15 +93,37 @@ class Robots:
                 return
 
 
+def recorded(process: Process, x: np.ndarray) -> None:
+    """A robot's force is recorded as it was sent, and decided on; test_ur.py and test_xmlrpc.py try
+    what becomes of it when the controller goes away.
+    """
+    robot = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{process.port}/RPC2")
+    answers = (robot.decide_recorded(robot.begin()) for _ in count())
+    answer = next(answer for answer in answers if answer["id"])  # on a busy machine it may be late
+    assert (answer["action"], answer["reason"]) == (0, "no_model")
+    assert robot.report(answer["id"], True) is True
+    record = process.ask(f"/decisions/{answer['id']}?trace=true")
+    assert record["success"] is True
+    assert np.float32(record["trace"]).ravel().tolist() == x.tolist()
+
+
 # The end by Ctrl-C is the same once more, sent to the whole group.
 @pytest.mark.parametrize("name", [pytest.param("SIGINT", marks=pytest.mark.slow), "SIGTERM"])
-def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is_lost(
+def test_it_records_a_robot_and_a_signal_ends_it_in_the_midst_of_work_and_nothing_is_lost(
     tmp_path, parts, name: str
 ) -> None:
     # Seconds of the budget: so that a retrain is met.
     recipe = Recipe("conv", radius=0.05, retrain_every=20, budget=1.5)
     (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with started(tmp_path, "--recipe", "recipe.toml") as process:
+    rest, x = np.zeros(SAMPLES), parts.X[0]
+    phase = np.concatenate([rest, np.ones(SAMPLES)])
+    force = Signals(FZ_Base=np.concatenate([rest, x]), output_int_register_25=phase)
+    words = f"--recipe recipe.toml --samples {SAMPLES} --robot 127.0.0.1:"
+    with (
+        FakeController(force) as fake,
+        started(tmp_path, *f"{words}{fake.port}".split()) as process,
+    ):
+        recorded(process, x)
         robots = Robots(process.ask, parts)
         threads = robots.start()
         until(lambda: process.ask("/status")["retraining"])
@@ -119,10 +141,8 @@ def test_a_signal_ends_it_in_the_midst_of_decisions_and_a_retrain_and_nothing_is
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert {id_: engine.find(id_).success for id_ in robots.labels} == robots.labels
         for id_, answer in robots.answers.items():
-            match = engine.find(id_)
-            assert [getattr(match.decision, name) for name in NAMES] == [
-                answer[name] for name in NAMES
-            ]
+            decision = engine.find(id_).decision
+            assert [getattr(decision, name) for name in NAMES] == [answer[name] for name in NAMES]
 
 
 @pytest.mark.parametrize("at_work", [False, True], ids=["at its start", "in a retrain"])
@@ -140,29 +160,6 @@ def test_a_server_that_is_killed_leaves_no_retraining_process_behind(
         until(lambda: not any(map(is_alive, below)), WAIT / 4)
     for thread in threads if at_work else ():
         thread.join(WAIT)
-
-
-def test_a_robots_force_is_recorded_and_decided_on(tmp_path, parts) -> None:
-    """What becomes of it when the controller goes away is tried in test_ur.py and test_xmlrpc.py."""
-    rest, force = np.zeros(SAMPLES), parts.X[0]
-    program = Signals(
-        FZ_Base=np.concatenate([rest, force]),
-        output_int_register_25=np.concatenate([rest, np.ones(SAMPLES)]),
-    )
-    with FakeController(program) as fake:
-        robot_at = ("--robot", f"127.0.0.1:{fake.port}", "--samples", str(SAMPLES))
-        with started(tmp_path, "--reducer", "pca", *robot_at) as process:
-            robot = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{process.port}/RPC2")
-            answers = (robot.decide_recorded(robot.begin()) for _ in count())
-            # On a busy machine a recording may come too late.
-            answer = next(answer for answer in answers if answer["id"])
-            assert (answer["action"], answer["reason"]) == (0, "no_model")
-            assert robot.report(answer["id"], True) is True
-            record = process.ask(f"/decisions/{answer['id']}?trace=true")
-            assert record["success"] is True
-            assert np.float32(record["trace"]).ravel().tolist() == force.tolist()  # as it was sent
-            assert process.end() == 0
-    assert "Traceback" not in process.output
 
 
 def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(

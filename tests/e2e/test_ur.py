@@ -271,6 +271,7 @@ def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_
     fake = FakeController(speed=20.0)
     with fake, RtdeStream(fake.host, (), (ORDER,), port=fake.port, clock=lambda: now[0]) as stream:
         for time_, anew, expected in ((0.0, False, order), (11.0, False, None), (11.0, True, None)):
+            fake.inputs.clear()
             stream.write({ORDER: order})
             while fake.inputs.get(ORDER) != order:
                 assert stream.take(WAIT) is not None
