@@ -109,7 +109,7 @@ evidence.member_counts evidence.detector_sums evidence.thresholds"""
 @pytest.mark.parametrize(
     ("guarantee", "stops", "n"),
     [
-        ("local", "all", 900),
+        ("local", "all", 600),
         ("pooled", "some", 1500),
         pytest.param("pooled", "all", 900, marks=pytest.mark.slow),
         pytest.param("cost", "all", 1500, marks=pytest.mark.slow),
