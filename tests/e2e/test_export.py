@@ -19,7 +19,6 @@ from sklearn.decomposition import PCA
 from dengine import (
     DataEngine,
     Dataset,
-    ExportedModel,
     ModelPrediction,
     Recipe,
     TraceSpec,
@@ -30,6 +29,7 @@ from dengine import (
 from dengine.decision.members import SAFE_MODES
 from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError, OutputError
+from dengine.export import ExportedModel
 from dengine.export.bundle import metadata_of, read_checked
 from dengine.export.decision import FIELDS, METHODS
 from dengine.folds import content_fold
