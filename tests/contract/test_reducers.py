@@ -227,7 +227,7 @@ TEACHABLE = {
 def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_still_tells_parts_apart(
     name: str, first: bool, tmp_path: Path
 ) -> None:
-    X, y = toy_traces(130)
+    X, y = toy_traces(180)
     X = X.reshape(len(X), -1)
     policy, options = Policy(alpha=0.4, lower_bound=0.7), {"replaying": True, "retrain_every": 1000}
     engine = DataEngine(TEACHABLE[name](), policy=policy, store=tmp_path / "e.db", **options)
@@ -237,7 +237,7 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
             engine.report(engine.decide(X[i]).id, bool(y[i]))
 
     if not first:
-        learn(range(100))
+        learn(range(150))
         assert engine.retrain().accepted
     engine.decide(X[0])  # it sets the contract
     engine.close()
@@ -245,21 +245,21 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
         SqlStore(str(tmp_path / "e.db"))
     ) as store:  # as an engine stored them that found no fault
         for i, damaged in enumerate(EXTREME.values()):
-            trace = np.asarray(damaged(X[100 + i]), dtype=np.float32)[None]
+            trace = np.asarray(damaged(X[150 + i]), dtype=np.float32)[None]
             item = StoredDecision(decision(f"extreme {i}"), trace, 1 + i, False, store.clock())
-            store.apply_records(labelled(item, bool(y[100 + i])))
+            store.apply_records(labelled(item, bool(y[150 + i])))
     engine = DataEngine.open(tmp_path / "e.db", reducer=TEACHABLE[name](), replaying=True)
     if first:
-        learn(range(100))
+        learn(range(150))
     reports = [engine.retrain() for _ in range(2)]
     assert [report.reason for report in reports if not report.accepted] == []
-    texts = [engine.decide(x) for x in X[110:]]
+    texts = [engine.decide(x) for x in X[160:]]
     assert not {Reason.MODEL_ERROR, Reason.NOVEL} & {report.reason for report in texts}
     middle = [
         np.mean(
             [
                 report.n_success - report.n_failure
-                for report, good in zip(texts, y[110:], strict=True)
+                for report, good in zip(texts, y[160:], strict=True)
                 if good == k
             ]
         )

@@ -21,7 +21,7 @@ pytest.importorskip("uvicorn", reason="needs the extra serve: pip install 'dengi
 from dengine.cli import main
 from dengine.errors import SettingError
 from dengine.records import Action, Reason
-from dengine.serve.auth import Access, read_tokens
+from dengine.serve.auth import read_tokens
 from dengine.serve.http import create_app
 from dengine.serve.metrics import Metrics
 from tests.support.command_line import dengine, well
@@ -119,8 +119,8 @@ def test_the_containers_check_passes_a_server_that_asks_for_a_token_and_fails_wi
 ) -> None:
     program, *check = json.loads(steps("HEALTHCHECK")[0].split("CMD", 1)[1])
     assert program == "python"
-    access = Access(read_tokens(token_file(tmp_path, 0o400)))
-    with a_service() as service, served(create_app(service, access)) as port:
+    tokens = read_tokens(token_file(tmp_path, 0o400))
+    with a_service() as service, served(create_app(service, tokens)) as port:
         asked = [sys.executable, *(word.replace(":8000/", f":{port}/") for word in check)]
         assert subprocess.run(asked, timeout=60, check=False).returncode == 0
     assert subprocess.run(asked, timeout=60, capture_output=True, check=False).returncode != 0
