@@ -35,15 +35,16 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = MAX_LENGTH
 def without_password(text: str) -> str:
     """Return a text in which *** stands for every password of a database URL.
 
-    As in `scheme://user:***@host` and `password=***`.
+    Two forms are masked, `scheme://user:***@host` and `password=***`.
     """
     return PASSWORD.sub(rf"\1={MASK}", URL.sub(rf"\1:{MASK}@", text))
 
 
 def shortened(value: Any) -> str:
-    """Return the `repr` of a value for a message, its middle cut out beyond some 60 characters.
+    """Return the `repr` of a value for a message.
 
-    A container shows only its first items.
+    If it is longer than 60 characters, its middle is cut out. A container shows only its first
+    items, each of them cut like this.
     """
     return _REPR.repr(value)
 

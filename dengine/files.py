@@ -1,10 +1,10 @@
 """Files: outputs, written as a whole or not at all, and NumPy archives, read safely. Data
 sets, exports, backups, tables and figures are read and written by them.
 
-`output_file` and `write_output` never replace a file unasked, and never a database; `new_folder`
-refuses one that holds something. `read_archive`
-unpacks no Python objects, and no more bytes than the machine can hold. `write_manifest` lists the
-checksums of files, and `read_key` reads the secret that signs exports.
+`output_file` and `write_output` replace a file only with `force`, and never a database;
+`new_folder` refuses a folder that is not empty. `read_archive` unpacks no Python objects, and no
+more bytes than the machine can hold. `write_manifest` lists the checksums of files, and `read_key`
+reads the secret that signs exports.
 """
 
 import hashlib
@@ -119,7 +119,7 @@ def read_errors(
 
 
 def _size_text(n_bytes: float) -> str:
-    """Return a number of bytes in GB, or in MB where it is under half a GB."""
+    """Return a number of bytes as text: in GB, or in MB if it is less than half a GB."""
     return f"{n_bytes / 2**30:.1f} GB" if n_bytes >= 2**29 else f"{n_bytes / 2**20:.1f} MB"
 
 
@@ -170,9 +170,10 @@ def read_archive(
 
 
 def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
-    """Return why a file is not of a kind, by its first bytes; "" if it begins and ends as one.
+    """Return why a file is not of the expected kind; "" if it is.
 
-    magic : with which files of the kind begin.
+    `head` holds its first bytes, and `magic` the bytes with which every file of this kind begins.
+    `is_whole` says whether the caller found the end of the file, too.
     """
     if not head.startswith(magic):
         return "it is none" if head else "it is empty"
@@ -180,9 +181,9 @@ def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
 
 
 def is_database(path: Path) -> bool:
-    """Return whether a file begins as a SQLite database or its write-ahead log does.
+    """Return whether a file begins like a SQLite database or its write-ahead log.
 
-    It must be a regular file. An OSError of opening or reading it passes.
+    It must be a regular file. An OSError of opening or reading it passes unchanged.
     """
     with path.open("rb") as file:
         return file.read(16).startswith(DATABASES)
@@ -237,7 +238,10 @@ def check_output(path: FilePath, force: bool = False) -> None:
 def write_output(
     path: FilePath, content: bytes, force: bool = False, *, make_folder: bool = False
 ) -> Path:
-    """Write a file as a whole or not at all, and return its path; parameters as `output_file`."""
+    """Write a file as a whole or not at all, and return its path.
+
+    `force`, `make_folder` and the errors are those of `output_file`.
+    """
     with output_file(path, force, make_folder=make_folder) as partial:
         partial.write_bytes(content)
     return Path(path)

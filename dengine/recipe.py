@@ -168,12 +168,12 @@ class Recipe:
 
     @property
     def name(self) -> str:
-        """Name of the recipe in tables: its reducer's name, or class name."""
+        """Name of the recipe in tables: its reducer's name, or the class name of an object."""
         return self.reducer if isinstance(self.reducer, str) else type(self.reducer).__name__
 
     @property
     def user_classes(self) -> list[str]:
-        """The `module:Class` of its reducer and of its rule, if they are not of this package."""
+        """The `module:Class` of its reducer and of its decision rule, if a user wrote them."""
         names = (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
         return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
 

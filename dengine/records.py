@@ -279,7 +279,7 @@ class Decision:
         return self.propensity if self.action is Action.VERIFY else 0.0
 
 
-TRAINED = "accepted"  # begins the reason of a version that was trained and answers
+TRAINED = "accepted"  # begins the reason of a version that was trained and put in force
 REPEATS = "traces nearly repeat another"  # in a note of a retrain's reason
 REPEATS_MEANING = (
     "If parts come twice, under two numbers or none, a label counts as two independent trials, and "

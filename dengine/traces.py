@@ -271,8 +271,7 @@ class TraceGate(nn.Module):
         Returns
         -------
         reason : int
-            Position in `REASONS` of the first fault found: not finite, constant, saturated or too
-            large; 0 if there is none.
+            Position in `REASONS` of the first fault found (see `check`); 0 if there is none.
         content_hash : int
             As `folds.content_hash`; also of a faulty trace.
         """
