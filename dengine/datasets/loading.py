@@ -33,39 +33,43 @@ def load_dataset(
     samples: int | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Read a data set: a set of dengine's own form, or recordings exactly by a description.
+    """Read a data set: one in a format of dengine, or recordings with their description.
 
     Parameters
     ----------
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
-        A folder, file or DataFrame of recordings, which a description describes. Or a source that
-        needs no description: the name of a bundled set; a `Dataset`; arrays X (n, T) or (n, C, T)
-        and y (n,); an .npz file of ours with X, y, and perhaps scale, rate_hz, unit, cause,
-        channels and part; a Parquet file that `Dataset.to_frame` made; the SQLite file of a store,
-        for its labelled traces.
+        The name of a bundled set, or recordings that a description describes: a folder, a file or a
+        DataFrame. These need no description, and are read without one unless it is given or saved
+        beside the file: a `Dataset`; arrays X (n, T) or (n, C, T) and y (n,); an .npz file with X,
+        y, and perhaps scale, rate_hz, unit, cause (why a part failed), channels and part; a Parquet
+        file of a table that `Dataset.to_frame` made; the SQLite file of a store, of which the
+        labelled traces are read.
     description : Description, dict or path, optional
-        None: the one that was saved, `recordings.toml` in a folder, `FILE.toml` beside a file.
+        How the recordings are written. None: the description that was saved, as `recordings.toml`
+        in the folder or `FILE.toml` beside the file.
     channels : str or sequence of str, optional
-        The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description
-        names. None: all that it reads.
+        The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
+        the data set names. None: all channels.
     samples : int, optional
-        Number of samples to keep from the start of each trace. If the description has fewer, or
-        resamples, the recordings are read as if it stated this number. None: as the description
-        states.
+        Number of samples of each trace: the rest is cut off at the end. If the description states
+        fewer samples, or resamples the traces, this number replaces the one that it states. None:
+        as the description states, or as the data set is.
     progress : callable, optional
         Called with 1 after each file.
 
     Returns
     -------
     Dataset
-        A recording that does not follow the description is one of its `faults`. A sample that is
-        lost is NaN, which the engine finds. Its `spec` is that of live traces of the same shape.
+        A recording that does not follow the description is one of its `faults`. A lost sample is
+        NaN; the engine verifies such a trace. `spec` is the `TraceSpec` of live traces of this
+        shape.
 
     Raises
     ------
     DataError
-        If there is no description, or a value in it is open (the message says what to type); or if
-        no recording is left.
+        If the description is missing or has a key whose value is `?` (the message says what to
+        type), if the source or a channel does not exist, if no recording is left, if `samples` is
+        below 1, or if traces that were read without a description are shorter than `samples`.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     """

@@ -112,10 +112,11 @@ class Table:
         return np.asarray(texts[codes])
 
     def numbers(self, name: str, form: TextForm) -> Floats:
-        """Return a column as numbers, shape (rows,); a missing one is NaN.
+        """Return a column as numbers, float64 (rows,); a missing number is NaN.
 
-        Raises UnreadableError if there is no such column, and for a cell that is no finite number
-        of this form, and no word for a missing one.
+        `form` says how numbers are written, and which words stand for a missing one. Raises
+        UnreadableError if there is no such column, and for any other cell: one that is no number
+        of this form, is infinite, or is too large for float32.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":

@@ -92,10 +92,12 @@ EXAMPLES = (
 
 
 def as_trigger(value: Any) -> Trigger:
-    """Return a trigger as it is, or parse its text: KIND, then =NUMBER and @SIGNAL if need be.
+    """Return a trigger as it is, or make one from a text, KIND[=NUMBER][@SIGNAL].
 
-    bit=0 is digital output 0, register@NAME any value but zero, contact=5 is 5 N of FZ_Base,
-    motion=0.002 is 2 mm a second. Raises SettingError for any other value.
+    "bit=0": digital output 0 is on. "register@NAME": the signal NAME is not zero. "contact=5": the
+    force FZ_Base is 5 N or more, in either direction. "motion=0.002": the tool moves faster than
+    2 mm a second. Only bit and contact need a number. Without @SIGNAL each kind reads a signal of
+    its own. Raises SettingError for any other value.
     """
     if isinstance(value, Trigger):
         return value

@@ -92,10 +92,10 @@ class Column:
 
     @cached_property
     def forms(self) -> list[str]:
-        """All forms of dates and times that fit its cells; none if there is a cell of another kind.
+        """All forms of dates and times that fit its cells; none if a cell is no date or time.
 
-        It looks at the first 20 cells and the last of each recording. If an ISO date or moment
-        fits, it is the only form.
+        The first 20 cells and the last cell of each recording are looked at. If an ISO date fits,
+        with or without a time of day, it is the only form.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
@@ -121,11 +121,11 @@ def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
 class Proposal:
     """A description that is put together key by key, and what its keys are inferred from.
 
-    stated : keys that the user gave, with their values. description : with all keys so far. base :
-    the folder. names : the recordings' files, if each is one. others : the other files. is_cut :
-    whether some file was read in part. tables : of the recordings that were looked at. columns : of
-    the rows that are samples, as far as that is known. notes : a comment for each key that needs
-    one.
+    stated : keys that the user gave, with their values. description : the description with all keys
+    so far. base : the folder. names : the files of the recordings; empty if a file holds several
+    parts. others : the other files in the folder. is_cut : whether only the beginning of some file
+    was read. tables : the recordings that are looked at. columns : their columns by name, without
+    rows that are known to be no samples. notes : a comment by key.
     """
 
     stated: Stated

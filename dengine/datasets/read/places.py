@@ -118,12 +118,19 @@ class LabelReader:
     used: set[str] = field(default_factory=set)
 
     def words(self, table: Table, part: str) -> Sequence[str]:
-        """Return the words for a recording.
+        """Return the words that stand for the label of a recording, like "ok".
 
-        In a listing these are the words of all rows with the recording's key: its part's number,
-        path or file name, or one of the last two without a suffix, the first that is listed. This
-        key is added to `used`. Raises UnreadableError if there are no words, and DataError for a
-        path that is no expression with one group.
+        If the source is a listing, a file that lists the labels of all recordings, they are the
+        words of all rows with the key of the recording. The key is the first of these that is
+        listed: the number of the part, the path, the file name, the path without suffix, the file
+        name without suffix. It is added to `used`. Any other source gives one word.
+
+        Raises
+        ------
+        UnreadableError
+            If there are no words for the recording.
+        DataError
+            If `source.path` is no regular expression with one group.
         """
         source = self.source
         path = table.path
