@@ -523,7 +523,7 @@ def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value in TOML's types; a dataclass becomes a dict without fields of default value."""
+    """Return a value in TOML's types; a dataclass becomes a dict without its default values."""
     if isinstance(value, str | int | float):
         return value
     if isinstance(value, tuple):

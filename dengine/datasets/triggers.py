@@ -112,14 +112,11 @@ def as_trigger(value: Any) -> Trigger:
 
 
 class Placed(NamedTuple):
-    """A stretch of a stream as a trace.
+    """Samples of a stream, put into a trace.
 
-    trace : array of float32, shape (C, T)
-        NaN where no sample came.
-    missing : array of int64, shape (m,)
-        The places of these.
-    repeated : int
-        Samples whose place was taken, which were left out.
+    trace : array of float32, shape (C, T) NaN at a place for which no sample came. missing : array
+    of int64, shape (m,) These places, increasing. repeated : int Number of samples that were left
+    out because an earlier sample had their place.
     """
 
     trace: NDArray[np.float32]
@@ -130,10 +127,8 @@ class Placed(NamedTuple):
 class Start(NamedTuple):
     """Where an insertion begins.
 
-    time : float
-        In seconds.
-    seen : bool
-        Whether its first sample came. False: it began at `time`, or later in a gap.
+    time : float In seconds. seen : bool Whether the first sample of the insertion came. If False,
+    samples are missing, and the insertion began at `time` or later.
     """
 
     time: float
@@ -162,13 +157,13 @@ class StartFinder:
         self._last_off = 0.0
 
     def feed(self, time: float, active: bool) -> Start | None:
-        """Take the next sample; return the start of an insertion if it shows one, else None.
+        """Take the next sample; return where an insertion begins if the sample shows it, else None.
 
-        The trigger must be on at this sample, and have been off for `quiet_s` before; one that is
-        on from the first sample on has no start.
+        It begins if the trigger is on at this sample and was off for `quiet_s` before. A trigger
+        that is on at the first sample gives no start until it was off.
 
-        If samples are missing just before it, the insertion may have begun in any of them, so the
-        place of no sample in its trace is known: `Start.seen` is False.
+        If samples are missing just before this one, the insertion may have begun in the gap, and
+        `Start.seen` is False; `Start.time` is then the first time in the gap.
         """
         if not active:
             self._off_since = time if self._off_since is None else self._off_since
@@ -185,7 +180,7 @@ class StartFinder:
 def place(
     times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float
 ) -> Placed:
-    """Put samples into a trace, each at the place that its time gives.
+    """Put samples into a trace, each at the place nearest to its time.
 
     Parameters
     ----------
@@ -195,14 +190,15 @@ def place(
     start : float
         Time of the first place.
     samples : int
-        Places in the trace.
+        Number of places in the trace.
     step : float
         Seconds from one place to the next.
 
     Returns
     -------
     Placed
-        Samples before or behind the trace are left out; of several at one place the first stays.
+        Samples before the first or after the last place are left out. If several have the same
+        place, the first is taken.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
     at = np.rint((np.asarray(times) - start) / step).astype(np.int64)
