@@ -1,7 +1,7 @@
 """Checks on a description before anything is read, and on the recordings that were read.
 
-Equal samples under two labels are a fault, and so is each repeat; `tolerance_note` compares a
-policy with the share of bad parts.
+Recordings with equal samples and different labels are faults, and so is each repeat of a recording.
+`tolerance_note` compares the tolerance of a policy with the share of bad parts.
 """
 
 from collections import defaultdict

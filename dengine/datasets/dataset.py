@@ -1,6 +1,6 @@
 """`Dataset`, labelled traces of one shape in memory, and `make_dataset`, which makes one of arrays.
 
-What is wrong with a recording that is left out is a `Fault`.
+A `Fault` says why a recording was left out.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,9 +41,14 @@ def expect_all(wanted: Mapping[str, Any]) -> None:
 class Fault:
     """Why a recording was left out.
 
-    source : str The file, as seen from the folder, with the row or part if the file has several.
-    line : int Line of the file, from 1; 0 if the fault is not of one line. message : str What was
-    expected, and what came. column : str Column of the table; "" if the fault is not of one column.
+    source : str
+        The file, as seen from the folder, with the row or part if the file has several.
+    line : int
+        Line of the file, from 1; 0 if the fault is not of one line.
+    message : str
+        What was expected, and what came.
+    column : str
+        Column of the table; "" if the fault is not of one column.
     """
 
     source: str

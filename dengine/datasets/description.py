@@ -225,11 +225,12 @@ class TraceForm:
     """The traces that come out: `[traces]`.
 
     samples
-        Samples of each trace.
+        Number of samples of each trace.
     lengths
-        What happens to a recording of another length. `strict`: it is a fault. `cut`: it loses its
-        end. `pad`: like `cut`, or its last sample is repeated, up to twice its length. `pad-all`:
-        like `pad`, at any length. `resample`: it is interpolated.
+        What happens to a recording of another length. `strict`: it is a fault. `cut`: a longer one
+        loses its end. `pad`: like `cut`, and a shorter one repeats its last sample; a recording
+        of less than half or more than twice the samples is a fault. `pad-all`: like `pad`, at any
+        length. `resample`: it is interpolated.
     """
 
     samples: int = 0
@@ -238,10 +239,10 @@ class TraceForm:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the author of the description saw: `[seen]`. Fewer recordings are noted later.
+    """What the author of the description saw: `[seen]`. A note says if there are fewer now.
 
     recordings
-        Recordings that were read.
+        Recordings that were found.
     good
         Good parts among them.
     bad

@@ -1,4 +1,4 @@
-"""`load_dataset`, which reads what is ours as it is, and everything else by a description."""
+"""`load_dataset`, which reads formats of dengine as they are, other recordings by a description."""
 
 import json
 import os

@@ -42,12 +42,12 @@ class Table:
     Parameters
     ----------
     source : str
-        What it is called in messages: the file, with the row or the part if it has several.
+        Name in messages: the file, with the row or the part if the file has several.
     columns : mapping of str to array, shape (rows,)
-        Numbers, times, or texts as objects. In a file of a single part a column of one cell holds
+        Numbers, times, or texts as objects. In a file of a single part a column with one cell holds
         for all rows.
     lines : sequence of int
-        Line of each row in the file, or the one line of all.
+        Line in the file of each row, or one line for all rows.
     units : mapping of str to str
         Units that the file states for its columns.
     above : sequence of str
@@ -55,12 +55,13 @@ class Table:
     header : int
         Line of the header; 0 for none.
     damage : sequence of UnreadableError
-        What is wrong with lines of another number of cells, whose rows have empty cells; or with a
-        part as a whole.
+        Errors of lines with a wrong number of cells, whose rows have empty cells; or of the part as
+        a whole.
     origin : mapping of str to sequence of str
-        The columns of the file that the cells of a column stood in, if they are others.
+        For a column that was put together from others: the column of the file for each cell.
     path : str
-        The path that names a part, as seen from the folder, or its column or window.
+        The path of the file that names the part, relative to the folder; or the name of its column
+        or window.
     """
 
     source: str
@@ -128,7 +129,7 @@ class Table:
         return values
 
     def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:
-        """Raise UnreadableError for the first row in which `is_bad` is True, if there is such a row.
+        """Raise UnreadableError for the first row in which `is_bad` is True; if none is, return.
 
         wanted : what was expected, for the message. name : the column.
         """

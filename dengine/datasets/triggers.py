@@ -2,8 +2,8 @@
 
 A signal is a channel (`FZ_Base`), a field of the controller (`output_int_register_25`,
 `actual_TCP_speed[0]`), or a topic of a bag. The recorder of the UR cell and the reader of bags use
-`as_trigger`, `StartFinder` and `place`. A sample that did not come is NaN at its place, which the
-engine finds: nothing is filled in.
+`as_trigger`, `StartFinder` and `place`. A sample that did not come is NaN at its place: no value is
+made up, and the engine verifies such a trace.
 """
 
 import re
@@ -27,15 +27,15 @@ class Trigger:
     Parameters
     ----------
     kind : {"bit", "register", "contact", "motion"}
-        bit: bit `number` of a word is set, counted from 0. register: the signal has the value
-        `number`, or any but zero if that is None. contact: the force is at least `number` newtons,
-        in either direction, as recorded. motion: the tool moves faster than `number` metres a
-        second; the signal is a vector.
+        bit: bit `number` of an integer is set, counted from 0. register: the signal has the value
+        `number`, or any value but zero if that is None. contact: the force is at least `number`
+        newtons, in either direction, as recorded. motion: the tool moves faster than `number`
+        metres a second; the signal is a vector.
     number : float or None
     signal : str
         Name of the signal.
     quiet_s : float
-        Seconds that the condition must not have been met before: a force that varies around the
+        Seconds that the condition must not have been met before. So a force that varies around the
         threshold is one contact.
     """
 
@@ -114,9 +114,12 @@ def as_trigger(value: Any) -> Trigger:
 class Placed(NamedTuple):
     """Samples of a stream, put into a trace.
 
-    trace : array of float32, shape (C, T) NaN at a place for which no sample came. missing : array
-    of int64, shape (m,) These places, increasing. repeated : int Number of samples that were left
-    out because an earlier sample had their place.
+    trace : array of float32, shape (C, T)
+        NaN at a place for which no sample came.
+    missing : array of int64, shape (m,)
+        These places, increasing.
+    repeated : int
+        Number of samples that were left out because an earlier sample had their place.
     """
 
     trace: NDArray[np.float32]
@@ -127,8 +130,11 @@ class Placed(NamedTuple):
 class Start(NamedTuple):
     """Where an insertion begins.
 
-    time : float In seconds. seen : bool Whether the first sample of the insertion came. If False,
-    samples are missing, and the insertion began at `time` or later.
+    time : float
+        In seconds.
+    seen : bool
+        Whether the first sample of the insertion came. If False, samples are missing, and the
+        insertion began at `time` or later.
     """
 
     time: float

@@ -120,7 +120,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
 
 def likely_suffixes(names: Names) -> Names:
-    """Return the suffixes that several files have, and that of a bag; if there is none, all."""
+    """Return the suffixes that several files have, and `.mcap`; if there is none, all suffixes."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 
@@ -147,7 +147,7 @@ def names_in(root: Path, patterns: Names) -> Names:
 
 
 def globs(names: Names) -> list[str]:
-    """Return patterns that match files, one for each suffix; of a single file, its name."""
+    """Return patterns that match the files, one for each suffix; for a single file its name."""
     folders = "**/" if any("/" in name for name in names) else ""
     endings = {name.removeprefix(without_suffix(name)) for name in names}
     return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]

@@ -72,8 +72,8 @@ def propose_clock(p: Proposal) -> None:
 def is_clock(column: Column) -> bool:
     """Return whether a column may hold the times of the samples.
 
-    It may if it changes within recordings and has dates or times of day, or if it is named like a
-    clock and some cells are no numbers. Numbers must rise in a column that is named like a clock.
+    Dates and times of day may if they change within a recording. So may a column that is named like
+    a clock, if it has numbers that rise, or if it changes and not all cells are numbers.
     """
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):

@@ -63,30 +63,30 @@ class Column:
 
     @cached_property
     def odd(self) -> Counter[str]:
-        """How often each word comes that is no number, with whatever decimal mark."""
+        """How often each word comes that is not a number with any decimal mark."""
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
 
     @cached_property
     def fixed(self) -> list[str]:
-        """The word of each recording; none if it changes within one."""
+        """The word of each recording; empty if the words of any recording differ between rows."""
         is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
         return [str(words[0]) for words in self.words] if is_fixed else []
 
     @cached_property
     def numbers(self) -> list[Floats]:
-        """The numbers of each recording; an empty list if any cell is no number of the form."""
+        """The numbers of each recording; empty if any cell is not a number as `form` writes it."""
         with suppress(DataError):
             return [table.numbers(self.name, self.form) for table in self.tables]
         return []
 
     @cached_property
     def steps(self) -> Floats:
-        """The steps from number to number within the recordings; none if a cell is no number."""
+        """The differences of successive numbers in each recording; empty if a cell is no number."""
         return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for it; "" if none does."""
+        """The unit that most files state for the column; "" if most state none."""
         units = Counter(bare(table.units.get(self.name, "")) for table in self.tables)
         return units.most_common(1)[0][0]
 

@@ -121,7 +121,10 @@ def row_of(column: Column) -> Literal["", "same", "last"]:
 
 
 def lines_of(p: Proposal, pattern: re.Pattern[str]) -> list[str]:
-    """Return the beginnings of lines above a header, before the first mark, that a pattern fits."""
+    """Return how lines above the header begin, up to the first `; : = , tab`, if a pattern fits.
+
+    Only the first table is looked at.
+    """
     lines = [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
     return [*filter(pattern.search, (line.strip(" \"'") for line in lines))]
 
@@ -182,7 +185,7 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
 
 
 def title_of(source: LabelSource, words: Words) -> str:
-    """Return what to type for a source, with the counts of its words."""
+    """Return the settings that state a source, like `label.column=result`, with the word counts."""
     stated = [f"label.{kind}={getattr(source, kind)}" for kind in KINDS if getattr(source, kind)]
     return f"{' '.join(stated)} ({counts_of(words.values())})"
 
@@ -209,9 +212,9 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
 
 
 def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
-    """Return 1 for each recording with a word for good, -1 for bad, 0 for not checked.
+    """Return, by recording, 1 for a word for good, -1 for bad and 0 for unchecked.
 
-    The mapping is empty if the meaning of a word is not known, or no word is for good or bad.
+    The dict is empty if a word has no known meaning, or if no word is for good or bad.
     """
     is_known = {*source.good, *source.bad, *source.unchecked}.issuperset(words.values())
     sides = {name: (word in source.good) - (word in source.bad) for name, word in words.items()}

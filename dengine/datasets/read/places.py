@@ -184,7 +184,7 @@ class LabelReader:
 
 
 def as_key(word: str) -> str:
-    """Return the key in a listing: whole numbers match by their value, and paths in any writing."""
+    """Return a word as a key of a listing: without leading zeros in a number, with / in a path."""
     return word.lstrip("0") or "0" if word.isdecimal() else word.replace("\\", "/")
 
 

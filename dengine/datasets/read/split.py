@@ -71,7 +71,7 @@ def signals_of(description: Description) -> Sequence[str]:
 
 
 def verdicts_of(description: Description) -> set[str]:
-    """Return the topics of a bag that have labels."""
+    """Return the topics of a bag that hold labels."""
     return {source.topic for source in description.labels} - {""}
 
 
@@ -166,7 +166,7 @@ def _row_of(table: Table, i: int) -> Table:
 
 
 def _numbered(key: str, table: Table) -> list[str]:
-    """Return the columns that a channel's pattern matches with numbers for `*`, by the numbers."""
+    """Return the columns that match a channel's pattern with a number for `*`, by that number."""
     return sorted(filter(pattern_of(key, DIGITS).fullmatch, table.columns), key=natural_key)
 
 
@@ -190,9 +190,11 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
 def _with_samples(
     table: Table, samples: frames.Columns, origin: Mapping[str, Sequence[str]]
 ) -> Table:
-    """Return a table with the samples of channels, which stood in other columns.
+    """Return a table with the samples of channels, which stood in other columns of the file.
 
-    Cells at their end that are empty or NaN are no samples.
+    Cells at the end of a channel that are empty or NaN are left out.
+
+    origin : for each channel the column of each sample.
     """
     units = {key: table.units.get(names[0], "") for key, names in origin.items() if names}
     columns = {**table.columns, **{key: without_empty_end(cells) for key, cells in samples.items()}}
@@ -200,7 +202,7 @@ def _with_samples(
 
 
 def without_empty_end(cells: Cells) -> Cells:
-    """Return cells without those at the end that are empty or NaN."""
+    """Return the cells without those at the end that are empty or NaN."""
     n = len(cells)
     while n and as_word(cells[n - 1]) in ("", "NaN", "nan"):
         n -= 1

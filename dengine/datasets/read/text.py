@@ -103,7 +103,10 @@ def split_line(line: str, delimiter: str) -> list[str]:
 
 
 def header_names(cells: Sequence[str]) -> list[str]:
-    """Return the columns' names: those that repeat get a number, like `X.2`, empty ones too."""
+    """Return the names of columns in a header; empty cells become `column1`, `column2`, ...
+
+    A name that repeats gets a number, like `X.2`.
+    """
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
     places = [names[: i + 1].count(name) for i, name in enumerate(names)]
     return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
