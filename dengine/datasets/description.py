@@ -350,9 +350,9 @@ class Description:
         return write_output(path, self.to_toml().encode(), force)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return nested dicts of TOML's types, without the notes and without what has its default.
+        """Return nested dicts of TOML's types, without the notes and without default values.
 
-        Channels are always there: `?` is a key of theirs if there is none.
+        The channels are always there; if there are none, `?` stands for them.
         """
         channels = self.channels or {UNKNOWN: Channel()}
         tables = {column: {"unit": c.unit, **_plain(c)} for column, c in channels.items()}

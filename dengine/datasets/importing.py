@@ -134,15 +134,16 @@ def import_labelled(
 ) -> ImportReport:
     """Put every labelled trace of a data set into a store, in order; nothing is trained.
 
-    They are stored in chunks, each as a whole: an import that was interrupted continues where it
-    stopped. The same file twice counts no label twice.
+    The traces are stored in chunks, each in one transaction: if an import is interrupted, the same
+    call continues it. A trace that the store has from an earlier import is not stored again.
 
     Parameters
     ----------
     store : path, URL or store
         A new store, which is created, or a used one. A store object stays open.
     dataset : object
-        Anything `load_dataset` takes. Described recordings get the form of the store's traces.
+        Anything `load_dataset` takes. Recordings that a description describes are brought to the
+        length of the store's traces.
     recipe, seed : optional
         For the engine of a new store; by default recipe conv and seed 0. A used store has its own
         recipe and seed; other values raise SettingError.

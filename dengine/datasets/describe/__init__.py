@@ -191,8 +191,9 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     """Return the table of a file; a text file gives all cells as texts.
 
     An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
-    is stated, if it is the only file and its arrays hold curves. Of a text file of more than 2 MB
-    only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is damaged.
+    is stated, if it is the only file and its arrays hold curves. Of a text or jsonl file of more
+    than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is
+    damaged.
     """
     kind = p.description.format
     if kind == "npz":

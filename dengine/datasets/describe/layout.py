@@ -69,7 +69,7 @@ def may_tell_parts(column: Column) -> bool:
 
 
 def numbered_columns(table: Table) -> list[str]:
-    """Return the patterns, like `x*`, of at least 20 columns with numbers behind one name."""
+    """Return a pattern like `x*` for each name, as in `x0`, `x1`, that 20 columns or more share."""
     counts = Counter(re.sub(r"\d+$", ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
 

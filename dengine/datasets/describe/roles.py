@@ -37,7 +37,7 @@ FORCES = (
 
 
 def propose_roles(p: Proposal) -> None:
-    """Find what each column is for, and set the keys of this in `p`; stated keys stay.
+    """Find what each column is for, and set the keys that say so in `p`; stated keys stay.
 
     In this order: columns that tell which rows are samples, clock, part, label, channels. A key is
     `?` if no rule proves a value. If it is open which rows are samples, `traces.samples` is `?` and
@@ -76,9 +76,9 @@ def samples_only(p: Proposal, table: Table) -> Table:
 
 
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
-    """Set in `p` what the words of columns mean for their rows, and leave out those that are none.
+    """Set `[rows]` in `p`, and leave the rows that are no samples out of `p.columns`.
 
-    From then on `p.columns` has only the rows that are samples. Without words nothing changes.
+    Nothing changes if `rows` is empty.
     """
     if rows:
         p.description = replace(p.description, rows=rows)

@@ -110,9 +110,9 @@ def _count_numbers(cells: Sequence[str]) -> int:
 
 
 def _first_row(rows: Rows, width: int) -> int:
-    """Return the first row of samples: as many numbers as usual, as have those behind it.
+    """Return the first row of samples, from 0; 0 if there is none.
 
-    It is counted from 0, and 0 if there is no such row.
+    It is the first of four successive rows that each have about as many numbers as is usual.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)

@@ -151,7 +151,8 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
-    `class`. Raises UnreadableError if it is no text, or has no series below a line `@data`.
+    `class`. Raises UnreadableError if the file is not in its encoding, or has no series below a
+    line `@data`.
 
     References
     ----------
