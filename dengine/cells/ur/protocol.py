@@ -122,8 +122,9 @@ class RtdeRecipe:
     def pack(self, values: Mapping[str, float]) -> bytes:
         """Return a data package, with its header, of these values by column.
 
-        Columns that are left out are 0, and names that are no columns are ignored. Numbers for an
-        integer field are cut to integers. Raise struct.error for one that its field cannot hold.
+        Columns that are left out are 0, and names that are no columns are ignored. A number for an
+        integer field loses its fraction. Raise struct.error for a number that is too large for its
+        field.
         """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))
