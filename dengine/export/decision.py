@@ -41,7 +41,7 @@ class DecisionModule(nn.Module):
     spec : TraceSpec
         Shape of the traces, and how other lengths are fitted to it.
     decider : Decider
-        Eager or compiled; its predictor has `neighbours`, as `model.neighbours.Predictor`.
+        Eager or compiled; its predictor has `neighbours`, like `model.neighbours.Predictor`.
     embedding_shape : pair of int
         (K, d).
     stops_all : bool, default False

@@ -170,7 +170,7 @@ def _refuse_unsupported(source: Exportable) -> None:
 
 
 class OnnxModel:
-    """An ONNX decision in onnxruntime; it has `decide` as `ExportedModel`, but learns nothing.
+    """An ONNX decision in onnxruntime; its `decide` takes no part, and it learns nothing.
 
     Parameters
     ----------

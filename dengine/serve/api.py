@@ -327,7 +327,9 @@ class Me(Struct):
 
 
 class Problem(Struct):
-    """Why a request is not served, as of RFC 9457. A part without a decision is verified."""
+    """Why a request is not served, in the form of RFC 9457. A part without a decision is
+    verified.
+    """
 
     title: str
     status: int

@@ -76,8 +76,9 @@ class TokenUsers(UserManager):
     tokens : collection of str or None
         None: everybody.
     encrypted : bool
-        Only clients with a certificate, which every client that encrypts has. asyncua lets anyone
-        open a channel without security, to ask for the endpoints, and would accept a session on it.
+        Whether clients without a certificate are refused; every client that encrypts has one.
+        asyncua lets anyone open a channel without security, to ask for the endpoints, and would
+        accept a session on it.
     """
 
     def __init__(self, tokens: Collection[str] | None, encrypted: bool = False) -> None:

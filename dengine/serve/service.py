@@ -348,8 +348,8 @@ class CellService:
         return await asyncio.to_thread(work, self.read_store)
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Return the status, as `DataEngine.status`; the engine's thread only flushes for it.
-        Raises BusyError and StoreError like `read`.
+        """Return the status that `DataEngine.status` returns, without its work in the engine's
+        thread, which only flushes. Raises BusyError and StoreError like `read`.
         """
         stored = await self.read(lambda store: status(store, last, watching))
         return self.engine.state.complete(stored)

@@ -178,7 +178,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         return OUTCOMES[self._execute_order(Verb.PROCEED)]
 
     def reject(self) -> None:
-        """Have the part put back to the bin without measuring; raise CellError as `insert`."""
+        """Have the part put back to the bin without measuring; raise CellError like `insert`."""
         self._execute_order(Verb.REJECT)
 
     def _execute_order(self, verb: Verb) -> ResultCode:

@@ -41,7 +41,10 @@ TYPES = {  # by field type: the letter of `struct`, and the number of values
 
 
 class HeldError(CellError):
-    """Another client writes this input; maybe one that has gone, as the controller will notice."""
+    """Another client of the controller writes this input.
+
+    It may have gone already: the controller notices that after a short time.
+    """
 
 
 class PackageType(IntEnum):

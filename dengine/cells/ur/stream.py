@@ -232,11 +232,11 @@ class StreamReport:
 class RtdeStream(AbstractContextManager["RtdeStream"]):
     """Receives packages in a thread and buffers them for `take`.
 
-    The parameters are those of `RtdeClient`, and `clock`, which returns seconds. The first
-    connection raises CellError if it fails, SettingError for an unknown column. A connection that
-    is lost later is made again, with as many attempts as that takes, and the newest inputs are
-    written again, unless they are old or the controller was restarted. The buffer holds 60 s of
-    packages; older ones are dropped.
+    The parameters are those of `RtdeClient`, and `clock`, a function that returns seconds. If the
+    first connection fails, CellError is raised, or SettingError for an unknown column. If a
+    connection is lost later, the thread reconnects, with as many attempts as that takes. It then
+    writes the newest inputs again, unless they are old or the controller was restarted. The buffer
+    holds 60 s of packages; older packages are dropped.
 
     Attributes
     ----------
@@ -297,8 +297,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def take(self, timeout: float) -> Row | None:
         """Remove and return the oldest buffered package.
 
-        It waits `timeout` seconds for one, but not once the stream is closed; None if there is none
-        then.
+        If the buffer is empty, it waits up to `timeout` seconds for a package, and no longer once
+        the stream is closed. It returns None if no package came.
         """
         with self._news:
             self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
