@@ -191,9 +191,9 @@ class HttpApi:
         """Report the outcome of a part. The label is on disk when the response comes.
 
         The same report twice is no error; a report that contradicts an earlier one is 409. But
-        `false` for an accepted part that counts as good, because the next part was decided, is a
-        late line stop, and corrects the label. An unknown id or part is 404. If the request has an
-        author or the token has a name, a new label is also recorded as an event.
+        `false` for an accepted part that was confirmed as good before is a late line stop, and
+        corrects the label. An unknown id or part is 404. If the request has an author or the token
+        has a name, a new label is also recorded as an event.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)

@@ -126,8 +126,8 @@ class RtdeRecipe:
         """Return a data package, with its header, of these values by column.
 
         Columns that are left out are 0, and names that are no columns are ignored. A number for an
-        integer field loses its fraction. Raise struct.error for a number that is too large for its
-        field.
+        integer field loses its fraction. Raise struct.error for a number that its field cannot
+        hold, for example one that is too large.
         """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))

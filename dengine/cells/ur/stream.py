@@ -318,7 +318,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
 
         If the connection is lost, the newest inputs are written again on the next connection,
         unless they are `REPEAT_S` old by then or the controller was restarted. Raises struct.error
-        for a number that is too large for its field.
+        for a number that its field cannot hold.
 
         Parameters
         ----------
