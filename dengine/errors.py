@@ -35,15 +35,16 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = MAX_LENGTH
 def without_password(text: str) -> str:
     """Return a text in which *** stands for every password of a database URL.
 
-    As in `scheme://user:***@host` and `password=***`.
+    Two forms are masked, `scheme://user:***@host` and `password=***`.
     """
     return PASSWORD.sub(rf"\1={MASK}", URL.sub(rf"\1:{MASK}@", text))
 
 
 def shortened(value: Any) -> str:
-    """Return the `repr` of a value for a message, its middle cut out beyond some 60 characters.
+    """Return the `repr` of a value for a message.
 
-    A container shows only its first items.
+    If it is longer than 60 characters, its middle is cut out. A container shows only its first
+    items, each of them cut like this.
     """
     return _REPR.repr(value)
 
@@ -61,8 +62,8 @@ def listed(names: Iterable[Any]) -> str:
 def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
-    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`. Arguments that are not in
-    `OPTIONS`, quoted data, and the rest of the text, stay.
+    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`. Only the names in `OPTIONS`
+    are rewritten. Text in single quotes, which messages use for data, and all other text stay.
     """
 
     def to_option(match: re.Match[str]) -> str:
@@ -161,16 +162,16 @@ def expect(
 def instead(
     error: type[DengineError], message: str, *caught: type[Exception], do: str = ""
 ) -> Iterator[None]:
-    """Context manager that raises `error` from, and instead of, the exceptions `caught`.
+    """Context manager that raises `error` in place of the exceptions `caught`, which are its cause.
 
     Parameters
     ----------
     error : type
         Class of the new error. An exception of this class passes unchanged.
     message : str
-        Beginning of the new message; the reason follows: the text of the caught exception, of an
-        OSError only its `strerror`, without the file's name, cut to 300 characters and on one line.
-        So `message` must name the file.
+        Beginning of the new message. The text of the caught exception follows, on one line and cut
+        to 300 characters. Of an OSError only `strerror` follows, which lacks the file's name, so
+        `message` must name the file.
     *caught : type
         Exceptions to catch. All others pass unchanged.
     do : str

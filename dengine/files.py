@@ -1,10 +1,10 @@
 """Files: outputs, written as a whole or not at all, and NumPy archives, read safely. Data
 sets, exports, backups, tables and figures are read and written by them.
 
-`output_file` and `write_output` never replace a file unasked, and never a database; `new_folder`
-refuses one that holds something. `read_archive`
-unpacks no Python objects, and no more bytes than the machine can hold. `write_manifest` lists the
-checksums of files, and `read_key` reads the secret that signs exports.
+`output_file` and `write_output` replace a file only with `force`, and never a database;
+`new_folder` refuses a folder that is not empty. `read_archive` unpacks no Python objects, and no
+more bytes than the machine can hold. `write_manifest` lists the checksums of files, and `read_key`
+reads the secret that signs exports.
 """
 
 import hashlib
@@ -44,7 +44,7 @@ MIN_KEY_BYTES = 16
 
 
 def read_key(path: FilePath, error: type[DengineError]) -> bytes:
-    """Return the secret in a key's file, without line ends behind it.
+    """Return the secret in a key's file, without line breaks at its end.
 
     Raises `error` if the file cannot be read, or the secret has fewer than 16 bytes.
     """
@@ -71,7 +71,7 @@ def check_size(size: float, source: object) -> None:
     size : float
         Bytes of all arrays.
     source : object
-        What they are in, for the error.
+        The file or other source that holds the arrays, for the error.
     """
     limit = MAX_BYTES
     with suppress(AttributeError, ValueError, OSError):  # on systems without these figures
@@ -108,7 +108,7 @@ def read_errors(
     extra : str
         Extra of dengine that installs the package, for that error.
     also : tuple of type
-        Exceptions to catch beside `UNREADABLE`.
+        Exceptions to catch in addition to those in `UNREADABLE`.
     do : str
         What the user can do about it.
     """
@@ -119,7 +119,7 @@ def read_errors(
 
 
 def _size_text(n_bytes: float) -> str:
-    """Return a number of bytes in GB, or in MB where it is under half a GB."""
+    """Return a number of bytes as text: in GB, or in MB if it is less than half a GB."""
     return f"{n_bytes / 2**30:.1f} GB" if n_bytes >= 2**29 else f"{n_bytes / 2**20:.1f} MB"
 
 
@@ -146,8 +146,9 @@ def read_archive(
     Raises
     ------
     DataError
-        If it cannot be read, is no archive, is damaged, an array to read holds Python objects,
-        which are not unpacked, or these arrays need too much memory (see `check_size`).
+        If the file cannot be read, is no archive or is damaged. Also if an array that is to be read
+        holds Python objects, which are never unpacked, or if the arrays that are to be read need
+        too much memory (see `check_size`).
     """
     title = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
     with (
@@ -169,9 +170,10 @@ def read_archive(
 
 
 def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
-    """Return why a file is not of a kind, by its first bytes; "" if it begins and ends as one.
+    """Return why a file is not of the expected kind; "" if it is.
 
-    magic : with which files of the kind begin.
+    `head` holds its first bytes, and `magic` the bytes with which every file of this kind begins.
+    `is_whole` says whether the caller found the end of the file, too.
     """
     if not head.startswith(magic):
         return "it is none" if head else "it is empty"
@@ -179,9 +181,9 @@ def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
 
 
 def is_database(path: Path) -> bool:
-    """Return whether a file begins as a SQLite database or its write-ahead log does.
+    """Return whether a file begins like a SQLite database or its write-ahead log.
 
-    It must be a regular file. An OSError of opening or reading it passes.
+    It must be a regular file. An OSError of opening or reading it passes unchanged.
     """
     with path.open("rb") as file:
         return file.read(16).startswith(DATABASES)
@@ -190,7 +192,8 @@ def is_database(path: Path) -> bool:
 def toml_value(value: Any) -> str:
     """Return a text, a number, a boolean, or a list or tuple of these, as TOML writes it.
 
-    Numbers of NumPy are taken as well; anything else is written as the text that `str` gives.
+    NumPy's numbers are numbers, too. Another object is written as a quoted text, its `str`. TOML
+    has no None, so the caller must replace it.
     """
     if isinstance(value, float):
         return repr(float(value))  # JSON has no infinity
@@ -235,7 +238,10 @@ def check_output(path: FilePath, force: bool = False) -> None:
 def write_output(
     path: FilePath, content: bytes, force: bool = False, *, make_folder: bool = False
 ) -> Path:
-    """Write a file as a whole or not at all, and return its path; parameters as `output_file`."""
+    """Write a file as a whole or not at all, and return its path.
+
+    `force`, `make_folder` and the errors are those of `output_file`.
+    """
     with output_file(path, force, make_folder=make_folder) as partial:
         partial.write_bytes(content)
     return Path(path)
@@ -257,7 +263,7 @@ def output_file(
     force : bool, default False
         Whether a file that exists may be replaced; see `check_output`.
     make_folder : bool, default False
-        Whether its folder is made if there is none.
+        Whether the folder of `path` is made, with its parents, if it does not exist.
 
     Yields
     ------
@@ -267,7 +273,8 @@ def output_file(
     Raises
     ------
     OutputError
-        If `check_output` refuses the path, or for an OSError, also one that the block raises.
+        If `check_output` refuses the path or the folder does not exist. Every other OSError becomes
+        one as well, also an OSError that the block raises.
     """
     target = Path(path)
     check_output(target, force)
@@ -296,7 +303,9 @@ def output_file(
 def new_folder(path: FilePath) -> Iterator[Path]:
     """Context manager that makes a folder, or takes an empty one, and gives its path.
 
-    Raises OutputError if it holds something, or for an OSError, also one that the block raises.
+    Parents are made, too. Nothing is deleted at the end, even if the block raises. Raises
+    OutputError if `path` is a file or a folder that is not empty, and in place of every OSError,
+    also one that the block raises.
     """
     target = Path(path)
     with _write_errors(target):
@@ -310,9 +319,10 @@ def new_folder(path: FilePath) -> Iterator[Path]:
 def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:
     """Add the SHA-256 of files to `manifest.json` in their folder, and return its path.
 
-    Entries of other files stay, and the manifest is created if there is none. Write it last: it
-    then lists only complete files. Raises OutputError if a file of that name is no manifest, unless
-    `force`, and if it cannot be written.
+    Entries of other files stay, and the manifest is created if there is none. Write it last, so
+    that it lists only complete files. A `manifest.json` that is no manifest raises OutputError, or
+    is replaced with `force`. Raises OutputError if it cannot be written, too; an OSError of reading
+    `files` passes unchanged.
     """
     target = folder / MANIFEST
     sums: dict[str, str] = {}
@@ -325,7 +335,10 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
 
 
 def _write_errors(target: Path, *also: type[Exception]) -> AbstractContextManager[None]:
-    """Return a context manager that raises OutputError with advice for OSError and `also`."""
+    """Return a context manager that raises OutputError in place of OSError and of `also`.
+
+    The message says that `target` cannot be written, and advises to choose another folder or file.
+    """
     return instead(
         OutputError,
         f"Cannot write {target}",

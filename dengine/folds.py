@@ -93,7 +93,7 @@ def trace_hash(content: int, part: str | None) -> int:
 def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:
     """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64 of shape (n,).
 
-    It is a fixed function of the hash and the salt: nothing is drawn.
+    It is a fixed function of the hash and the salt: the same arguments give the same integers.
     """
     with np.errstate(over="ignore"):
         h = np.asarray(hashes, dtype=np.int64) ^ np.int64(salt)

@@ -85,9 +85,9 @@ class ForceLimits:
     def parse(cls, text: str) -> ForceLimits:
         """Return the limits that a text like START:END:LOW:HIGH describes; `str` writes this text.
 
-        An empty LOW or HIGH is no limit. `:channel=1`, `:along=2` and `:reject` may follow. Only
-        digits name a channel by its index. Raises SettingError for any other text, and for values
-        that are no limits.
+        An empty LOW or HIGH means no limit. `:channel=1`, `:along=2` and `:reject` may follow. A
+        channel in digits is an index, any other text is a name. Raises SettingError for a text of
+        another form, and for values that `ForceLimits` refuses.
         """
         fields = text.split(":")
         options: dict[str, Any] = {}

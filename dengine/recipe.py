@@ -168,12 +168,12 @@ class Recipe:
 
     @property
     def name(self) -> str:
-        """Name of the recipe in tables: its reducer's name, or class name."""
+        """Name of the recipe in tables: its reducer's name, or the class name of an object."""
         return self.reducer if isinstance(self.reducer, str) else type(self.reducer).__name__
 
     @property
     def user_classes(self) -> list[str]:
-        """The `module:Class` of its reducer and of its rule, if they are not of this package."""
+        """The `module:Class` of its reducer and of its decision rule, if a user wrote them."""
         names = (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
         return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
 
@@ -216,10 +216,10 @@ class Recipe:
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
         """Parse the text that `to_toml` writes, and return the recipe.
 
-        Settings that are missing get their defaults, and "none" is read as None. In earlier
-        versions the policy's "force_limits" had the name "windows", which is read, too. No class is
-        imported. Raises SettingError, which names `where`, for text that is not TOML, an unknown
-        key or a value out of range.
+        Settings that are missing get their defaults, and "none" is read as None. The policy's
+        "windows", the name in earlier versions, is read as "force_limits". No class is imported, so
+        an unknown reducer is not noticed here. Raises SettingError, which names `where`, for text
+        that is not TOML, an unknown key or a value out of range.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
@@ -246,9 +246,10 @@ class Recipe:
     ) -> Recipe:
         """Parse ``settings["recipe"]`` of a store's settings, and return the recipe.
 
-        No class that it names is imported. Raises StoreError if `radius` or `retrain_every` is
-        missing and a user's class would have to be imported for its default: the store is damaged.
-        Raises SettingError for a text that is no recipe.
+        No class that the recipe names is imported. The defaults of `radius` and `retrain_every`
+        stand in the reducer's class. If either setting is missing and the reducer is a user's
+        class, StoreError is raised, because the store is damaged. Raises SettingError for a text
+        that is no recipe.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
@@ -262,11 +263,11 @@ class Recipe:
     def to_toml(self) -> str:
         """Return the recipe as TOML, in which None is written as "none".
 
-        `radius` and `retrain_every` are written as values also where the reducer's class gives
-        them; it is imported for that. Of a named reducer only the `params` given are written, not
-        its defaults. A reducer object is written as `module:Class` and its parameters. If these are
-        no plain values, for example in a pipeline, it is written as "object Class", and the object
-        must be handed in again.
+        If `radius` or `retrain_every` is None, the reducer's class is imported, and its default is
+        written. Of a reducer given by name the recipe's `params` are written, and no defaults. A
+        reducer object is written as `module:Class` and its parameters. If a parameter is no plain
+        value, like the steps of a pipeline, or the class cannot be imported by name, the object is
+        written as "object Class", and the user must hand it in again.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
@@ -288,9 +289,9 @@ class Recipe:
     def make_reducer(self, seed: int) -> Any:
         """Return the reducer: the object itself if one was given, or a new one, made by name.
 
-        Its class is imported. A new reducer gets the seed as `random_state`, and `folds`, if it has
-        these parameters. The recipe's `params` come last and replace them. Raises SettingError if
-        there is no such reducer, or it does not take these `params`.
+        A named reducer's class is imported. It gets the seed as `random_state`, and `folds`, if it
+        has these parameters; the recipe's `params` take precedence over both. Raises SettingError
+        if there is no such reducer, or if it does not take these `params`.
         """
         if not isinstance(self.reducer, str):
             return self.reducer
@@ -315,7 +316,7 @@ def _check_keys(table: Table, record_type: Any, where: str) -> None:
 
 
 def _read_text(path: Path) -> str | None:
-    """Return the text of a recipe's file, None if there is no such file, or it is a folder.
+    """Return the text of a recipe's file; None if it does not exist or is no regular file.
 
     Raises SettingError if it is larger than 1 MB, is not UTF-8 or cannot be read.
     """
@@ -336,9 +337,9 @@ def _read_text(path: Path) -> str | None:
 def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
     """Return a reducer as TOML can describe it: a name, and parameters with plain values.
 
-    A name is returned with the `params` given. An object gives its `module:Class` and its own
-    parameters without those that are None; or "object Class" and no parameters, where these are not
-    plain, or its class is local or stands in `__main__`.
+    A name is returned unchanged, with `params`. Of an object the result is its `module:Class` and
+    its own parameters, without those that are None. It is "object Class" and no parameters if a
+    parameter is no plain value, or if the class is local or defined in `__main__`.
     """
     if isinstance(reducer, str):
         return reducer, params
@@ -358,8 +359,8 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
 def describe_estimator(estimator: Any) -> str:
     """Return an estimator as text: its class and all parameters, also nested ones, sorted by name.
 
-    The text is the same in every process, because a value that is not plain is named by its class
-    alone.
+    Of a value that is not plain only the class is named, so that the text is the same in every
+    process.
     """
     params = estimator.get_params(deep=True)
     values = (

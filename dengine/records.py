@@ -188,9 +188,10 @@ class TraceSpec:
         return self.columns or tuple(f"channel {i}" for i in range(self.channels))
 
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
-        """Return a copy that takes the rate, units and columns that it lacks from another contract.
+        """Return a copy whose unknown rate, units and columns are taken from another `TraceSpec`.
 
-        Returns this contract unchanged if `other` is None or has another shape.
+        What this `TraceSpec` states is kept. It is returned unchanged if `other` is None or has
+        another number of samples or channels.
         """
         if other is None or (self.samples, self.channels) != (other.samples, other.channels):
             return self
@@ -205,7 +206,7 @@ class TraceSpec:
 def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
     """Parse the `TraceSpec` among the settings of a store, which are texts by name.
 
-    Returns None if the store has none, as before its first trace. Raises StoreError if it is
+    Returns None if there is none, like before the first trace. Raises StoreError if its text is
     damaged.
     """
     if "trace" not in settings:
@@ -278,7 +279,7 @@ class Decision:
         return self.propensity if self.action is Action.VERIFY else 0.0
 
 
-TRAINED = "accepted"  # begins the reason of a version that was trained and answers
+TRAINED = "accepted"  # begins the reason of a version that was trained and put in force
 REPEATS = "traces nearly repeat another"  # in a note of a retrain's reason
 REPEATS_MEANING = (
     "If parts come twice, under two numbers or none, a label counts as two independent trials, and "
@@ -289,12 +290,12 @@ REPEATS_MEANING = (
 
 @dataclass(frozen=True, slots=True)
 class RetrainReport:
-    """One retrain, from taking the data to the new version answering.
+    """One retrain, from taking the data to the candidate being put in force or dropped.
 
     Parameters
     ----------
     version : int
-        Version of the model that decides afterwards.
+        Number of the version in force afterwards.
     seconds : float
         Wall time from taking the data until that version decides, without the time to store it.
     n_traces : int
@@ -380,9 +381,9 @@ def as_success(value: Any, owner: str = "") -> bool:
 
 
 def as_outcome(value: Any, owner: str = "") -> Outcome:
-    """Convert an `Outcome`, or its text as in "stopped", to an `Outcome`.
+    """Convert an `Outcome`, or its text such as "stopped", to an `Outcome`.
 
-    Raises ReportError for any other value, also for True and None; `owner` says in its message
+    Raises ReportError for any other value, also for True and None. `owner` says in its message
     whose outcome it is.
     """
     whose = f" of {owner}," if owner else ""

@@ -10,12 +10,12 @@ from .errors import without_password
 
 
 def to_jsonable(value: Any) -> Any:
-    """Return a value as `json` takes it, without the passwords of database URLs.
+    """Return a value as `json` takes it, with the passwords of database URLs masked.
 
-    Dataclasses become objects, arrays lists, paths, keys and other objects text, NaN and infinities
-    None. A dataclass field with "flat" in its metadata gives its own fields in its place; one with
-    "apart" is left out, as large arrays are. Nothing is raised for an unknown type: it is written
-    as `str` gives it.
+    Dataclasses and mappings become dicts with text keys, arrays and tuples become lists, and NaN
+    and infinities become None. Any other object becomes the text that `str` gives; no type raises.
+    A dataclass field whose `metadata` has "apart" is left out (large arrays have it). If it has
+    "flat", the fields of its value stand in its place.
     """
     # Floats first: a server's responses consist mostly of them.
     if isinstance(value, float):

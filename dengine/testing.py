@@ -48,7 +48,8 @@ def toy_traces(
 ) -> tuple[Floats, Ints]:
     """Make traces of two shapes with noise, and their labels.
 
-    The force of a success rises late, when the part bottoms; that of a failure early, at the rim.
+    The force of a success rises late, when the part reaches the bottom of the hole. The force of a
+    failure rises early, at the edge of the hole.
 
     Parameters
     ----------
@@ -84,9 +85,10 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     """Assert that `embed`, `transform` and `embed_references` of a trained clone fit together.
 
     `reducer` must be a scikit-learn estimator. `embed` must return finite float32 of shape
-    (n, K, d), the same from two trained clones, with K of 2 or more if labels are used; `transform`
-    must return (n, d); `embed_references` must return of each row of `embed` the space of its fold.
-    The caller's traces must not be written to. `reducer` may be unfitted and stays unchanged.
+    (n, K, d), equal for two clones with the same training, with K of 2 or more if labels are used.
+    `transform` must return shape (n, d). `embed_references` must return, for trace i with fold k,
+    the point `embed(X)[i, k]`. The caller's traces must not be written to. `reducer` may be
+    unfitted and stays unchanged.
     """
     is_estimator = isinstance(reducer, BaseEstimator)
     assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -111,11 +113,11 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
 
 
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
-    """Assert honest counting: the labels of fold k change no bit of space k, its k-th embedding.
+    """Assert honest counting: the labels of fold k do not influence embedding space k.
 
-    For each k a clone is trained twice in a row with the labels of fold k flipped and shuffled; the
-    embeddings of new traces in space k must equal those with the true labels. `reducer` may be
-    unfitted and stays unchanged.
+    For each k a clone is trained, twice in a row, with the labels of fold k flipped and shuffled.
+    It must map new traces to the same points of space k, bit for bit, as a clone that was trained
+    with the true labels. `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
     trained = _train_clone(reducer, times=2)
@@ -133,10 +135,9 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
 def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     """Assert that a reducer whose `fit` needs labels has `uses_labels = True`.
 
-    For a transformer that is no `Reducer`, its tag `target_tags.required` must be True. Otherwise
-    an engine passes no labels, and every retrain would fail. A clone is trained on test traces: an
-    error of its `fit` that is not due to missing labels is raised as it is, and `reducer` stays
-    unchanged.
+    A transformer that is no `Reducer` must have the tag `target_tags.required` instead. Otherwise
+    an engine would pass no labels, and every retrain would fail. A clone is trained on test traces,
+    so `reducer` stays unchanged. An error that is not due to missing labels is raised as it is.
     """
     X, y = toy_traces()
     try:
@@ -166,10 +167,10 @@ def fit_starts_afresh(reducer: Any) -> None:
 
 
 def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
-    """Assert that a trace embedded alone, as in a cell, lies where it lies in a batch.
+    """Assert that a trace is mapped to the same point alone, as in a cell, and in a batch.
 
-    A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged. The two
-    points may differ by a ten-thousandth of the embedding's root mean square radius.
+    The two points may differ by a ten-thousandth of the embedding's root mean square radius. A
+    clone is trained on test traces, so `reducer` may be unfitted and stays unchanged.
     """
     trained = _train_clone(reducer)
     together = trained.embed(QUERIES)
@@ -184,9 +185,8 @@ def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
 def any_length_and_several_channels_work(reducer: Any) -> None:
     """Assert that traces of other lengths, and of three channels, can be trained on and embedded.
 
-    `train` must return a point for each trace, and all points must be finite.
-    For each shape a clone is trained on test traces, so `reducer` may be unfitted and stays
-    unchanged.
+    `train` must return a point for each trace, and all points must be finite. For each shape a
+    clone is trained on test traces, so `reducer` may be unfitted and stays unchanged.
     """
     for channels, samples in SHAPES:
         X, y = toy_traces(70, samples, channels)
@@ -201,8 +201,8 @@ def any_length_and_several_channels_work(reducer: Any) -> None:
 def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
     """Assert that `fit` and `transform` raise ValueError for a trace with a NaN.
 
-    Clones are called, the second after a training on test traces, so `reducer` may be unfitted and
-    stays unchanged.
+    `fit` is called on an unfitted clone, `transform` on a clone that was trained on test traces, so
+    `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
     X[3, 0, 7] = np.nan
@@ -219,8 +219,9 @@ def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
 def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
     """Assert that its `module()` compiles to TorchScript and embeds as `embed` does, within 1e-4.
 
-    A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged. Passes if
-    the clone has no module, None. If it does not compile, TorchScript's own error is raised.
+    The check passes if `module()` returns None. If the module does not compile, TorchScript's own
+    error is raised. A clone is trained on test traces, so `reducer` may be unfitted and stays
+    unchanged.
     """
     trained = _train_clone(reducer)
     module = trained.module()
@@ -231,11 +232,11 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
 
 
 def a_version_answers_as_it_was_trained(reducer: Any) -> None:
-    """Assert what an engine requires of a version: restored and compiled, it embeds as it does.
+    """Assert what an engine requires of a version: restored or compiled, it embeds as when trained.
 
-    Two models are trained on test traces, the second with other labels. So the compiled module of
-    the second is a copy of the first's, with other tensors, as in an engine. `reducer` may be
-    unfitted and stays unchanged.
+    Two models are trained on test traces, the second with opposite labels. The compiled module of
+    the second is then a copy of the first's with other tensors, like after a retrain of an engine.
+    `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
     for labels in (y, 1 - y):
@@ -247,8 +248,8 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
 def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
     """Assert that its state holds plain arrays, and that a clone restored from it embeds the same.
 
-    A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged. Passes if
-    the clone has no state, None.
+    The check passes if `get_state()` returns None. A clone is trained on test traces, so `reducer`
+    may be unfitted and stays unchanged.
     """
     trained = _train_clone(reducer)
     state = trained.get_state()
@@ -300,7 +301,7 @@ def check_reducer(reducer: Any) -> None:
     Parameters
     ----------
     reducer : Reducer, or another scikit-learn transformer
-        It is not fitted itself.
+        May be unfitted; it stays unchanged.
 
     Raises
     ------
@@ -324,9 +325,10 @@ def check_reducer(reducer: Any) -> None:
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:
     """Return a clone of a reducer, trained `times` times in a row on the toy traces.
 
-    It is trained as in an engine, with folds by the traces' content, as many as it has spaces: 2 if
-    it is cross-fitted from outside. Each training takes at most 8 optimiser steps. `reducer` stays
-    unchanged. `labels` (100,) replace those of the toy traces; None keeps them.
+    It is trained like in an engine: the fold of a trace follows from its content. There are as many
+    folds as embedding spaces; there are 2 if `as_reducer` cross-fits the reducer. Each training
+    takes at most 8 optimiser steps. `reducer` stays unchanged. `labels`, shape (100,), replace
+    those of the toy traces; None keeps them.
     """
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)

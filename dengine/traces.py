@@ -42,7 +42,7 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
     Returns
     -------
     array of float32, shape (C, T)
-        Contiguous and writeable; the trace itself if it is that already.
+        Contiguous and writeable. It shares its memory with `trace` if that is such an array.
 
     Raises
     ------
@@ -117,17 +117,17 @@ def as_labels(y: ArrayLike) -> NDArray[np.int64]:
 def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     """Fit traces of another length to a number of samples.
 
-    Scripted into exported files as it stands here.
+    The function is compiled by TorchScript into exported files.
 
     Parameters
     ----------
     x : Tensor of float32, shape (..., T)
     samples : int
-        The length to return; `can_fit_length` must be True.
+        The length to return; the caller has checked with `can_fit_length` that it is possible.
     fit : int
         Position in `FITS` of "cut", "pad" or "resample". The first two keep each sample's time from
-        the start: both drop what is too much at the end, and pad repeats the last sample. resample
-        stretches the whole trace by linear interpolation.
+        the start: both drop the end of a longer trace, and "pad" repeats the last sample of a
+        shorter one. "resample" interpolates the whole trace linearly.
 
     Returns
     -------
@@ -146,8 +146,8 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
 def can_fit_length(length: int, samples: int, fit: int) -> bool:
     """Return whether a trace of `length` samples can be fitted to `samples` without making up data.
 
-    `fit` is a position in `FITS`. "strict" takes the same length alone, "cut" that or a longer one,
-    "pad" and "resample" from half to twice the length.
+    `fit` is a position in `FITS`: "strict" allows only the same length, "cut" the same or a greater
+    length, "pad" and "resample" allow half to twice the length.
     """
     if fit == 0:
         return length == samples
@@ -159,7 +159,7 @@ def can_fit_length(length: int, samples: int, fit: int) -> bool:
 def _as_real(values: ArrayLike) -> TraceArray:
     """Convert numbers or booleans to a float32 array; one that is float32 already is not copied.
 
-    What float32 cannot hold becomes an infinity. Raises TraceError for values that are no real
+    A value too large for float32 becomes an infinity. Raises TraceError for values that are no real
     numbers and for rows of different lengths.
     """
     try:
@@ -217,9 +217,9 @@ def clip_extremes(traces: TraceArray) -> TraceArray:
     Returns
     -------
     array of float32, shape (n, C, T)
-        The same array if nothing was clipped. Each channel has a limit of its own: a power of four,
-        at least 64 times the size that nine in ten traces keep, and at most 1e15, whose squares
-        float32 can sum.
+        The same array if nothing was clipped. Each channel has its own limit: the least power of
+        four that is at least 64 times the peak which nine in ten traces do not exceed, but at most
+        1e15, so that float32 can sum squares. If that peak is 0, the limit is 1e15.
     """
     if not len(traces):
         return traces
@@ -271,8 +271,7 @@ class TraceGate(nn.Module):
         Returns
         -------
         reason : int
-            Position in `REASONS` of the first fault found: not finite, constant, saturated or too
-            large; 0 if there is none.
+            Position in `REASONS` of the first fault found (see `check`); 0 if there is none.
         content_hash : int
             As `folds.content_hash`; also of a faulty trace.
         """
@@ -286,13 +285,14 @@ class TraceGate(nn.Module):
         ----------
         x : Tensor of float32, shape (C, T)
         limit : float
-            In place of `trace_spec.limit`; infinity checks none.
+            Used in place of `trace_spec.limit`; infinity: no range is checked.
 
         Returns
         -------
         reason : int
-            Position in `REASONS` of the first fault found: not finite, constant, saturated (a
-            sample as large as `limit`) or too large; 0 if there is none.
+            Position in `REASONS` of the first fault found: not finite, constant (all samples of all
+            channels are equal), saturated (a sample at or beyond ±`limit`) or too large (beyond
+            1e18); 0 if there is none.
         content_hash : int
             As `folds.content_hash`; also of a faulty trace.
         """
@@ -319,8 +319,8 @@ class TraceGate(nn.Module):
 def check_rate(force_limits: Sequence[ForceLimits], trace_spec: TraceSpec | None) -> None:
     """Raise SettingError if a force limit is in seconds and the rate of the traces is unknown.
 
-    It is unknown without a contract (`trace_spec` None), too: the first trace does not tell its
-    rate. A limit along a channel needs no rate.
+    If `trace_spec` is None, the rate is unknown, too: the `TraceSpec` will be inferred from the
+    first trace, which does not tell its rate. A limit along a channel needs no rate.
     """
     in_seconds = [limits for limits in force_limits if limits.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
@@ -387,10 +387,10 @@ class ForceLimitsGate(nn.Module):
     def forward(self, x: Tensor) -> int:
         """Check a trace (C, T) of float32.
 
-        Returns WITHIN_LIMITS if it keeps all limits, or there are none; else the `ActionCode`:
-        REJECT if it leaves a limit that rejects, otherwise VERIFY. A trace without a sample in the
-        stretch of a limit leaves it. A NaN among the values leaves no limit; a NaN as the position
-        along a path lies in no stretch.
+        Returns WITHIN_LIMITS (-1) if it keeps all limits, or if there are none; else the
+        `ActionCode`: REJECT if it leaves a limit with `reject`, otherwise VERIFY. A trace that has
+        no sample in the stretch of a limit leaves it. A value that is NaN leaves no limit; a sample
+        whose position (the value of the channel `along`) is NaN lies in no stretch.
         """
         if self.limits.size(0) == 0:
             return self.within
@@ -405,7 +405,8 @@ class ForceLimitsGate(nn.Module):
 def infer_trace_spec(x: TraceArray) -> tuple[TraceSpec, bool]:
     """Infer the `TraceSpec` of all traces from the shape of the first one.
 
-    All else has the defaults of `TraceSpec`; rate and unit are unknown.
+    Only samples and channels are taken from the trace. All other fields have the defaults of
+    `TraceSpec`, so that rate and unit are unknown.
 
     Parameters
     ----------

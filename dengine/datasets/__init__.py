@@ -1,4 +1,4 @@
-"""Read labelled traces: recordings by a description, and what is ours without one.
+"""Read labelled traces: recordings by a description, files of dengine without one.
 
     description = describe("cell_3/")  # proposes what the recordings are
     description.save("cell_3/recordings.toml")

@@ -1,7 +1,7 @@
 """Checks on a description before anything is read, and on the recordings that were read.
 
-Equal samples under two labels are a fault, and so is each repeat; `tolerance_note` compares a
-policy with the share of bad parts.
+Recordings with equal samples and different labels are faults, and so is each repeat of a recording.
+`tolerance_note` compares the tolerance of a policy with the share of bad parts.
 """
 
 from collections import defaultdict
@@ -30,9 +30,11 @@ __all__ = [
 def check_description(description: Description) -> None:
     """Raise DataError unless recordings can be read by a description; no file is looked at.
 
-    No key may be `?`. The zone must be known, the samples of a trace stated, the rate, if it is
-    stated, between 1 Hz and 1 MHz, and the limit the same for all channels. An order by time needs
-    a clock, and each column of the clock a format. The text form must pass `check_text`.
+    The value of no key may be `?`. The time zone must be known, and the number of samples of a
+    trace stated. A rate that is stated must be between 1 Hz and 1 MHz. All channels must have the
+    same `limit`, the range of the sensor. If the recordings are ordered by time, the description
+    must name a column of times, and each such column needs a format. The form of the text files
+    must pass `check_text`.
     """
     clock = description.time
     if open_keys := description.open_keys:
@@ -55,10 +57,10 @@ def check_description(description: Description) -> None:
 
 
 def check_text(text: TextForm) -> None:
-    """Raise DataError unless text files can be read by a form.
+    """Raise DataError unless text files can be read with the settings in `[text]`.
 
-    Python must know its encoding, its delimiter and decimal mark must be one character each, and
-    its samples must begin in line 1 or later.
+    Python must know the encoding. The delimiter and the decimal mark must be one character each.
+    The samples must begin in line 1 or later.
     """
     with instead(DataError, "Expected an encoding in text.encoding", LookupError):
         "".encode(text.encoding)  # also refuses codecs that are of no text
@@ -73,12 +75,12 @@ def check_text(text: TextForm) -> None:
 
 
 def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Fault]]:
-    """Return the recordings without repeats of others, and the faults of those left out.
+    """Return the recordings without repeated traces, and a fault for each recording left out.
 
-    Traces (C, T), all of one shape, are equal if they have one `content_hash`, so up to 1/65,536 of
-    their unit. Of equal traces with one label the first is kept; if their labels differ, none is.
-    Traces without two different finite samples are kept, since a dead sensor gives the same
-    whatever the part.
+    The traces (C, T) all have one shape. Two traces are equal if they have the same `content_hash`,
+    which rounds samples to 1/65,536 of their unit. Of equal traces with one label the first is
+    kept; if their labels differ, none is kept. A trace whose finite samples are all the same is
+    always kept: a dead sensor gives it for any part.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []
@@ -108,9 +110,10 @@ def lost_note(recordings: Sequence[Recording]) -> str:
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:
-    """Return why a policy's tolerance says nothing about these parts; "" if it does.
+    """Return a note if the tolerance of a policy is too wide for these parts; "" if it is not.
 
-    So it is if at most so many parts are bad as the policy tolerates among the accepted ones.
+    The tolerance, 1 - `lower_bound`, is the share of accepted parts that may be bad. It is too wide
+    if the share of bad parts in the data set is not above it: accepting every part would meet it.
     """
     share = 1 - float(data.y.mean())
     tolerance = 1 - lower_bound

@@ -1,6 +1,6 @@
 """`Dataset`, labelled traces of one shape in memory, and `make_dataset`, which makes one of arrays.
 
-What is wrong with a recording that is left out is a `Fault`.
+A `Fault` says why a recording was left out.
 """
 
 from collections.abc import Callable, Mapping
@@ -42,13 +42,13 @@ class Fault:
     """Why a recording was left out.
 
     source : str
-        The file, seen from the folder, with the row or part if it has several.
+        The file, as seen from the folder, with the row or part if the file has several.
     line : int
-        In the file, from 1; 0 for the whole.
+        Line of the file, from 1; 0 if the fault is not of one line.
     message : str
         What was expected, and what came.
     column : str
-        Of the table; "" for none.
+        Column of the table; "" if the fault is not of one column.
     """
 
     source: str
@@ -184,11 +184,11 @@ class Dataset:
         )
 
     def cut(self, samples: int) -> "Dataset":
-        """Return a data set of the first `samples` samples of every trace, to decide earlier.
+        """Return a data set with only the first `samples` samples of each trace, to decide earlier.
 
-        Its `fit` is "cut" if it was "pad" and the traces became shorter. Raises DataError if the
-        traces are shorter, or were resampled, so that their first samples are not the first of the
-        recordings.
+        If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result. Raises
+        DataError if the traces are shorter than `samples`, or if they were resampled and would
+        become shorter: their first samples are not those of the recordings.
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1
@@ -216,7 +216,7 @@ def make_dataset(
     y : array, shape (n,)
         1 for success, 0 for failure.
     rate_hz, channels, part, cause
-        As in `Dataset`; part's numbers may be integers.
+        As in `Dataset`; part numbers may be integers.
     **about
         Other fields of `Dataset`, which are not checked.
 
@@ -224,12 +224,12 @@ def make_dataset(
     -------
     Dataset
         Its X has the shape (n, T) if there is one channel, and may share its memory with the given
-        one.
+        X.
 
     Raises
     ------
     DataError
-        If they do not fit together, there is no trace, a label is neither 1 nor 0, X has more
+        If the arrays do not fit together, there is no trace, a label is neither 1 nor 0, X has more
         channels than samples, or the rate is not between 1 Hz and 1 MHz.
     """
     try:

@@ -225,11 +225,12 @@ class TraceForm:
     """The traces that come out: `[traces]`.
 
     samples
-        Samples of each trace.
+        Number of samples of each trace.
     lengths
-        What happens to a recording of another length. `strict`: it is a fault. `cut`: it loses its
-        end. `pad`: like `cut`, or its last sample is repeated, up to twice its length. `pad-all`:
-        like `pad`, at any length. `resample`: it is interpolated.
+        What happens to a recording of another length. `strict`: it is a fault. `cut`: a longer one
+        loses its end. `pad`: like `cut`, and a shorter one repeats its last sample; a recording
+        of less than half or more than twice the samples is a fault. `pad-all`: like `pad`, at any
+        length. `resample`: it is interpolated.
     """
 
     samples: int = 0
@@ -238,10 +239,10 @@ class TraceForm:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What the author of the description saw: `[seen]`. Fewer recordings are noted later.
+    """What the author of the description saw: `[seen]`. A note says if there are fewer now.
 
     recordings
-        Recordings that were read.
+        Recordings that were found.
     good
         Good parts among them.
     bad
@@ -298,10 +299,10 @@ class Description:
 
     @classmethod
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
-        """Return the description that nested dicts of TOML's types state; `?` passes for any value.
+        """Return the description that nested dicts state, as a TOML file has them.
 
-        Raises DataError for a key that does not exist (the message names the most similar key), for
-        a value of the wrong type, and for a newer version of this form.
+        Every value may be `?`. Raises DataError for an unknown key (the message names the most
+        similar key), for a value of the wrong type, and for a description of a newer version.
 
         where : what the description is called in errors.
         """
@@ -349,9 +350,9 @@ class Description:
         return write_output(path, self.to_toml().encode(), force)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return nested dicts of TOML's types, without the notes and without what has its default.
+        """Return nested dicts of TOML's types, without the notes and without default values.
 
-        Channels are always there: `?` is a key of theirs if there is none.
+        The channels are always there; if there are none, `?` stands for them.
         """
         channels = self.channels or {UNKNOWN: Channel()}
         tables = {column: {"unit": c.unit, **_plain(c)} for column, c in channels.items()}
@@ -370,12 +371,12 @@ class Description:
         return "\n".join(lines) + "\n"
 
     def _lines(self, prefix: str, table: Stated) -> list[str]:
-        """Return the lines of one table of the file: its keys, each below the note on it.
+        """Return the lines of one table of the TOML file; the note on a key stands above it.
 
-        Notes on keys that the table does not state come first.
+        Notes on keys that the table does not have come first.
 
-        prefix : what the names of its keys begin with in `notes`, like `label.`; "" for the keys on
-        top.
+        prefix : the section with a dot, like `label.`, with which the keys of its notes begin; ""
+        for keys outside of all sections.
         """
         notes = {
             key.removeprefix(prefix): "".join(c if c.isprintable() else " " for c in note)
@@ -395,10 +396,10 @@ class Description:
 
     @property
     def open_keys(self) -> Words:
-        """The keys whose value is still `?`, like `label.column`; `channels` if there is none.
+        """The keys whose value is still `?`, like `label.column`; also `channels` if there is none.
 
-        Not among them is a `?` in `[ignored]`, or in `[[check]]`: there, `?` is a word that no
-        recording has, so it makes no label, and recordings with other words become faults.
+        A `?` in `[ignored]` or `[[check]]` is not counted. In `[[check]]` it is a word that no
+        recording has, and recordings with other words become faults.
         """
         values = self.to_dict()
         values.pop("ignored", None)
@@ -406,11 +407,11 @@ class Description:
         return (*_open_keys(values), *open_channels)
 
     def with_values(self, stated: Stated) -> "Description":
-        """Return a description in which keys, like `label.column`, have other values.
+        """Return a description in which the given keys, like `label.column`, have these values.
 
-        Stating one source of labels, or of parts, clears the other sources of the same section, but
-        not its words. A channel that is stated replaces `?`. The notes stay. Raises DataError like
-        `from_dict`.
+        Stating one source of labels, or of parts, clears the other sources in its section, but not
+        the words for good and bad. Stating a channel replaces the channel `?`. The notes stay.
+        Raises DataError like `from_dict`.
         """
         values = self.to_dict()
         for section, sources in SOURCES.items():
@@ -429,10 +430,10 @@ class Description:
         return replace(Description.from_dict(values), notes=self.notes)
 
     def with_channels(self, columns: Sequence[str]) -> "Description":
-        """Return the description with exactly these columns as its channels, in this order.
+        """Return the description with exactly these columns as channels, in this order.
 
-        Each must be one of its channels, or a column that it ignores, which gets the unit stated
-        there. Raises DataError for another column.
+        Each must be in `[channels]`, or in `[ignored]`, which gives its unit. Raises DataError for
+        any other column.
         """
         channels = {column: Channel(unit) for column, unit in self.ignored.items()}
         channels |= self.channels
@@ -472,10 +473,10 @@ KINDS: dict[Any, str] = {
 
 
 def _made(kind: Any, value: Any, where: str) -> Any:
-    """Return what TOML states as a dataclass, or in the type of its key.
+    """Return a value of a TOML file as the dataclass, tuple or other type that its key has.
 
-    Where several values are expected, a single one stands for a list of one. Raises DataError for
-    an unknown key or choice, and for a value of another type.
+    A single value becomes a tuple where several are expected. Raises DataError for an unknown key
+    or choice, and for a value of another type.
     """
     origin = get_origin(kind)
     args = get_args(kind)
@@ -499,9 +500,9 @@ def _made(kind: Any, value: Any, where: str) -> Any:
 
 
 def _as_kind(kind: Any, value: Any, where: str) -> Any:
-    """Return a value in the type of its key; `?` passes for every key.
+    """Return a value in the type of its key; `?` is returned as it is.
 
-    A number becomes a text where one is expected. Raises DataError for a value of another type, and
+    A number becomes a text if a text is expected. Raises DataError for a value of another type and
     for a number that is not finite.
     """
     if value == UNKNOWN:
@@ -523,7 +524,7 @@ def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return dataclasses, and what they hold, in TOML's types, without fields of their defaults."""
+    """Return a value in TOML's types; a dataclass becomes a dict without its default values."""
     if isinstance(value, str | int | float):
         return value
     if isinstance(value, tuple):
@@ -536,7 +537,7 @@ def _plain(value: Any) -> Any:
 
 
 def _open_keys(values: Stated, prefix: str = "") -> Iterator[str]:
-    """Yield each key of nested dicts, like `label.column`, that is `?` or has it in its list."""
+    """Yield each key of nested dicts, like `label.column`, that is `?` or a list that has `?`."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _open_keys(value, f"{prefix}{name}.")

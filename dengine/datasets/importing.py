@@ -51,12 +51,11 @@ RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestam
 
 
 def in_form_of(store: "StoreLike", description: Description) -> Description:
-    """Return a description by which recordings get the form of the traces in a store.
+    """Return a description with the trace length of a store, for recordings to be imported into it.
 
-    The form is their number of samples, and their fit unless that is strict; recordings that came
-    out in another length would all count again. The description is returned as it is for a store
-    that is new, has no traces yet or cannot be opened. The store is read, and closed if it was
-    given by its address.
+    It also gets the store's `fit` unless that is "strict". Traces of another length would have
+    other hashes, so known ones would be imported again. The description is returned as it is if the
+    store is new, cannot be opened, or has no `TraceSpec` yet. A store object stays open.
     """
     try:
         with opening(store, must_exist=True) as opened:
@@ -74,9 +73,9 @@ def in_form_of(store: "StoreLike", description: Description) -> Description:
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """Raise TraceError if a data set does not agree with the `TraceSpec` of a store.
 
-    Its rate must be the same within 2 %, and its channels the same in the same order, where both
-    are known. Recordings that were brought to one length must have the store's length, and be
-    resampled if and only if the store's traces are.
+    If both rates are known, they must be the same within 2 %; if both have channel names, these
+    must be the same in the same order. Traces that were read by a description (`lengths` is set)
+    must have the store's number of samples, and be resampled if and only if the store's traces are.
     """
     spec = data.spec
     fits = {spec.fit, trace_spec.fit}
@@ -96,24 +95,24 @@ def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ImportReport:
-    """How many labels of a data set, or of a cell's journal, an import took.
+    """How many labels of a data set, or of a cell's journal, an import stored.
 
     Parameters
     ----------
     imported : int
-        Labels that train.
+        Labels that were stored and train.
     quarantined : int
         Labels of traces with a fault, which are stored but never train.
     repeated : int
-        Labels that an earlier import took.
+        Labels that the store had already.
     resumed : bool
         Whether the store existed before.
     cut : int
-        Bytes of a journal's last line that was not finished, and was left out.
+        Bytes of a journal's unfinished last line, which were left out.
     contradicted : int
-        Labels that contradict those of an earlier import, and were left out.
+        Labels that contradict the stored label of their part, and were left out.
     set_aside : str
-        What of a journal was set aside, in a sentence; "" if nothing was.
+        A sentence on what of a journal was set aside; "" if nothing was.
     """
 
     imported: int
@@ -135,15 +134,16 @@ def import_labelled(
 ) -> ImportReport:
     """Put every labelled trace of a data set into a store, in order; nothing is trained.
 
-    They are stored in chunks, each as a whole: an import that was interrupted continues where it
-    stopped. The same file twice counts no label twice.
+    The traces are stored in chunks, each in one transaction: if an import is interrupted, the same
+    call continues it. A trace that the store has from an earlier import is not stored again.
 
     Parameters
     ----------
     store : path, URL or store
         A new store, which is created, or a used one. A store object stays open.
     dataset : object
-        Anything `load_dataset` takes. Described recordings get the form of the store's traces.
+        Anything `load_dataset` takes. Recordings that a description describes are brought to the
+        length of the store's traces.
     recipe, seed : optional
         For the engine of a new store; by default recipe conv and seed 0. A used store has its own
         recipe and seed; other values raise SettingError.
@@ -194,31 +194,32 @@ def import_parts(
     policy: Policy,
     on_traces: Progress | None = None,
 ) -> ImportReport:
-    """Put parts with their decisions into a store, in chunks.
+    """Store parts with their decisions and labels, in chunks of 500.
 
-    Each chunk is one transaction; chunks before an error stay. With `stops="some"` each label holds
-    how many accepted parts went on without a report since the label before. A decision whose id has
-    a label in the store stays as it is, and its label here is counted as repeated or contradicted.
-    A trace with a fault is stored, with the fault as its decision's reason, but never trains.
+    Each chunk is one transaction; chunks before an error stay. If the store has a label for a
+    decision, nothing is changed: the new label is counted as repeated or contradicted. A trace with
+    a fault is stored but never trains, and its decision gets the fault as its reason. With
+    `stops="some"` each label also stores the number of accepted parts without a report since the
+    label before.
 
     Parameters
     ----------
     store : SqlStore
     parts : sequence of (Decision, array of float32 of shape (C, T), bool or None)
-        The decision, the trace and the label of each; None if nothing was heard of the part. A part
-        whose label came later has a second row.
+        The decision, the trace and the label of each part; None if there is no report. A part
+        whose label came later may stand in the sequence a second time, with the label.
     trace_spec : TraceSpec
         Of the traces.
     policy : Policy
-        Under which the decisions were made. Each stored decision gets its propensity from it;
-        `Decision.propensity` is not read.
+        The policy under which the decisions were made. Each stored decision gets its propensity
+        from it; `Decision.propensity` is not read.
     on_traces : callable, optional
         Called with the number of parts of each chunk.
 
     Returns
     -------
     ImportReport
-        It counts labels; `resumed` is True.
+        It counts labels, not parts; `resumed` is True.
     """
     gate = TraceGate(trace_spec)
     counts: dict[str, Any] = dict.fromkeys(
@@ -257,9 +258,10 @@ def import_parts(
 
 
 def _count_unreported(store: "SqlStore", policy: Policy) -> int:
-    """Return how many parts that this policy accepted have no label, and are in no label's count.
+    """Return the number of unreported accepted parts that no label has counted yet.
 
-    With `stops="all"` there is none: the next decision confirms them.
+    It starts when the policy last changed. With `stops="all"` it is 0, since the next decision
+    confirms an accepted part.
     """
     if policy.stops != "some":
         return 0
@@ -284,9 +286,10 @@ def _as_stored(
 
 
 def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:
-    """Yield for each trace, of shape (n, C, T), the decision to verify it without a model.
+    """Yield for each trace of shape (C, T) a decision to verify it, made without a model.
 
-    Its id is made of the trace's content; equal traces of one data set have different ids.
+    The decision's id comes from the content of the trace; equal traces get different ids by a
+    counter.
     """
     n_equal = Counter[int]()
     parts = [None] * len(data) if data.part is None else data.part.tolist()

@@ -1,4 +1,4 @@
-"""`load_dataset`, which reads what is ours as it is, and everything else by a description."""
+"""`load_dataset`, which reads formats of dengine as they are, other recordings by a description."""
 
 import json
 import os
@@ -33,39 +33,43 @@ def load_dataset(
     samples: int | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
-    """Read a data set: a set of dengine's own form, or recordings exactly by a description.
+    """Read a data set: one in a format of dengine, or recordings with their description.
 
     Parameters
     ----------
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
-        A folder, file or DataFrame of recordings, which a description describes. Or a source that
-        needs no description: the name of a bundled set; a `Dataset`; arrays X (n, T) or (n, C, T)
-        and y (n,); an .npz file of ours with X, y, and perhaps scale, rate_hz, unit, cause,
-        channels and part; a Parquet file that `Dataset.to_frame` made; the SQLite file of a store,
-        for its labelled traces.
+        The name of a bundled set, or recordings that a description describes: a folder, a file or a
+        DataFrame. These need no description, and are read without one unless it is given or saved
+        beside the file: a `Dataset`; arrays X (n, T) or (n, C, T) and y (n,); an .npz file with X,
+        y, and perhaps scale, rate_hz, unit, cause (why a part failed), channels and part; a Parquet
+        file of a table that `Dataset.to_frame` made; the SQLite file of a store, of which the
+        labelled traces are read.
     description : Description, dict or path, optional
-        None: the one that was saved, `recordings.toml` in a folder, `FILE.toml` beside a file.
+        How the recordings are written. None: the description that was saved, as `recordings.toml`
+        in the folder or `FILE.toml` beside the file.
     channels : str or sequence of str, optional
-        The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description
-        names. None: all that it reads.
+        The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
+        the data set names. None: all channels.
     samples : int, optional
-        Number of samples to keep from the start of each trace. If the description has fewer, or
-        resamples, the recordings are read as if it stated this number. None: as the description
-        states.
+        Number of samples of each trace: the rest is cut off at the end. If the description states
+        fewer samples, or resamples the traces, this number replaces the one that it states. None:
+        as the description states, or as the data set is.
     progress : callable, optional
         Called with 1 after each file.
 
     Returns
     -------
     Dataset
-        A recording that does not follow the description is one of its `faults`. A sample that is
-        lost is NaN, which the engine finds. Its `spec` is that of live traces of the same shape.
+        A recording that does not follow the description is one of its `faults`. A lost sample is
+        NaN; the engine verifies such a trace. `spec` is the `TraceSpec` of live traces of this
+        shape.
 
     Raises
     ------
     DataError
-        If there is no description, or a value in it is open (the message says what to type); or if
-        no recording is left.
+        If the description is missing or has a key whose value is `?` (the message says what to
+        type), if the source or a channel does not exist, if no recording is left, if `samples` is
+        below 1, or if traces that were read without a description are shorter than `samples`.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     """
@@ -102,17 +106,17 @@ def description_of(
     ----------
     source : path or DataFrame
     description : Description, mapping or path, optional
-        None: the one that was saved.
+        None: the description that was saved in the folder or beside the file.
     stated : mapping, optional
-        Keys, like `label.column`, whose values replace those in a file, or are given to a proposal.
-        They are not used if `description` is a Description or a mapping.
+        Values of keys like `label.column`. They replace those in a description file, and a proposal
+        keeps them. Not used if `description` is a Description or a mapping.
     propose : bool
-        Whether one is proposed if none was saved; else that is a DataError.
+        Whether a description is proposed if none was saved; if not, DataError is raised.
 
     Raises
     ------
     DataError
-        If no description was saved (the message has what to type), none is given for a DataFrame,
+        If no description was saved (the message says what to type), none is given for a DataFrame,
         the source does not exist, or a description cannot be read or proposed.
     """
     if isinstance(description, Description):
@@ -144,7 +148,10 @@ def count_files(source: str, description: Description | None) -> int:
 
 
 def missing_text(path: Path, proposal: Description) -> str:
-    """Return the message for recordings without a description: what is open, and what to type."""
+    """Return the error message for recordings without a description.
+
+    It lists the open keys of a proposal, and has the commands that show and save it.
+    """
     notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
     questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())
     state = "".join(f" --set {key}=..." for key in notes)
@@ -156,7 +163,7 @@ def missing_text(path: Path, proposal: Description) -> str:
 
 
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
-    """Return what reads a source without a description; None for a source that needs one.
+    """Return a function that reads a source in a format of dengine; None if it needs a description.
 
     A file beside which a description was saved needs it, whatever it holds. Raises DataError for a
     source of an unknown type, and for a damaged .npz or Parquet file.
@@ -180,7 +187,7 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
 
 
 def _is_own_archive(path: Path) -> bool:
-    """Return whether a file is an archive with X, and labels y of 1 and 0.
+    """Return whether a file is an .npz archive with an array X, and labels y of 1 and 0.
 
     Raises DataError for an .npz file that is damaged.
     """
@@ -192,9 +199,9 @@ def _is_own_archive(path: Path) -> bool:
 
 
 def _is_own_table(path: Path) -> bool:
-    """Return whether a Parquet file was written of a table that `Dataset.to_frame` made.
+    """Return whether a file is a Parquet file of a table that `Dataset.to_frame` made.
 
-    Raises DataError for one that is damaged, or if pyarrow is not installed.
+    Raises DataError if a .parquet file is damaged or pyarrow is not installed.
     """
     if path.suffix.lower() != ".parquet":
         return False
@@ -213,7 +220,10 @@ def _read_own_table(path: Path) -> Dataset:
 
 
 def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
-    """Return the data set of a table that `Dataset.to_frame` made; DataError as `make_dataset`."""
+    """Return the data set of a table that `Dataset.to_frame` made.
+
+    Raises DataError if `make_dataset` refuses its arrays.
+    """
     about = frame.attrs[OWN]
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)
     X = frame.drop(columns=["label", *words]).to_numpy(np.float32)
@@ -235,7 +245,10 @@ def _read_npz(path: Path) -> Dataset:
 
 
 def _from_arrays(arrays: Stated, name: str) -> Dataset:
-    """Return the data set of arrays with the names of a `Dataset`; DataError as `make_dataset`."""
+    """Return the data set of arrays that are named like the fields of a `Dataset`.
+
+    Raises DataError if `make_dataset` refuses them.
+    """
     units, channels = (
         tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")
     )
@@ -257,9 +270,10 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
 def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
-    Quarantined and forgotten ones are left out. If a part came again, `part` is the hash by which
-    the store counts its traces as one. Raises DataError if the store contradicts its ledger, the
-    chain of hashes over its records, or has no labelled traces.
+    Quarantined and forgotten traces are left out. If several traces are of one part, `part` is the
+    hash by which the store counts them as one part; otherwise it is None. Raises DataError if the
+    store has no labelled traces, or if its rows contradict its ledger, the chain of hashes over
+    them.
     """
     from ..store.opening import opening
 

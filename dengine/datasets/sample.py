@@ -18,8 +18,8 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     """Write n insertions of the bundled set as CSV files, such as `insertion_0001_True.csv`.
 
     Each file has 960 to 1000 rows at 500 Hz, with the force in FZ_Base, the height in TCP_Z, and
-    the label in its name. One file is cut off in its last line. The same call writes the same
-    files.
+    the label in its name: True is good. The last line of one file is cut off. The same call always
+    writes the same files.
 
     Parameters
     ----------

@@ -26,8 +26,7 @@ MINUS = "−"
 class UnreadableError(DataError):
     """A file or a recording that does not follow the description.
 
-    line : of the file, 0 if it is the whole.
-    column : "" if it is none.
+    line : of the file; 0 if the error is not of one line. column : "" if it is not of one column.
     """
 
     def __init__(self, message: str, line: int = 0, column: str = "") -> None:
@@ -43,12 +42,12 @@ class Table:
     Parameters
     ----------
     source : str
-        What it is called in messages: the file, with the row or the part if it has several.
+        Name in messages: the file, with the row or the part if the file has several.
     columns : mapping of str to array, shape (rows,)
-        Numbers, times, or texts as objects. In a file of a single part a column of one cell holds
+        Numbers, times, or texts as objects. In a file of a single part a column with one cell holds
         for all rows.
     lines : sequence of int
-        Line of each row in the file, or the one line of all.
+        Line in the file of each row, or one line for all rows.
     units : mapping of str to str
         Units that the file states for its columns.
     above : sequence of str
@@ -56,12 +55,13 @@ class Table:
     header : int
         Line of the header; 0 for none.
     damage : sequence of UnreadableError
-        What is wrong with lines of another number of cells, whose rows have empty cells; or with a
-        part as a whole.
+        Errors of lines with a wrong number of cells, whose rows have empty cells; or of the part as
+        a whole.
     origin : mapping of str to sequence of str
-        The columns of the file that the cells of a column stood in, if they are others.
+        For a column that was put together from others: the column of the file for each cell.
     path : str
-        The path that names a part, as seen from the folder, or its column or window.
+        The path of the file that names the part, relative to the folder; or the name of its column
+        or window.
     """
 
     source: str
@@ -88,9 +88,9 @@ class Table:
         return self
 
     def take(self, rows: Any) -> "Table":
-        """Return a table of some rows: a slice, or an array of positions or booleans.
+        """Return a table of some rows, given by a slice or an array of positions or booleans.
 
-        Columns of one cell, which holds for all rows, stay as they are, and so does the damage.
+        A column of one cell holds for all rows and stays; so does `damage`.
         """
         lines = self.lines
         if len(lines) > 1:
@@ -112,10 +112,11 @@ class Table:
         return np.asarray(texts[codes])
 
     def numbers(self, name: str, form: TextForm) -> Floats:
-        """Return a column as numbers, shape (rows,); a missing one is NaN.
+        """Return a column as numbers, float64 (rows,); a missing number is NaN.
 
-        Raises UnreadableError if there is no such column, and for a cell that is no finite number
-        of this form, and no word for a missing one.
+        `form` says how numbers are written, and which words stand for a missing one. Raises
+        UnreadableError if there is no such column, and for any other cell: one that is no number
+        of this form, is infinite, or is too large for float32.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
@@ -128,7 +129,10 @@ class Table:
         return values
 
     def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:
-        """Raise UnreadableError for the first cell of a column that is bad, if one is."""
+        """Raise UnreadableError for the first row in which `is_bad` is True; if none is, return.
+
+        wanted : what was expected, for the message. name : the column.
+        """
         if is_bad.any():
             row = int(is_bad.argmax())
             cell = shortened(self.columns[name][row : row + 1].tolist()[0])
@@ -141,10 +145,12 @@ class Table:
         return int(self.lines[row]) if row < len(self.lines) else 0
 
     def one_word(self, name: str, at: str = "same") -> str:
-        """Return the word of a column that holds for a recording; see `LabelSource.at`.
+        """Return the one word that a column has for a recording, as a label or a part number.
 
-        Raises UnreadableError if there is no such column or no row, or if the word changes although
-        it must be the same.
+        Raises UnreadableError if there is no such column or no row, or if the rows differ under
+        "same".
+
+        at : "same" if all rows must have this word, "first" or "last" for the row that has it.
         """
         words = self.words(name)
         if not len(words):
@@ -156,7 +162,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """The trace of one part, and what is known of it.
+    """The trace of one part, and what is known of the part.
 
     Parameters
     ----------
@@ -168,11 +174,11 @@ class Recording:
     part : str
         Number of the part; "" if none is stated.
     length : int
-        Samples as recorded.
+        Number of samples as recorded.
     start : float
-        Time of the first sample in seconds, by the clock's own zero; NaN without a clock.
+        Time of the first sample in seconds, counted from the clock's own zero; NaN without a clock.
     rank : str
-        Word of the column by which the recordings are put in order.
+        Word in the column that `order` names, by which recordings are sorted; "" for other orders.
     """
 
     source: str
@@ -194,7 +200,7 @@ def as_word(cell: Any) -> str:
 
 @lru_cache
 def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
-    """Return the pattern of a number with these marks."""
+    """Return the regular expression of a number with this decimal mark and this mark of groups."""
     mark, point = re.escape(thousands), re.escape(decimal)
     groups = rf"[1-9]\d{{0,2}}(?:{mark}\d{{3}})+|" if mark else ""
     digits = rf"(?:(?:{groups}\d+)(?:{point}\d*)?|{point}\d+)"
@@ -202,9 +208,9 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
 
 
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
-    """Return the number in a cell, NaN for a word that stands for a lost one, inf for other words.
+    """Return the number in a cell; NaN for a word of `form.missing`, infinity for any other text.
 
-    A float is returned as it is; None is the word `null`.
+    A float is returned as it is; None is read as the word `null`.
     """
     if isinstance(cell, float):
         return cell

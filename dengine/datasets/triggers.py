@@ -2,8 +2,8 @@
 
 A signal is a channel (`FZ_Base`), a field of the controller (`output_int_register_25`,
 `actual_TCP_speed[0]`), or a topic of a bag. The recorder of the UR cell and the reader of bags use
-`as_trigger`, `StartFinder` and `place`. A sample that did not come is NaN at its place, which the
-engine finds: nothing is filled in.
+`as_trigger`, `StartFinder` and `place`. A sample that did not come is NaN at its place: no value is
+made up, and the engine verifies such a trace.
 """
 
 import re
@@ -27,15 +27,15 @@ class Trigger:
     Parameters
     ----------
     kind : {"bit", "register", "contact", "motion"}
-        bit: bit `number` of a word is set, counted from 0. register: the signal has the value
-        `number`, or any but zero if that is None. contact: the force is at least `number` newtons,
-        in either direction, as recorded. motion: the tool moves faster than `number` metres a
-        second; the signal is a vector.
+        bit: bit `number` of an integer is set, counted from 0. register: the signal has the value
+        `number`, or any value but zero if that is None. contact: the force is at least `number`
+        newtons, in either direction, as recorded. motion: the tool moves faster than `number`
+        metres a second; the signal is a vector.
     number : float or None
     signal : str
         Name of the signal.
     quiet_s : float
-        Seconds that the condition must not have been met before: a force that varies around the
+        Seconds that the condition must not have been met before. So a force that varies around the
         threshold is one contact.
     """
 
@@ -92,10 +92,12 @@ EXAMPLES = (
 
 
 def as_trigger(value: Any) -> Trigger:
-    """Return a trigger as it is, or parse its text: KIND, then =NUMBER and @SIGNAL if need be.
+    """Return a trigger as it is, or make one from a text, KIND[=NUMBER][@SIGNAL].
 
-    bit=0 is digital output 0, register@NAME any value but zero, contact=5 is 5 N of FZ_Base,
-    motion=0.002 is 2 mm a second. Raises SettingError for any other value.
+    "bit=0": digital output 0 is on. "register@NAME": the signal NAME is not zero. "contact=5": the
+    force FZ_Base is 5 N or more, in either direction. "motion=0.002": the tool moves faster than
+    2 mm a second. Only bit and contact need a number. Without @SIGNAL each kind reads a signal of
+    its own. Raises SettingError for any other value.
     """
     if isinstance(value, Trigger):
         return value
@@ -110,14 +112,14 @@ def as_trigger(value: Any) -> Trigger:
 
 
 class Placed(NamedTuple):
-    """A stretch of a stream as a trace.
+    """Samples of a stream, put into a trace.
 
     trace : array of float32, shape (C, T)
-        NaN where no sample came.
+        NaN at a place for which no sample came.
     missing : array of int64, shape (m,)
-        The places of these.
+        These places, increasing.
     repeated : int
-        Samples whose place was taken, which were left out.
+        Number of samples that were left out because an earlier sample had their place.
     """
 
     trace: NDArray[np.float32]
@@ -131,7 +133,8 @@ class Start(NamedTuple):
     time : float
         In seconds.
     seen : bool
-        Whether its first sample came. False: it began at `time`, or later in a gap.
+        Whether the first sample of the insertion came. If False, samples are missing, and the
+        insertion began at `time` or later.
     """
 
     time: float
@@ -160,13 +163,13 @@ class StartFinder:
         self._last_off = 0.0
 
     def feed(self, time: float, active: bool) -> Start | None:
-        """Take the next sample; return the start of an insertion if it shows one, else None.
+        """Take the next sample; return where an insertion begins if the sample shows it, else None.
 
-        The trigger must be on at this sample, and have been off for `quiet_s` before; one that is
-        on from the first sample on has no start.
+        It begins if the trigger is on at this sample and was off for `quiet_s` before. A trigger
+        that is on at the first sample gives no start until it was off.
 
-        If samples are missing just before it, the insertion may have begun in any of them, so the
-        place of no sample in its trace is known: `Start.seen` is False.
+        If samples are missing just before this one, the insertion may have begun in the gap, and
+        `Start.seen` is False; `Start.time` is then the first time in the gap.
         """
         if not active:
             self._off_since = time if self._off_since is None else self._off_since
@@ -183,7 +186,7 @@ class StartFinder:
 def place(
     times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float
 ) -> Placed:
-    """Put samples into a trace, each at the place that its time gives.
+    """Put samples into a trace, each at the place nearest to its time.
 
     Parameters
     ----------
@@ -193,14 +196,15 @@ def place(
     start : float
         Time of the first place.
     samples : int
-        Places in the trace.
+        Number of places in the trace.
     step : float
         Seconds from one place to the next.
 
     Returns
     -------
     Placed
-        Samples before or behind the trace are left out; of several at one place the first stays.
+        Samples before the first or after the last place are left out. If several have the same
+        place, the first is taken.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
     at = np.rint((np.asarray(times) - start) / step).astype(np.int64)

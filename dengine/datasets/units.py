@@ -37,7 +37,7 @@ def is_unit(text: str) -> bool:
 
 
 def conversion(unit: str, wanted: str) -> float:
-    """Return the factor from one unit to another; 1 if they are the same or one is not stated.
+    """Return the factor from one unit to another; 1 if they are the same or either is "".
 
     Raises DataError if they are of different quantities, or one is unknown.
     """

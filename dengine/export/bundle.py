@@ -101,14 +101,14 @@ def prepare_export(
 ) -> tuple[Exportable, DecisionModule]:
     """Check that an engine or a model can be exported, and build its decision module.
 
-    Nothing is written. The module shares references and rule with the model; it is not compiled
-    yet, but the decider in it is.
+    Nothing is written. The module shares references and rule with the model. Its decider is
+    compiled already; the module itself is not.
 
     Parameters
     ----------
     engine_or_model : DataEngine or ModelPrediction
     trace : TraceSpec or None
-        Another trace contract than the engine's or the model's own.
+        The `TraceSpec` of the file, if it is not the engine's or the model's own.
     path : path-like
         Where the file will be written.
     force : bool
@@ -117,18 +117,19 @@ def prepare_export(
     Returns
     -------
     source : Exportable
-        The model with trace contract, audits and force limits.
+        The model with its `TraceSpec`, audits and force limits.
     module : DecisionModule
 
     Raises
     ------
     ExportError
-        For a baseline, before the first training, for a rule, an interval or a reducer that
-        TorchScript cannot compile or run, if the compiled decision embeds a trace elsewhere than
-        the reducer does, if the rule is stale, because an update of it failed, and if the store was
+        For a baseline; before the first training; for a rule, an interval or a reducer that
+        TorchScript cannot compile or run; if the compiled decision and the reducer map a trace to
+        different points; if the rule is stale, because an update of it failed; and if the store was
         changed from outside.
     OutputError
-        If `path`, its checksum or its signature must not be written; this is checked first.
+        If one of the files (`path`, its checksum, its signature) must not be written; this is
+        checked first.
     """
     _check_outputs(path, force)
     source = exportable(engine_or_model, trace)
@@ -167,9 +168,9 @@ def prepare_export(
 def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:
     """Return the model that decides at present, with the engine's settings, for an exporter.
 
-    It is no copy: the model goes on learning. `trace` replaces the trace contract of the engine or
-    the model. An `Exportable` is returned as it is. Raises ExportError before the first training,
-    for a baseline, and where the engine's store was changed from outside.
+    The model is not copied, and goes on learning. `trace` replaces the `TraceSpec` of the engine or
+    the model. An `Exportable` is returned as it is, without `trace`. Raises ExportError before the
+    first training, for a baseline, and if the engine's store was changed from outside.
     """
     if isinstance(engine_or_model, Exportable):
         return engine_or_model
@@ -207,9 +208,9 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
 def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
-    It names schema, versions, time, trace contract, policy, references (number and SHA-256), the
-    order of fields, actions and reasons, audits and seed. It can be read without loading the model,
-    see `metadata_of`.
+    It names the schema, the versions of dengine, torch and the model, the time, the `TraceSpec`,
+    the policy, the references (their number and SHA-256), the order of fields, actions and reasons,
+    the audit rate, the seed and the recipe. `metadata_of` reads it without loading the model.
     """
     model = source.model
     index = model.index
@@ -254,8 +255,9 @@ def write_export(
 ) -> Path:
     """Write a file, its checksum (PATH.sha256) and, with a key, its signature (PATH.sig).
 
-    Each is a rename of its own: if a kill comes between, the file is refused as damaged until it is
-    exported again. The export is noted in the engine's store first.
+    Each file is put in place by a rename. If the process is killed between two renames, the file
+    may be refused as damaged until it is exported again. Before anything is written, the export is
+    recorded as an event of the engine, so the event may be there without the file.
 
     Parameters
     ----------
@@ -266,7 +268,8 @@ def write_export(
     key : path-like, optional
         File of the key to sign with.
     source : Exportable, optional
-        Its `note`, if it has one, records checksum and model version as an event.
+        Its `note` records checksum and model version as an event. No event is recorded without
+        `source`, or if its `note` is None.
 
     Returns
     -------
@@ -372,7 +375,7 @@ def metadata_of(content: bytes, path: Path) -> Metadata:
 def check_schema(metadata: Any, path: Path) -> Metadata:
     """Return a description as it is if it has the present schema, `SCHEMA`.
 
-    Raises ExportError, naming `path`, for another schema and for what is no dict.
+    Raises ExportError, which names `path`, if it has another schema or is not a dict.
     """
     fields = metadata if isinstance(metadata, dict) else {}
     if fields.get("schema") != SCHEMA:

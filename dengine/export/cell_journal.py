@@ -12,8 +12,8 @@ lines so far, each without its own. If it does not fit, a line was changed, or i
 or moved: that line and all after it are set aside. FILE.head beside the journal has the number of
 its lines and the last CRC; if it knows of a line that the journal lacks, the journal says so, and a
 missing head is logged. A last line without its end was being written when the program was killed:
-it is left out. A line that fits its checksum was written by a cell; if it cannot be read, as when
-its traces have another contract, it is a DataError that names the line.
+it is left out. A line that fits its checksum was written by a cell. If it cannot be read, for
+example because its traces have another shape, DataError is raised and names the line.
 """
 
 import os
@@ -72,7 +72,7 @@ class CellJournal:
     lines : list of JournalLine
         Accepted parts and labelled parts, in the order in which their outcomes became known.
     pending : JournalLine or None
-        The last part, if it was accepted and nothing came after it.
+        The last part, if it was accepted and its outcome is not known; also the last of `lines`.
     sum : str
         SHA-256 of the export that the journal belongs to.
     cut : int
@@ -91,17 +91,19 @@ class CellJournal:
 def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     """Read and check the journal of a cell program.
 
-    Rejected parts, and verified ones without a label, are left out. An accepted part whose label
-    came late is there twice. The first line whose checksum does not fit, and all lines after it,
-    are set aside without an error; `set_aside` says so, or that lines are missing at the end, which
-    FILE.head (the number of lines and the last checksum) tells. If FILE.head is missing or cannot
-    be read, a warning is logged.
+    Parts without a label are left out unless they were accepted. An accepted part whose label came
+    after the next part was decided has two lines: one without a label, and later one with it.
+
+    The first line whose checksum does not fit, and all lines after it, are set aside without an
+    error, and `set_aside` of the result says so. Otherwise FILE.head, which holds the number of
+    lines and the last checksum, is compared: `set_aside` then says if lines are missing at the end.
+    If FILE.head is missing or cannot be read, a warning is logged.
 
     Parameters
     ----------
     path : path-like
     spec : TraceSpec
-        Contract of the traces.
+        What the traces must be.
 
     Returns
     -------
@@ -110,8 +112,8 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     Raises
     ------
     DataError
-        For a file that is no journal of this form, a line that this contract cannot read, or no
-        accepted and no labelled part.
+        For a file that is no journal of this form, a line whose checksum fits but which cannot be
+        read as `spec` says, or a journal with neither an accepted nor a labelled part.
     OSError
         If the file cannot be read.
     """
@@ -173,11 +175,11 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
 
 
 def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
-    """Return a sentence if the head of a journal knows of a line that the journal lacks, else "".
+    """Return a sentence if a journal lacks the line that its head names, else "".
 
-    The head is the file PATH.head: the number of lines and the last checksum. `crcs` are the
-    checksums of the journal's lines. If the head is missing or cannot be read, a warning is logged
-    and "" is returned.
+    The head is the file PATH.head; it holds a number of lines and the checksum of the last of them.
+    `crcs` are the checksums of the journal's lines. If the head is missing or cannot be read, a
+    warning is logged and "" is returned.
     """
     head = Path(f"{os.fspath(path)}.head")
     risk = "lines may have been removed at its end, or lost with the power."
@@ -193,11 +195,12 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
 
 
 def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
-    """Return decision, trace and label of a part's line, whose first word is left out.
+    """Return the decision, trace and label of a part; `words` are its line without the first word.
 
-    The trace of a part with the action REJECT is empty, (1, 0); another one is fitted as `spec.fit`
-    says. The line lacks embedding, model version and propensity (the probability of this action);
-    None, 0 and 1 stand for these. Raises ValueError, LookupError or TraceError for other words.
+    The trace of a rejected part is empty, (1, 0); other traces are fitted as `spec.fit` says. A
+    line does not have the embedding, the model version and the propensity (the probability of this
+    action), which become None, 0 and 1. Raises ValueError, LookupError or TraceError for words that
+    are no such line.
     """
     id_, label, part, action, predicted, reason, *numbers = words
     lower, upper, n_success, n_failure, *samples = numbers
@@ -226,9 +229,10 @@ def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
 def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) -> ImportReport:
     """Import what an exported cell learned into the store of its engine.
 
-    Each part is imported once, however often its journal is. Rule and certificate count the parts
-    as the engine's own. If a journal lacks a line, what stands before it is imported. A store that
-    was passed open stays open; on PostgreSQL it owns the cell until it is closed.
+    A part that was imported before is not imported again. The decision rule and the certificate
+    count imported parts like the engine's own. If a line is missing or was changed, only the lines
+    before it are imported. A store that was passed open stays open; on PostgreSQL it owns the cell
+    until it is closed.
 
     Parameters
     ----------
@@ -237,8 +241,8 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
     path : path-like
         The journal.
     any_model : bool, default False
-        Whether to take a journal of a model that the store has not noted as exported from it. A
-        store that has noted no export takes every journal.
+        Whether to take a journal of a model whose export is no event of this store. A store without
+        any export event takes every journal.
 
     Returns
     -------
@@ -248,10 +252,10 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
     Raises
     ------
     DataError
-        Before anything is stored, for a file that is no journal, holds no label, or has a line that
-        cannot be read, and for a journal of another model.
+        For a file that is no journal, has neither an accepted nor a labelled part, or has a line
+        that cannot be read, and for a journal of another model. Nothing is stored then.
     StoreError
-        If there is no store, an engine runs on the cell, or the store has no trace contract.
+        If there is no store, an engine runs on the cell, or the store has no `TraceSpec` or recipe.
     OSError
         If the journal cannot be read.
     """
@@ -284,12 +288,12 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
 
 
 def _with_known_outcomes(journal: CellJournal, stops: str) -> list[JournalLine]:
-    """Return the lines of a journal, with the outcomes that follow from silence.
+    """Return the lines of a journal, with the labels of accepted parts that were not reported.
 
-    If `stops` is "some", nothing follows, and the lines stay as they are. If it is "all", an
-    accepted part without a label is confirmed as good, because the next part was decided; the
-    pending part at the end is left out. Of an accepted part whose label came late there are two
-    lines, of which one stays: the late one if it is a stop, else the first, confirmed.
+    If `stops` is "some", the lines are returned as they are. If it is "all", an accepted part
+    without a label gets the label good, because the next part was decided; the pending part at the
+    end is left out. An accepted part whose label came late has two lines, and only one is returned:
+    the late line if it says bad, else the first line, with the label good.
     """
     if stops == "some":
         return journal.lines

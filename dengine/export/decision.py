@@ -41,7 +41,7 @@ class DecisionModule(nn.Module):
     spec : TraceSpec
         Shape of the traces, and how other lengths are fitted to it.
     decider : Decider
-        Eager or compiled; its predictor has `neighbours`, as `model.neighbours.Predictor`.
+        Eager or compiled; its predictor has `neighbours`, like `model.neighbours.Predictor`.
     embedding_shape : pair of int
         (K, d).
     stops_all : bool, default False
@@ -99,8 +99,8 @@ class DecisionModule(nn.Module):
     def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
         """Decide on one trace, and make this the pending decision: its outcome is not known yet.
 
-        Before that, a pending accept is settled, see `settle`: it is learned as good or counted as
-        unreported; another pending decision is forgotten. After a faulty trace no decision is
+        Before that, `settle` learns an earlier accept that is still pending as good, or counts it
+        as unreported; any other pending decision is forgotten. After a faulty trace no decision is
         pending.
 
         Parameters
@@ -152,9 +152,9 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make this decision the pending one: the one whose outcome is not reported yet.
 
-        An earlier one is forgotten. The fields are copied. `action` is `NONE_PENDING` for a faulty
-        trace: then none is pending. `part` is 0 for an unknown part, for which the content hash
-        stands. Whether the trace was novel is read from `reason`.
+        An earlier pending decision is forgotten. `action` is `NONE_PENDING` for a faulty trace;
+        then no decision is pending. If `part` is 0, the part is unknown, and the hash `content` of
+        the trace is used as its part. Whether the trace was novel is read from `reason`.
         """
         self.pending_action = action
         self.pending_predicted = predicted
@@ -169,10 +169,10 @@ class DecisionModule(nn.Module):
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:
         """Learn the outcome of a part: update the rule, and make the trace a reference.
 
-        If the trace and its part are those of the pending decision, its bound is used and none is
-        pending afterwards. Otherwise the trace is decided on first, because its bound must be one
-        from before its label was known; the pending decision stays pending. A faulty trace is
-        ignored. A full index drops its oldest reference.
+        If the trace and its part are those of the pending decision, its bound is used, and no
+        decision is pending afterwards. Otherwise the trace is first decided on, because a bound
+        must be computed before the label is known; the pending decision then stays pending. A
+        faulty trace is ignored. If the index is full, its oldest reference is dropped.
 
         Parameters
         ----------
@@ -224,11 +224,12 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def settle(self) -> bool:
-        """Settle a pending accept: the next part comes, and nothing was reported.
+        """End the wait for the outcome of a pending accept; return whether it was learned as good.
 
-        A pending accept is a part that was decided last and accepted. With `stops_all` it is
-        learned as good and becomes a reference, else it counts as unreported; no decision is
-        pending then. Returns whether it was learned. Other pending decisions stay.
+        A pending accept is the part decided last, if it was accepted and nothing was reported on
+        it. With `stops_all` it is learned as good and becomes a reference; otherwise it counts as
+        unreported. Then no decision is pending. If the pending decision is no accept, or there is
+        none, nothing changes.
         """
         if self.pending_action != ActionCode.ACCEPT.value:
             return False
@@ -248,13 +249,13 @@ class DecisionModule(nn.Module):
     def restore(
         self, trace: Tensor, part: int, action: int, reason: int, lower: float, upper: float
     ) -> None:
-        """Make an earlier decision, as a journal has it, the pending one again.
+        """Make an earlier decision, which a journal holds, the pending decision again.
 
-        A pending accept is settled first (`settle`: learned as good, or counted as unreported);
-        another pending decision is forgotten. The trace (T,) or
-        (C, T) is embedded anew, with the fields of the decision as they are given; `part` is a
-        hash, 0 if unknown, and `predicted` follows from the others. A faulty trace leaves none
-        pending. Raises ValueError, compiled torch.jit.Error, for another shape.
+        A pending accept is first settled by `settle`; any other pending decision is forgotten. The
+        trace, (T,) or (C, T), is embedded anew. The other fields are taken as they are given;
+        `part` is a hash, 0 if unknown. What the model alone would have done follows from action,
+        reason and bound. After a faulty trace no decision is pending. Raises ValueError, or
+        torch.jit.Error if compiled, for another shape.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -287,10 +288,10 @@ class DecisionModule(nn.Module):
         return n_references
 
     def learn_pending(self, success: bool) -> None:
-        """Learn the outcome of the pending decision; then none is pending.
+        """Learn the outcome of the pending decision; afterwards no decision is pending.
 
-        The rule is updated, and the trace becomes a reference: of a success if `success` is True.
-        That a decision is pending is not checked.
+        The rule is updated, and the trace becomes a reference with the label `success`. It is not
+        checked whether a decision is pending.
         """
         self.learn_outcome(
             self.pending_lower,
@@ -318,11 +319,11 @@ class DecisionModule(nn.Module):
         """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
 
         `lower`, `upper`, `novel`, `action` and `predicted` are those of the decision, from before
-        the label was known. `part` is the hash of the part, which also gives its fold, and so in
-        which of the K spaces the reference lies: the one that was trained without labels of this
-        fold. The rule gets as inclusion probability the audit rate if the part was audited, 1 if it
-        was verified for another reason, and 0 if it was accepted or rejected. It also gets
-        `n_unreported`, which restarts at 0. A full index drops its oldest reference.
+        the label was known. `part` is the hash of the part; it also gives the part's fold k, and
+        the reference is put into embedding space k. The rule gets as inclusion probability the
+        audit rate if the part was audited, 1 if it was verified for another reason, and 0 if it was
+        accepted or rejected. It also gets `n_unreported`, which restarts at 0. If the index is
+        full, its oldest reference is dropped.
         """
         inclusion_probability = 0.0
         if action == ActionCode.VERIFY.value:
@@ -339,8 +340,8 @@ class DecisionModule(nn.Module):
         """Return the trace as (C, T) float32 with the number of samples that the decider takes.
 
         Another number of samples is cut, padded or resampled, as `TraceSpec.fit` says. Raises
-        ValueError, compiled torch.jit.Error, for one that cannot be fitted so, and for another
-        shape.
+        ValueError, or torch.jit.Error if compiled, for a number of samples that cannot be fitted in
+        this way, for no samples, and for another shape.
         """
         x = trace.unsqueeze(0) if trace.dim() == 1 else trace
         fits = x.numel() > 0 and can_fit_length(x.size(-1), self.samples, self.fit)

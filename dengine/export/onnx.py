@@ -76,8 +76,8 @@ def export_onnx(
     path : path-like
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
-        The trace contract, for a `ModelPrediction` whose traces have another rate or limit than the
-        defaults of `TraceSpec`. None: the engine's, or the shape of the model's traces.
+        Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
+        `TraceSpec`. None: the engine's `TraceSpec`, or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -91,12 +91,13 @@ def export_onnx(
     Raises
     ------
     ExportError
-        If the engine audits (checks some parts that the model is certain of), has force limits, or
-        a rule other than that of the guarantee "local" with stops "some", or a part is among the
-        references more than once; the message names all of these that apply. If nothing was trained
-        yet; for a baseline; if the reducer or the interval has no module; if the rule is stale,
-        because an update of it failed; if the store was changed from outside; if the key cannot be
-        read, or a package is missing; and if onnxruntime does not decide as the model does.
+        If the engine audits (checks some parts that the model is certain of), has force limits or a
+        rule other than that of the guarantee "local" with stops "some", or if a part is among the
+        references more than once; the message names all of these that apply. Also if nothing was
+        trained yet; for a baseline; if the reducer, the interval or the rule cannot be exported; if
+        the rule is stale, because an update of it failed; if the store was changed from outside; if
+        the key cannot be read; if a package is missing; and if onnxruntime does not decide like the
+        model.
     OutputError
         If `path` cannot be written.
     """
@@ -116,6 +117,8 @@ def export_onnx(
 
 def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     """Check an ONNX file, load it into onnxruntime on one thread, and warm it up.
+
+    Unlike `load_exported` it does not compare the embedding of a test trace with the file's.
 
     Parameters
     ----------
@@ -167,7 +170,7 @@ def _refuse_unsupported(source: Exportable) -> None:
 
 
 class OnnxModel:
-    """An ONNX decision in onnxruntime; it has `decide` as `ExportedModel`, but learns nothing.
+    """An ONNX decision in onnxruntime; its `decide` takes no part, and it learns nothing.
 
     Parameters
     ----------
@@ -261,8 +264,8 @@ class OnnxDecision(nn.Module):
     def fault(self, trace: Tensor) -> Tensor:
         """Return the position in `Reason` of what is wrong with a trace, () int64; 0 if nothing is.
 
-        The first that applies counts: not finite, constant, at the sensor's limit, too large. It is
-        what `TraceGate` computes.
+        Only the first fault that applies is returned: not finite, constant, at the sensor's limit,
+        too large. The result is the same as that of `TraceGate`.
         """
         low = trace.min()
         high = trace.max()
@@ -274,10 +277,10 @@ class OnnxDecision(nn.Module):
         return torch.where(is_finite, fault, NOT_FINITE)
 
     def count(self, distances: Tensor) -> tuple[Tensor, ...]:
-        """Return action, lower, upper, n_success and n_failure, as `RadiusNeighbours` does.
+        """Count the labels within the radius; return action, lower, upper, n_success, n_failure.
 
         `distances` are the squared distances to the references, (n,). The results are tensors
-        without a dimension, the action 0 verify, 1 accept, 2 reject.
+        without a dimension; the action is 0 verify, 1 accept or 2 reject.
         """
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).to(torch.int64).sum()
@@ -290,11 +293,11 @@ class OnnxDecision(nn.Module):
 
 
 def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
-    """Return the ONNX program of a decision on traces of this contract, a protobuf `ModelProto`.
+    """Return the ONNX program of a decision on traces of this shape, a protobuf `ModelProto`.
 
-    It goes by torch.export, which does not need TorchScript. Meanwhile Python's warnings, and log
-    messages up to WARNING, are off in the whole process, because torch names packages that it could
-    use and need not. Raises ExportError if torch makes no program.
+    torch.export makes it, without TorchScript. Meanwhile Python's warnings, and log messages up to
+    level WARNING, are off in the whole process, because torch reports optional packages that are
+    missing. Raises ExportError if torch makes no program.
     """
     example = (torch.from_numpy(golden_trace(spec)),)
     options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
@@ -316,9 +319,10 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
     """Compare an ONNX model with the model that it was made from, on 64 traces of noise.
 
-    Its amplitudes are from 0.01 to 100. Raises ExportError if embeddings differ by more than
-    `TOLERANCE`, if counts differ by more than two references, which may lie at the radius, or if
-    counts are equal and action or bound differ.
+    The noise has amplitudes from 0.01 to 100. Raises ExportError if embeddings differ by more than
+    `TOLERANCE`, if counts of labels differ by more than two, or if counts are equal but action or
+    bound differ. Smaller differences of counts are allowed, since references may lie exactly at the
+    radius.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

@@ -59,7 +59,9 @@ TOLERANCE = 1e-4  # of a scaled embedding: another processor may add in another 
 
 
 def export_sources(folder: FilePath) -> Path:
-    """Write the C and C++ sources, and a file VERSION, into a folder, which is made if missing.
+    """Write the C and C++ sources that run an exported file, and a file VERSION, into a folder.
+
+    The folder is made if it is missing.
 
     Parameters
     ----------
@@ -74,7 +76,7 @@ def export_sources(folder: FilePath) -> Path:
     Raises
     ------
     OutputError
-        If it holds something or cannot be written.
+        If the folder is not empty or cannot be written.
     """
     with new_folder(folder) as target:
         shutil.copytree(Path(__file__).parent / "cpp", target, dirs_exist_ok=True)
@@ -92,9 +94,9 @@ def export_torchscript(
 ) -> Path:
     """Write the decision of an engine, or of a model, as TorchScript, with its checksum beside it.
 
-    A part that the engine has accepted and whose outcome is not known yet is missing from the file,
-    which never learns that outcome. This is not checked: export when no part is under way. An
-    engine's store records the export as an event.
+    The file does not know of a part that the engine accepted and whose outcome is not known yet, so
+    it never learns this outcome. Export when no part is under way; this is not checked. The export
+    of an engine is recorded as an event in its store.
 
     Parameters
     ----------
@@ -103,8 +105,8 @@ def export_torchscript(
     path : path-like
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
-        The trace contract, for a `ModelPrediction` whose traces have another rate or limit than the
-        defaults of `TraceSpec`. None: the engine's, or the shape of the model's traces.
+        Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
+        `TraceSpec`. None: the engine's `TraceSpec`, or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -186,7 +188,7 @@ class ExportedModel:
     metadata : dict
         The file's description of itself.
     trace : TraceSpec
-        Contract of its traces.
+        What its traces must be.
     """
 
     def __init__(self, module: Any, metadata: Metadata) -> None:
@@ -229,10 +231,10 @@ class ExportedModel:
     def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.
 
-        The trace becomes a reference, the rule is updated, and `metadata["references"]` follows.
-        The file is not written; see `save`. A faulty trace is ignored. If trace or part are not
-        those of the pending decision, the file first decides on them; the earlier decision stays
-        pending.
+        The trace becomes a reference, the rule is updated, and `metadata["references"]` becomes the
+        new number of references. The file on the disk is not changed; see `save`. A faulty trace is
+        ignored. If the trace or the part is not that of the pending decision, the model first
+        decides on the trace, and the earlier decision stays pending.
 
         Parameters
         ----------
@@ -311,9 +313,10 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     Raises
     ------
     ExportError
-        Before anything is loaded, for a file that is missing, damaged, truncated, foreign or of
-        another schema, or that was not signed with the key; after loading, if this machine does not
-        give the embedding that the file holds for a test trace.
+        Before anything is loaded: for a file that is missing, damaged, truncated, no export or of
+        another schema, or that was not signed with the key. Afterwards: if it is no TorchScript, if
+        its description does not fit its module, or if this machine does not compute the embedding
+        that the file holds for a test trace.
     """
     target = Path(path)
     content = read_checked(target, key)

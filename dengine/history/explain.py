@@ -49,11 +49,11 @@ class Neighbour:
     success : bool
         Its label.
     source : Source or None
-        Of the label.
+        Where the label came from; None if unknown.
     distance : float
         In units of the scaled embedding.
     space : int
-        The fold in whose embedding it lies.
+        Number k of the embedding space in which it lies: its fold.
     inside : bool
         Whether it lies within the radius.
     trace : array of float32, shape (C, T), or None
@@ -83,7 +83,7 @@ class Explanation:
     sentences : tuple of str
         Why the decision came out as it did.
     notes : tuple of str
-        A sentence on whose references the neighbours are, or why none are shown.
+        A sentence that says which version's references the neighbours are, or why none are shown.
     bound : Bound or None
         The bounds and thresholds; None if no bound was computed.
     novelty : Novelty or None
@@ -92,7 +92,7 @@ class Explanation:
     neighbours : tuple of Neighbour
         The nearest references of the version that decided, nearest first; empty if it is not kept.
     radius : float or None
-        None if there is no neighbourhood.
+        Radius of the neighbourhood; None if no distances could be computed.
     envelope : Envelope or None
         The band of the known successes; None while there are too few.
     policy : Policy
@@ -113,10 +113,10 @@ class Explanation:
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:
-    """Return the id of the decision on a part.
+    """Return the id of the only decision on a part that was no reject, or of its only reject.
 
-    If a part was decided on again after rejects, the rejects do not count, unless all are rejects.
-    Only the newest 20 decisions on the part are looked at. Only this cell's count.
+    A rejected part may come again, so rejects count only if there is no other decision. Only the
+    newest 20 decisions of this cell on the part are looked at.
 
     Parameters
     ----------
@@ -131,9 +131,9 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     Raises
     ------
     UnknownDecisionError
-        If there is none.
+        If `part` is neither the number of a decided part nor the id of a decision.
     ReportConflictError
-        If there are several; the message has their ids.
+        If several decisions count; the message has their ids.
     """
     decisions = store.decisions.select(HistoryFilter(part=part), 20)
     not_rejected = [item for item in decisions if item.decision.action is not Action.REJECT]
@@ -156,14 +156,15 @@ def find_decision_id(store: SqlStore, part: str) -> str:
 def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanation:
     """Explain one decision from what its store keeps; nothing is trained or embedded.
 
-    The policy is the one that was in force at the decision. If a label or a trace of a success is
-    damaged, it is left out, and an event is written to the store; else the store does not change.
+    The policy is the one that was in force at the decision. A damaged label, and a damaged trace of
+    the envelope's, is left out, and an event is written to the store. Nothing else is written.
 
     Parameters
     ----------
     store : SqlStore
     decision_id : str
-        Its id, or its part's number as `find_decision_id` takes it.
+        Id of the decision; or the number of its part, if no decision has this id (see
+        `find_decision_id`).
     neighbours : int, default 10
         Number of nearest references at most.
 
@@ -174,7 +175,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     Raises
     ------
     ReportError
-        For a decision that the store does not hold, and for a part with several decisions.
+        For a decision that the store does not hold (UnknownDecisionError), and for a part with
+        several decisions (ReportConflictError).
     StoreError
         For a store that no engine has used, and for a damaged trace of the decision or of a
         neighbour.
@@ -223,9 +225,10 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
 
 
 def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
-    """Return the policy that was in force at a time: the old one of the first change after it.
+    """Return the policy that was in force at a time, in seconds since 1970.
 
-    `present` is the policy in force now.
+    It is the policy that the first change of policy after this time replaced. If there was no
+    change since, it is `present`, the policy in force now.
     """
     for event in store.events.newest():
         if event.kind in POLICY_KINDS and event.time > time and event.data is not None:
@@ -234,10 +237,10 @@ def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
 
 
 def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
-    """Return why safe mode had begun when a decision was made in it; "" for any other decision.
+    """Return why the safe mode in which a decision was made had begun.
 
-    Safe mode is when every part is verified, after an alarm. The result is the text of the last
-    event by which one began before the decision, "" if there is none.
+    It is the text of the last event before the decision that began a safe mode. "" if the reason of
+    the decision is not `Reason.SAFE_MODE`, or if there is no such event.
     """
     if item.decision.reason is not Reason.SAFE_MODE:
         return ""
@@ -254,8 +257,9 @@ def _measure_distances(
 ) -> NDArray[np.float64] | None:
     """Return the distances from a decision's embedding to the references of a version, shape (n,).
 
-    They are in the order of the index; infinite to references of the decision's own part. None if
-    the trace was not embedded, or the version is not kept.
+    Each is measured in the embedding space of the reference, and they are in the order of the
+    version's index. The distance to references of the decision's own part is infinite. None if the
+    trace was not embedded or there is no version.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:
@@ -275,8 +279,9 @@ def _find_neighbours(
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    Yields nothing without distances or version. A neighbour may lie outside of the radius. What is
-    not known of a reference is None. Raise StoreError for a damaged trace.
+    Nothing is yielded if `version` or `distances` is None. A neighbour may lie outside of the
+    radius. If the decision behind a reference is unknown (another cell made it), its id, part,
+    source and trace are None. Raises StoreError for a damaged trace.
     """
     if distances is None or version is None:
         return
@@ -302,12 +307,12 @@ def _find_neighbours(
 def _find_envelope(
     store: SqlStore, item: StoredDecision, version: PastVersion | None
 ) -> Envelope | None:
-    """Return the envelope of the successes among the newest labels that the version could know.
+    """Return the envelope of the successes among the newest labels up to `version.last_seq`.
 
-    Labels are as corrected by now. Traces of the decision's own part or content are left out. At
-    most `MAX_ENVELOPE_LABELS` are read. Without a version, or if these successes are too few, the
-    newest labels known now are taken; None if these are too few, too, or of another shape. For a
-    damaged trace, which is left out, an event is written to the store.
+    At most `MAX_ENVELOPE_LABELS` labels are read, as corrected by now. Traces of the decision's own
+    part (without a number, traces equal to its trace) are left out. Without a version, or if
+    `envelope_of` returns None for these successes, the newest labels of today are taken. None if
+    they do not suffice, either. A damaged trace is left out, and an event is written to the store.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labels.with_traces(MAX_ENVELOPE_LABELS, last=last)
@@ -319,7 +324,11 @@ def _find_envelope(
 
 
 def _note_of(item: StoredDecision, has_neighbours: bool) -> str:
-    """Return a sentence on whose references the neighbours are, or why none are shown."""
+    """Return a sentence that says which version's references the neighbours are.
+
+    Without neighbours it says why: the trace is quarantined or was not embedded, or the version is
+    not kept.
+    """
     decision = item.decision
     version = f"version {decision.model_version}, which answered,"
     if has_neighbours:

@@ -30,8 +30,10 @@ class Mark:
 
     Attributes
     ----------
-    id, part
+    id : str
         Of its decision.
+    part : str or None
+        Number of the part. None if it has none, or if its decision is not among the newest 1,000.
     x, y : float
         The first two dimensions of its embedding; of a newest part the mean over the spaces.
     success : bool or None
@@ -60,7 +62,8 @@ class PartMap:
         Oldest first, the known parts before the newest; empty before the first model, and for a
         model that keeps no references.
     radius : float or None
-        Within which labels count, to be drawn around the newest parts; None if there are none.
+        Radius within which labels count, to be drawn around each newest part; None if the map has
+        no newest part.
     probability : bool
         Whether x is a probability.
     """
@@ -80,14 +83,14 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     recipe : Recipe
         With the radius and the reducer.
     version : int
-        The model version; 0: before the first, an empty map.
+        The model version. 0 stands for the time before the first version: the map is empty.
 
     Returns
     -------
     PartMap
-        With the newest 250 references of known label and, of the newest 10 decisions of the cell,
-        those that this version made and embedded. A part that is both is drawn once, as a newest
-        one.
+        With the newest 250 references whose label this cell recorded. Of the cell's newest 10
+        decisions it has those that this version made and for which it embedded the trace. A part
+        that is both appears once, as a newest part.
     """
     recent = store.decisions.select(HistoryFilter(), N_NAMED)
     newest = list(_newest_marks(recent[-N_NEWEST:], version))
@@ -116,8 +119,9 @@ def _known_marks(
 ) -> list[Mark]:
     """Return the marks of the newest N_KNOWN references of a version, oldest first.
 
-    References whose label is unknown, as those of other cells, are left out; [] if the version's
-    references are not kept. `parts` has the parts' numbers by decision id.
+    References whose label this cell did not record are left out. [] if the version's references are
+    not kept. `parts` maps decision ids to the parts' numbers; the mark of an id that is missing
+    there has no number.
     """
     past = load_past_version(store, version, recipe, None)
     if past is None:

@@ -44,12 +44,12 @@ class PastVersion:
     labels : list of PastLabel or None
         The label of each reference, in the order of the index; None if it is unknown.
     thresholds : (float, float) or None
-        That a decision had to reach: accepted where lower >= the first, rejected where 1 - upper >=
-        the second. None if they are not kept.
+        Accept threshold and reject threshold of that moment. A part was accepted if lower >= the
+        first, rejected if 1 - upper >= the second. None if they are not kept.
     last_seq : int
-        Number of the newest label that it could know.
+        Number of the newest label that had come by then.
     novelty : Novelty or None
-        Of the trace that it found novel; None for any other.
+        Of the decision's trace, if the version found it novel; else None.
     """
 
     index: RadiusIndex
@@ -65,24 +65,25 @@ def load_past_version(
     """Load a model version from the store as it was when a decision was made.
 
     Its references and its rule include this cell's labels that had come by then, as they were
-    reported: later corrections are not applied. At most `MAX_LABELS` after the version are read. A
-    damaged label is left out, and an event is written to the store.
+    reported: later corrections are not applied. Of the labels that came after the version was
+    trained, only the first `MAX_LABELS` are read. A damaged label is left out, and an event is
+    written to the store.
 
     Parameters
     ----------
     store : SqlStore
     version : int
     recipe : Recipe
-        Of that moment.
+        The recipe of that moment.
     item : StoredDecision or None
-        The decision, with its trace; None: the version with all labels that came until the next
-        one.
+        The decision, with its trace. None: the version with all labels that came until the next
+        version of this cell was put in force.
 
     Returns
     -------
     PastVersion or None
-        None if there is no such version, or its references are damaged or not kept, as of a
-        baseline, a model that the user handed in.
+        None if no such version was put in force, if its state is damaged or no longer kept, or if
+        it has no references (a baseline, a model that the user handed in).
     """
     try:
         stored = store.versions.load(version)
@@ -120,8 +121,8 @@ def _was_known(label: PastLabel, item: StoredDecision) -> bool:
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
     """Return the index of a stored version's references, with the labels `added` later.
 
-    A label without a point (the embedding of its trace) is left out; any other replaces the oldest
-    reference of a full index. Its fold follows from its hash.
+    A label without a point (the embedding of its trace) is left out. In a full index each added
+    reference replaces the oldest. The fold of a label is computed from its hash.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
@@ -136,9 +137,10 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 
 
 def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
-    """Compute how novel the trace of a decision was, by its version's gate.
+    """Compute how novel the trace of a decision was, by its version's `NoveltyGate`.
 
-    None for a decision with another reason than `Reason.NOVEL`, and if the gate cannot be restored.
+    Returns None without a decision, if the decision's reason is not `Reason.NOVEL`, and if the gate
+    cannot be restored.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -155,9 +157,10 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
 def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     """Return the decision rule of a policy with the state that a version stored.
 
-    None if the state lacks what the rule has learned, has another rule than the policy's, or was
-    stored while stale (it had missed an update), and if the rule is a class of the user's whose
-    module is not imported yet: nothing is imported here. A rule that learns nothing needs no state.
+    Returns None if the version has no state that fits this rule: it stored another rule, none (it
+    is another cell's), or the rule was stale (it had missed an update). Also None if the rule is a
+    user's class whose module is not imported yet, since nothing is imported here. A rule that
+    learns nothing needs no state.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -175,10 +178,11 @@ def _restore_thresholds(
 ) -> Thresholds | None:
     """Return the thresholds of a version's rule after it was updated with later labels.
 
-    They are (accept, reject): a part was accepted where lower >= the first, rejected where 1 -
-    upper >= the second. Labels of quarantined traces (with a fault) and of inspected rejects do not
-    update the rule. The rule "local" with stops="some" learns nothing: both are the policy's lower
-    bound. Otherwise None if the state is not kept, or the rule has no such thresholds.
+    They are (accept, reject): a part was accepted if lower >= the first, rejected if 1 - upper >=
+    the second. Labels of quarantined traces and of rejected parts that somebody inspected do not
+    update the rule. The rule "local" with stops="some" learns nothing, so both thresholds are the
+    policy's lower bound. Of any other rule the result is None if `_restore_rule` returns None, or
+    if the rule is no `MemberRule`, which alone has such thresholds.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -195,9 +199,10 @@ def _restore_thresholds(
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
 
-    Where the stored rule cannot be continued (`RuleProgress.last_seq` is 0, for example after a
-    correction or by an overdue check), it is rebuilt from all outcomes. A safe mode that has begun
-    since then is on in the result. The store does not change.
+    If a label was corrected or a check is overdue, the stored rule cannot be continued, and the
+    rule is rebuilt from all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
+    may begin or end a safe mode of the returned rule. Nothing is written to the store, except an
+    event if the arrays of a version are damaged; then the version before it is taken.
 
     Parameters
     ----------
@@ -207,9 +212,9 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     Returns
     -------
     DecisionRule or None
-        None before the first version, and if its rule cannot be restored from what is stored: its
-        state is not kept (that of another cell of the product never is) or is stale (it had missed
-        an update), or its class is not imported.
+        None before the first version, and if the rule of the newest version cannot be restored:
+        another cell of the product made the version, the rule was stored while it was stale (it had
+        missed an update), its state does not fit the policy, or its class is not imported.
     """
     stored = store.versions.newest()
     settings = store.settings.read()
@@ -228,11 +233,12 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
 
 
 def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None:
-    """Update a rule, in place, with one part's outcome and what came without one before it.
+    """Update a rule, in place, with the outcome of one part.
 
-    First `observe` gets the number of accepted parts that went on without a report since the last
-    label (`outcome.silent`), and whether the part was novel; then `update` gets the bounds, the
-    label and the probability that it was asked for. A safe mode may begin or end.
+    First `observe` gets `outcome.silent`, the number of unreported accepted parts since the
+    previous label, and whether this part was novel. Then `update` gets the bounds, the label, the
+    action that the model alone would have taken, and the inclusion probability. A safe mode of the
+    rule may begin or end.
     """
     rule.observe(outcome.silent, outcome.novel)
     rule.update(
@@ -248,8 +254,8 @@ def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None
 class Novelty:
     """How novel a trace was, in four respects.
 
-    Each is the squared distance to the nearest reference over its limit; a trace with one above 1
-    is novel.
+    Each is the squared distance to the nearest reference, divided by its limit. A trace is novel if
+    any of the four is above 1.
     """
 
     level: float

@@ -35,9 +35,9 @@ class Bound:
     lower, upper : float
         Bounds of the success rate, as recorded.
     accept_threshold : float or None
-        Accepted where lower >= accept_threshold. None if nothing could be accepted, or unknown.
+        Accepted if lower >= accept_threshold. None if nothing could be accepted, or if unknown.
     reject_threshold : float or None
-        Rejected where upper <= reject_threshold. None if nothing could be rejected, or unknown.
+        Rejected if upper <= reject_threshold. None if nothing could be rejected, or if unknown.
     origin : str
         Where the thresholds come from, in words.
     """
@@ -106,10 +106,11 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
 def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
     """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
 
-    A part was accepted where lower >= the first, rejected where upper <= the second. Under the
-    guarantee "local", outside of a safe mode, they are LB and 1 - LB; else those of the version's
-    rule at that time. A threshold is None if it is unknown, as of a handed-in model and a rule of
-    the user's, or if nothing could be accepted, or rejected.
+    A part was accepted if lower >= the first, rejected if upper <= the second. Under the guarantee
+    "local", outside safe mode, they are LB and 1 - LB; else those of the version's rule at that
+    time. Both are None if they are unknown: they are not kept, a user's rule decided, or a
+    handed-in model decided by its own method. One of them is None if nothing could be accepted, or
+    nothing rejected.
     """
     policy = circumstances.recipe.policy
     if circumstances.baseline or policy.guarantee not in RULES:
@@ -129,8 +130,8 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
 def _is_score(policy: Policy, decision: Decision) -> bool:
     """Return whether a decision's `lower` and `upper` are one score, and no interval.
 
-    The score is the probability of success that the reducer's classifiers (its heads) give. It is
-    so under the guarantees "pooled" and "cost", where lower equals upper.
+    True under the guarantees "pooled" and "cost" if lower equals upper. The score is then the mean
+    success probability that the reducer's classifier heads give.
     """
     return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
 
@@ -140,8 +141,8 @@ def explain_in_words(
 ) -> Iterator[str]:
     """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
 
-    Without a bound the sentences on bounds are left out. The outcome is the label as corrected by
-    now.
+    If `bound` is None, the sentences on bounds are left out. The outcome is the label as corrected
+    by now, or that nothing was reported.
     """
     decision = item.decision
     reason = WHY[decision.reason](decision, item.trace, circumstances)
@@ -156,9 +157,9 @@ def explain_in_words(
 
 
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the rest of the sentence on a trace outside an operator's limits: which it leaves.
+    """Return the rest of the sentence on a trace outside the force limits: which limits it leaves.
 
-    They are tried again one by one, by the policy of that time.
+    The limits of the policy of that time are checked again, one by one.
     """
     x = torch.from_numpy(trace)
     left = [
@@ -214,8 +215,9 @@ def _bound_sentences(
 ) -> Iterator[str]:
     """Yield the sentences on a decision's evidence, its bounds, and the thresholds for them.
 
-    If no bound was good enough to accept or reject, or the thresholds are unknown, they say so. For
-    a model that decides by its own method there is one sentence, with its counts and bounds.
+    If nothing could be accepted or rejected, or the thresholds are unknown, the sentences say so.
+    For a handed-in model that decides by its own method there is one sentence, with its counts and
+    bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = f"{decision.lower:.3f} to {decision.upper:.3f}"

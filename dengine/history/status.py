@@ -77,7 +77,8 @@ class ErrorEstimate:
         Where the outcomes come from: "every outcome", "audits", "checks" (in shadow mode), or "" if
         none is known.
     lower, upper : float
-        Wilson interval of the share of wrong ones, for a single look; 0 and 1 if nothing is known.
+        Wilson interval of the share of wrong ones, which holds for a single look and not at all
+        times together; 0 and 1 if nothing is known.
     tolerance : float
         The share that the policy allows: 1 - LB, or what the prices of the guarantee "cost" give.
     verdict : {"kept", "broken", "open"}
@@ -116,10 +117,11 @@ class Span:
     false_rejects : int
         Rejected parts that somebody inspected and found good.
     would_accept, would_reject : ErrorEstimate
-        By audits alone (in shadow mode every part), at 95 %, whatever the policy's alpha.
+        How often the model would have been wrong, by the audited parts alone (in shadow mode these
+        are all parts about which it was certain), at 95 %, whatever the policy's alpha.
     bad_accepts : ErrorEstimate
-        Of the parts that the model accepted, and would have accepted but for an audit, at the
-        policy's alpha; of no part if none was accepted, as in shadow mode.
+        Of the parts that the model accepted, and those that it would have accepted if they had not
+        been audited, at the policy's alpha. Its `n` is 0 if none was accepted, like in shadow mode.
     unlabelled : int
         Verified parts without a label, a forgotten one included.
     retrains : int
@@ -160,11 +162,12 @@ class Watch:
     Attributes
     ----------
     recovery : str
-        In safe mode, what its evidence for an end is, and about how many parts are missing if
-        everything goes on like since the alarm; "" outside. After too many novel traces it is about
-        accepting.
+        In safe mode a text: how many parts since the alarm are evidence, and after about how many
+        more parts safe mode ends, if everything goes on as it has since the alarm. "" outside safe
+        mode. If novel traces began the safe mode, the evidence is that for accepting.
     accepts, rejects, novelty : float
-        From 0 to 1, which is the alarm that begins safe mode.
+        From 0 to 1; at 1 the alarm begins safe mode. All are 0 in a safe mode that novel traces
+        began.
     """
 
     recovery: str
@@ -189,18 +192,19 @@ class Status:
     model : str or None
         Name of a model that was handed in; None: the recipe describes the model.
     version : int
-        Of the model that answers; 0 before the first retrain.
+        Number of the version in force; 0 before the first.
     shadow : bool
         Whether every part is verified and the model only observes.
     pinned : int
-        Number of the earlier version that was rolled back to, if it answers and no automatic
-        retrain replaces it; 0: none is pinned.
+        Number of the version that a rollback put in force, while no automatic retrain replaces it;
+        0: none is pinned.
     safe_mode : str
         Why everything is verified; "" outside safe mode.
     safe_mode_time : float or None
         When safe mode last began or ended; None: never.
     new_labels : int
-        Labels since the newest retrain; `recipe.retrain_every` of them start the next.
+        Labels since the newest retrain, even if that was dropped; `recipe.retrain_every` of them
+        start the next.
     last : int
         Largest number of decisions that `newest` counts.
     newest, ever : Span
@@ -265,10 +269,12 @@ class Status:
     def alarm(self) -> str:
         """The most urgent thing that somebody should look at, in a sentence; "" if there is none.
 
-        In this order: the store, lost data, safe mode, bad accepts, good rejects, dropped retrains,
-        traces that nearly repeat another, shadow mode's errors, novel traces, parts outside limits,
-        errors of the model. Only the newest decisions count. Novel traces, and parts outside
-        limits, are named if they are more than half of the newest decisions.
+        The first of these that applies: a fault of the store, lost data, safe mode, too many bad
+        parts among the accepted, too many good parts among the rejected, 3 or more dropped retrains
+        in a row, traces that nearly repeat another, too many errors in shadow mode, mostly novel
+        traces, mostly parts outside the force limits, errors of the model. "Too many" means an
+        `ErrorEstimate` whose verdict is "broken", "mostly" means more than half. Parts are counted
+        over the newest decisions alone.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -323,10 +329,9 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
     Parameters
     ----------
     dropped : sequence of str
-        Reasons of the retrains that were dropped since the last one that was accepted, oldest
-        first.
+        Reasons of the retrains that were dropped since the last accepted retrain, oldest first.
     version : int
-        Of the model that answers; 0 before the first.
+        Number of the version in force; 0 before the first.
 
     Returns
     -------
@@ -343,7 +348,9 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
     """Read the status of an engine from its store.
 
-    If a new label is damaged, it is left out, and an event is written to the store.
+    A damaged label among those since the newest retrain is left out, and an event is written to
+    the store. An event is also written if the arrays of the newest version are read and are
+    damaged; then those of the version before it are taken.
 
     Parameters
     ----------
@@ -351,7 +358,7 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     last : int, default 500
         Number of newest decisions that `Status.newest` counts.
     watching : bool, default False
-        Read `Status.watch`, too, for which the newest version's arrays are read.
+        Whether `Status.watch` is computed, too; the arrays of the newest version are read for it.
 
     Returns
     -------
@@ -414,9 +421,9 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
 
 
 def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
-    """Return the number of the version that was rolled back to and answers; 0: none is pinned.
+    """Return the number of the version that a rollback put in force; 0: none is pinned.
 
-    `accepted` holds the reports of the accepted versions, oldest first.
+    `accepted` holds the reports of all versions that were put in force, oldest first.
     """
     if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
         return 0
@@ -429,10 +436,11 @@ COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
 def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
-    """Return the counts over a tally's decisions, and the retrains since the first of these.
+    """Return the counts over the decisions of a tally, and over the retrains since the first one.
 
-    A `Tally` holds numbers of decisions by their properties. Estimates on what the model would have
-    accepted or rejected are at 95 %, whatever the policy's alpha.
+    A `Tally` holds how many decisions have each combination of properties, like action and reason.
+    The intervals of `would_accept` and `would_reject` (how often the model would have been wrong)
+    are at 95 %, whatever the policy's alpha.
     """
     outcomes = tally.outcomes
     first = tally.first
@@ -484,10 +492,10 @@ def _estimate_error(
     n: int | None = None,
     basis: str = "audits",
 ) -> ErrorEstimate:
-    """Return the estimate if `n_wrong` of `n_known` parts were decided wrongly.
+    """Return the estimate of the share of wrong decisions, of which `n_wrong` are among `n_known`.
 
-    Its bounds are the two-sided Wilson interval at error level `alpha`; without known parts they
-    are 0 and 1, and its basis is "". `n` is the number of all parts, by default `n_known`.
+    Its bounds are the two-sided Wilson interval at error level `alpha`. If `n_known` is 0, they are
+    0 and 1, and its basis is "". `n` is the number of all parts, by default `n_known`.
     """
     low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
     lower = 1.0 - high
@@ -515,13 +523,13 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 
 
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
-    """Estimate how many of the accepted parts were bad, audited ones included.
+    """Estimate the share of bad parts among those that the model accepted, with or without audit.
 
-    The estimate rests on the reported outcomes of the unaudited parts if all of them are known;
-    under `stops="all"` (every bad part stops the line) if any is, without those that are still
-    open. Otherwise it rests on the audits, whose coin knows no outcome, so that they speak for all
-    parts. Line stops count besides the audits: the lower end is at least the one that follows if
-    all other parts were good, and the upper end at least the share of line stops.
+    If the outcomes of all accepted parts are known, the estimate rests on them. Under `stops="all"`
+    (every bad part stops the line) one known outcome is enough; unreported accepted parts are then
+    left out. Otherwise the estimate rests on the audits, because the audit draw does not depend on
+    the outcome. Line stops then move the interval: its lower end is at least the one that follows
+    if all other accepted parts were good, and its upper end at least the share of line stops.
 
     Parameters
     ----------
@@ -531,8 +539,8 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     Returns
     -------
     ErrorEstimate
-        At the policy's alpha. Of no part if none was accepted: those of shadow mode are in
-        `Span.would_accept`.
+        At the policy's alpha. If no part was accepted, like in shadow mode, its `n` is 0; see
+        `Span.would_accept` then.
     """
     tolerance = policy.tolerances[0]
     if not outcomes.accepted:
@@ -554,13 +562,12 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
 
 
 def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | None:
-    """Return how close the detectors of drift are to an alarm, by the rule as it is now.
+    """Return how close the drift detectors are to an alarm, and a safe mode to its end.
 
-    In safe mode, which an alarm begins, the result also says in words how far its end is. The rule
-    is the stored one, updated with all outcomes since. None before the first version, and if the
-    rule has no detectors, as "local" with stops="some", or cannot be restored. In a safe mode that
-    novel traces began, the three values are 0. `mode` is the newest event at which a safe mode
-    began or ended.
+    They are read from the rule that `load_rule` returns. None if that is None, and if the rule has
+    no drift detectors: "local" with stops="some", and a user's rule. In a safe mode that novel
+    traces began, the three values are 0. `mode` is the newest event at which a safe mode began or
+    ended; without it `recovery` is "".
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule
@@ -630,13 +637,14 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     last : int
         Number of newest decisions that the picture marks; it is only passed on to `Course`.
     **by
-        `seconds` and `start` for periods of time, as `SqlStore.stretches` takes them. By default a
-        stretch has at least 20 decisions, the newest perhaps fewer.
+        `seconds` and `start`, for stretches that are periods of time (see `stretches_query`).
+        Without them each stretch has the same number of decisions, at least 20; the newest may have
+        fewer.
 
     Returns
     -------
     Course
-        With the newest 120 stretches at most; retrains and safe modes of all time.
+        With the newest 120 stretches at most. Its retrains and safe modes are all of the store.
     """
     modes = [event for event in store.events.newest() if event.kind in MODES]
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
@@ -652,8 +660,8 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     ----------
     store : SqlStore
     last : int or None
-        Number of newest decisions of the selection, which are read at once; None: all, read as the
-        iteration goes on.
+        Number of newest decisions of the selection; all of these are read by this call. None: all
+        decisions, which are read in pages during the iteration.
     **where
         The selection: fields of `HistoryFilter`.
 
@@ -720,8 +728,8 @@ def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        A row for each, indexed by its id: the fields of `Decision` but for the embedding, `time` in
-        UTC, and `label`, "good", "bad" or None.
+        A row for each decision, indexed by its id. The columns are the other fields of `Decision`
+        without the embedding, `time` in UTC, and `label`, which is "good", "bad" or None.
     """
     import pandas as pd
 

@@ -101,10 +101,10 @@ def field_types(record: type, *without: str) -> Json:
 def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[Struct]:
     """Return a msgspec struct type with a field for each parameter of a handler but **keywords.
 
-    A parameter with a default may be left out of a request. So may the `optional_fields`, given as
-    types by name; they are UNSET then. Unknown fields are refused. Underscores at the end of a
-    parameter's name are left out in a request: `id_` is `id` there. The handler's docstring is the
-    type's.
+    A parameter with a default may be left out of a request. The `optional_fields`, given as types
+    by name, may be left out too, and are UNSET then. Unknown fields are refused. Underscores at the
+    end of a parameter's name are left out in a request: `id_` is `id` there. The type gets the
+    handler's docstring.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
@@ -134,10 +134,10 @@ def media_type(request: Request) -> str:
 
 
 async def read_body(request: Request, struct_type: type[T], *other_types: str) -> T:
-    """Decode a request's JSON body, an object whose values are no objects, into a struct.
+    """Decode a request's JSON body into a struct; the body is an object without nested objects.
 
-    Raises Refusal: 415 for another media type, whose text also names `other_types`; 400 for a body
-    that cannot be decoded, or has a name twice; 422 for wrong fields.
+    Raises Refusal: 415 for another media type (the message lists JSON and the `other_types` as
+    accepted), 400 for a body that cannot be decoded or has a name twice, 422 for wrong fields.
     """
     media = media_type(request)
     if media != JSON:
@@ -200,8 +200,8 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
     Raises
     ------
     TraceError
-        For lists of unequal length and anything else, for no samples, for bytes that are no whole
-        number of samples of each channel or that look like float64.
+        For a value of another type, lists of unequal length, no samples, bytes that are not the
+        same whole number of samples for each channel, and bytes that look like float64.
     """
     if isinstance(value, bytes):
         if len(value) % (4 * channels):
@@ -231,12 +231,12 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
 
 
 def _look_like_float64(words: NDArray[np.float32]) -> bool:
-    """Return whether float32 words are more likely halves of float64 numbers, low half first.
+    """Return whether float32 words look like the halves of float64 numbers, low half first.
 
-    The low halves are then the ends of fractions: bits at random, or zeros. So it is True if all of
-    them are zero and some high half is not, or if at least `LARGE_SHARE` of all words are low
-    halves more than `LARGE_FACTOR` times as large as the largest high half. False for fewer than
-    `MIN_WORDS` words and for an odd number.
+    The low half of a float64 number is the end of its fraction: random bits, or zeros. So the
+    result is True if all low halves are zero and some high half is not. It is also True if many low
+    halves, at least `LARGE_SHARE` of all words, are more than `LARGE_FACTOR` times as large as the
+    largest high half. It is False for fewer than `MIN_WORDS` words and for an odd number of words.
     """
     if len(words) % 2 or len(words) < MIN_WORDS:
         return False
@@ -258,9 +258,9 @@ def _response_type(
 ) -> type[Struct]:
     """Make the struct type of a response, named `name`.
 
-    It has the record's fields with their types as in JSON, except those in `without`, and the
-    fields of `more`, types by name, which replace the record's. Its description is `about` and the
-    record's docstring.
+    It has the fields of the record, except those in `without`, with their types in JSON. It also
+    has the fields of `more`, given as types by name; they replace fields of the record with the
+    same name. Its description is `about`, followed by the record's docstring.
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
@@ -272,8 +272,8 @@ def _response_type(
 def _json_field_types(record: type) -> Json:
     """Return the types of a record's fields in JSON, under the names that `to_jsonable` gives them.
 
-    Fields that are marked "apart" in their metadata are left out; one marked "flat" gives its own
-    fields in its place.
+    The metadata of a dataclass field may have a mark: an "apart" field is left out, and a "flat"
+    field, itself a record, is replaced by its own fields.
     """
     hints = get_type_hints(record)
     members: Json = {}
@@ -287,8 +287,10 @@ def _json_field_types(record: type) -> Json:
 
 @cache
 def _json_type(hint: Any) -> Any:
-    """Return a type as JSON has it: dataclasses as structs, tuples as lists of the first item's
-    type, floats as nullable; in `X | Y` each of them, and other types as they are.
+    """Return the type that a Python type has in JSON.
+
+    A dataclass becomes a struct, a list or a tuple a list of its first item's type, and a float may
+    be null. In `X | Y` both types are converted. Other types are returned as they are.
     """
     if isinstance(hint, type) and is_dataclass(hint):
         return _response_type(hint.__name__, "", hint)
@@ -325,7 +327,9 @@ class Me(Struct):
 
 
 class Problem(Struct):
-    """Why a request is not served, as of RFC 9457. A part without a decision is verified."""
+    """Why a request is not served, in the form of RFC 9457. A part without a decision is
+    verified.
+    """
 
     title: str
     status: int
@@ -447,10 +451,11 @@ def problem_response(
 
 
 def _error_response(request: Request, error: Any) -> Response:
-    """Return the `Problem` response of an exception, with its own status or that in `STATUSES`.
+    """Return the `Problem` response of an exception.
 
-    A client that disconnected gets 400. An exception that is not expected gets 500 with a general
-    text, and is logged with its traceback.
+    Its status is the exception's own, or the one that `STATUSES` has for its type; it is 400 if the
+    client disconnected. Any other exception gets 500 with a general text, and is logged with its
+    traceback.
     """
     if isinstance(error, Refusal):
         return problem_response(error.status, error.detail, error.headers)
@@ -497,9 +502,10 @@ class Operation:
     optional_fields : dict
         Types of further fields that the handler takes if they are given.
     raw_parameter : str
-        The parameter that a body of bytes is; the others are then in the query. "": JSON only.
+        Name of the parameter that gets the body if the body is bytes; the other parameters are then
+        read from the query. "": the body must be JSON.
     examples : tuple of dict
-        Of the body.
+        Examples of the body.
     """
 
     method: str
@@ -518,10 +524,11 @@ class Operation:
     async def serve(self, request: Request) -> Response:
         """Read a request, call the handler with its fields, and return the response.
 
-        The fields are read from the query and path of a GET, or from the body; beside a body of
-        bytes, which is `raw_parameter`, from the query. A result of the handler that is no response
-        is sent as JSON. Raises Refusal for a request that cannot be read, and what the handler
-        raises; the application turns both into responses.
+        The fields of a GET are read from its query and path, those of a POST from its JSON body. If
+        the body is bytes, it is the field `raw_parameter`, and the other fields are read from the
+        query. A result of the handler that is not a response is sent as JSON. Raises Refusal for a
+        request that cannot be read, and whatever the handler raises; the application turns both
+        into responses.
         """
         if self.method == "GET":
             values = read_query(request, self.request_type)

@@ -58,9 +58,10 @@ CURRENT_TOKEN = ContextVar("CURRENT_TOKEN", default=ANYBODY)  # of the request b
 def read_tokens(file: Path) -> tuple[Token, ...]:
     """Read tokens from a file that only its owner may use, in the order of its lines.
 
-    Each line is a secret, optionally followed by `viewer` or `operator` and the owner's name.
-    Without these words a token may operate. Empty lines are skipped, and what is beyond 64 KiB is
-    not read. The group may read a credential of systemd; on Windows no permission is checked.
+    Each line is a secret, optionally followed by `viewer` or `operator` and the owner's name. A
+    secret alone is an operator's. Empty lines are skipped, and what is beyond 64 KiB is not read. A
+    file in systemd's folder of credentials may also be readable by its group. On Windows no
+    permission is checked.
 
     Raises
     ------
@@ -118,7 +119,8 @@ def names_this_machine(host: str) -> bool:
     """Return whether a request's `Host` header is localhost or a loopback address, with or without
     a port.
 
-    A web page whose own name was made to resolve to this machine (DNS rebinding) sends that name.
+    It is False for a web page of another site whose name was made to resolve to this machine (DNS
+    rebinding): the browser sends that name as `Host`.
     """
     try:
         return is_loopback(urlsplit(f"//{host}").hostname or "")
@@ -136,8 +138,9 @@ def find_token(tokens: tuple[Token, ...], secret: str) -> Token | None:
 def take_token(scope: Scope, authorization: str) -> str:
     """Return the secret that a request carries, or "" if it has none that can be read.
 
-    It is the rest of a path /RPC2/SECRET, else a bearer token or the password of HTTP Basic. Such a
-    path is changed to /RPC2 in `scope`, so that the secret is not logged later.
+    If the path is /RPC2/SECRET, the secret is taken from it, and the path in `scope` is changed to
+    /RPC2, so that the secret is not logged later. Otherwise the secret is a bearer token or the
+    password of HTTP Basic.
 
     Parameters
     ----------
@@ -220,9 +223,10 @@ class Guard:
         """Raise Refusal for a request that is not allowed; else set its token as `CURRENT_TOKEN`,
         for the handlers.
 
-        In this order it checks the host name of a server without tokens (421), the token
-        (`_check_token`), the site whose web page sends a request that may change something (403),
-        and the announced length of the body (413). A token in the path is removed from the scope.
+        The checks are, in this order: a request to a server without tokens must call it localhost
+        or by a loopback address (421); `_check_token` checks the token; a request that may change
+        something must not come from a web page of another site (403); and the announced length of
+        the body must be allowed (413). A token in the path is removed from `scope`.
         """
         headers = Headers(scope=scope)
         host = headers.get("host", "")
@@ -248,9 +252,10 @@ class Guard:
     def _check_token(self, scope: Scope, headers: Headers) -> None:
         """Check a request's token, and set `CURRENT_TOKEN`.
 
-        A secret in the path is removed from it. Raises Refusal: 401 without a right token, 403 for
-        a viewer's token on a request that could change something. /healthz needs no right token;
-        without one nothing is set. A server without tokens takes every request.
+        Raises Refusal: 401 for a missing or wrong token, 403 for a viewer's token on a request that
+        may change something. A request for /healthz without a right token is allowed, and
+        `CURRENT_TOKEN` is then not set. A server without tokens allows every request. A secret in
+        the path is removed from `scope`.
         """
         secret = take_token(scope, headers.get("authorization", ""))
         token = find_token(self.tokens, secret) if self.tokens else ANYBODY

@@ -39,7 +39,7 @@ async def playing(
     speed : float
         Parts per second after the first `N_FAST`, which are played without a pause.
     seed : int
-        Of the order.
+        Seed of the random order.
     """
     cell = ReplayCell(data)
     cell.order = np.random.default_rng(seed).permutation(len(cell.data))
@@ -55,11 +55,11 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
     """Insert every part of a recording once, ask the service for a decision, and report the
     outcome.
 
-    Reported are the recorded results of verified parts, and failures of accepted ones. The first
-    `N_FAST` parts have no pause, but each waits for a retrain under way; the later ones come at
-    `speed` parts per second. A part, or a report, for which the queue is full is left out. A log
-    line says when all parts were played. Any other exception is logged and ends the demonstration,
-    not the server.
+    The recorded result is reported for verified parts, and for accepted parts that are bad. After
+    each of the first `N_FAST` parts it only waits for the end of a retrain that is under way; later
+    parts come at `speed` parts per second. If the queue is full, the part or its report is left
+    out. A log line says when all parts were played. Any other exception is logged and ends the
+    demonstration, not the server.
     """
     loop = asyncio.get_running_loop()
     run = uuid.uuid4().hex[:8]

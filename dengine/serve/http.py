@@ -164,9 +164,10 @@ class HttpApi:
         """Decide on a trace. The same trace and request id get the same decision; another trace
         with that id gets 409, and a trace of a wrong shape 422.
 
-        A body of bytes has the other fields in the query. A decision that is not begun before the
-        deadline is VERIFY, late; one that the store cannot take is VERIFY, no_store. 503: the queue
-        is full or the server is closing, nothing was recorded, verify the part.
+        If the body is bytes, the other fields are in the query. A decision that is not begun before
+        the deadline is VERIFY with the reason late; if the store cannot take it, it is VERIFY with
+        the reason no_store. 503: the queue is full or the server is closing, and nothing was
+        recorded; verify the part.
         """
         samples = api.as_samples(trace, channels)
         response = await self.service.decide(samples, request, part)
@@ -189,9 +190,10 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        The same report twice is no error, a different one is 409; but `false` for an accepted part
-        that counts as good is a late line stop, and corrects that. An unknown id or part is 404.
-        With an author, or a token that has a name, a new label is an event, too.
+        The same report twice is no error; a report that contradicts an earlier one is 409. But
+        `false` for an accepted part that was confirmed as good before is a late line stop, and
+        corrects the label. An unknown id or part is 404. If the request has an author or the token
+        has a name, a new label is also recorded as an event.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -217,8 +219,9 @@ class HttpApi:
     ) -> Json:
         """Correct a label, from the next decision on, and return what changed.
 
-        What was reported stays on record. A forgotten label counts again. If the label counts so
-        already, nothing changes. 404: an unknown id or part; 422: it has no label.
+        The label as it was reported stays on record. A forgotten label counts again. If the part
+        already counts with this label, nothing changes. 404: an unknown id or part; 422: a decision
+        without a label.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -233,8 +236,9 @@ class HttpApi:
     ) -> Json:
         """Leave labels out of training and of all counts, and return what changed.
 
-        /correct takes one in again. If one id is unknown (404), or has no label (422), none is
-        forgotten. A pinned version that was trained with one of them is released.
+        /correct makes a forgotten label count again. If the id of one decision is unknown (404), or
+        a decision has no label (422), no label is forgotten. If a rollback pinned the version in
+        force, and it was trained with one of the labels, it is released.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -269,11 +273,11 @@ class HttpApi:
         )
 
     async def retrain(self, author: Author = "") -> Json:
-        """Begin a retrain, which is an event, and do not wait for its end; it replaces a pinned
-        version, too.
+        """Begin a retrain, record who asked for it as an event, and do not wait for its end.
 
-        If one is under way, the response says so, and nothing is begun or recorded. Whether the new
-        version was taken stands in /versions afterwards.
+        A pinned version is released, so that the new version may replace it. If a retrain is under
+        way already, the response says so, and nothing changes. /versions tells afterwards whether
+        the new version was put in force or dropped.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -358,9 +362,10 @@ class HttpApi:
     async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
         """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
-        A stretch is a shift, or without `hours` a share of the decisions, 20 or more, the newest
-        perhaps fewer. The newest 120 stretches are returned; the cell's retrains and safe modes may
-        be older. 422: hours below one second, unless 0.
+        With `hours` a stretch is a shift. Without it all decisions are split into at most 120
+        stretches of at least 20 decisions; the newest stretch may have fewer. At most the newest
+        120 stretches are returned, but all retrains and safe modes of the cell. 422: `hours` is
+        shorter than one second and not 0.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,
@@ -375,8 +380,8 @@ class HttpApi:
     async def embedding(self) -> Json:
         """Return where parts lie in the model's embedding, in two dimensions.
 
-        They are the newest 250 references and, of the newest 10 decisions, those that the present
-        version made; none before the first version.
+        The parts are the newest 250 references, and those of the newest 10 decisions that the
+        version in force made. There are none before the first version.
         """
         engine = self.service.engine
         parts = await self.service.read(
@@ -397,8 +402,8 @@ class HttpApi:
         return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
-        """Server-sent events: hello with the server's version, changed after changes, tick after a
-        silence. They end when the server ends.
+        """Server-sent events: hello with the server's version, then changed, at once and after each
+        change, and tick after `TICK` seconds without a change. They end when the server ends.
         """
 
         async def event_stream() -> AsyncIterator[str]:
@@ -421,8 +426,8 @@ class HttpApi:
     async def healthz(self) -> Response:
         """Return whether the engine answers: ok or degraded (200), down (503). It needs no token.
 
-        Degraded: the store cannot be written, or retrains are dropped again and again. Down: the
-        engine's thread has ended, or was busy with one thing for a minute.
+        Degraded: the store cannot be written, or the last three or more retrains were dropped.
+        Down: the engine's thread has ended, or was busy with one thing for a minute.
         """
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
@@ -464,8 +469,8 @@ class HttpApi:
 def _checked_author(author: str) -> str:
     """Return the author for the event log: the token's name if it has one, else the given name.
 
-    Runs of spaces become one. Raises Refusal 422 without a name, for one that is too long or not
-    printable, and for another name than the token's.
+    Repeated spaces become a single one. Raises Refusal 422 if there is no name, if the name is too
+    long or not printable, and if the given name is not the token's.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
@@ -481,9 +486,9 @@ def _read_newest(
 ) -> list[StoredDecision]:
     """Return up to `limit` decisions that `where` selects, newest first, without their traces.
 
-    With `before` only those older than the decision of this id; the list is empty if the id is
-    unknown. With `unlabelled` only verified ones whose label was never reported, whatever `where`
-    says of action and label; a forgotten label was reported.
+    With `before` only decisions older than the one with this id are returned; none if the id is
+    unknown. With `unlabelled` only verified decisions whose label was never reported are returned,
+    and the action and label in `where` are ignored. A forgotten label counts as reported.
     """
     if unlabelled:
         where = replace(where, action=Action.VERIFY, label="none")
@@ -496,11 +501,13 @@ def _read_newest(
 def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, given by its id or its part's number, as a response.
 
-    It has the decision's trace, the band of good parts (None where there is none), up to `N_BADS`
-    newest bad traces among the newest `N_LABELS` labels (none if their shape differs), and the
-    corrections of its label. Raises StoreError for a damaged trace of the decision or of a
-    neighbour; other damaged rows are left out, and an event records that. Raises
-    UnknownDecisionError without a decision, ReportConflictError if the part has several.
+    It has the decision's trace, the corrections of its label, the band of good parts (its three
+    curves are None if there is no band), and the newest `N_BADS` bad traces among the newest
+    `N_LABELS` labels (none if their shape differs).
+
+    Raises StoreError if the trace of the decision or of a neighbour is damaged; other damaged rows
+    are left out, and an event records that. Raises UnknownDecisionError if there is no such
+    decision, and ReportConflictError if the part has several.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -535,13 +542,14 @@ def create_app(
     ----------
     service : CellService
     tokens : tuple of Token, optional
-        Empty: serve the application at a loopback address alone, which is not checked here.
+        Empty: no request needs a token. Serve the application at a loopback address alone then;
+        this is not checked here.
     beside : sequence of callable
         Each is called with the service and returns an async context, which lasts as long as the
         application, in the same event loop: an OPC UA server, for example. One that fails to start
         ends the application; its error is `app.state.failure`.
     recorder : RtdeRecorder, optional
-        Of the traces for `decide_recorded`; the caller closes it.
+        Records the traces for `decide_recorded`; the caller closes it.
 
     Returns
     -------

@@ -78,7 +78,8 @@ class Metrics:
     def observe(self, response: ServiceResponse | ReportResponse | RetrainReport) -> None:
         """Add the duration of a response or a retrain to the histogram of its type.
 
-        Its labels are the fields that `HISTOGRAMS` names, of a decision its action and reason.
+        The Prometheus labels of the histogram are the fields that `HISTOGRAMS` names: for a
+        decision, for example, its action and its reason.
         """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response
@@ -90,9 +91,10 @@ class Metrics:
         return generate_latest(self._registry), CONTENT_TYPE_LATEST
 
     def collect(self) -> Iterator[Metric]:
-        """Yield gauges and counters with the state of engine and queue now; the registry calls it.
+        """Yield gauges and counters with the present state of the engine and its queue.
 
-        It reads no database, so that it works while the store is unavailable.
+        Prometheus's registry calls this when the metrics are read. It reads no database, so that it
+        works while the store is unavailable.
         """
         service = self._service
         engine = service.engine

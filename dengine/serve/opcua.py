@@ -76,8 +76,9 @@ class TokenUsers(UserManager):
     tokens : collection of str or None
         None: everybody.
     encrypted : bool
-        Only clients with a certificate, which every client that encrypts has. asyncua lets anyone
-        open a channel without security, to ask for the endpoints, and would accept a session on it.
+        Whether clients without a certificate are refused; every client that encrypts has one.
+        asyncua lets anyone open a channel without security, to ask for the endpoints, and would
+        accept a session on it.
     """
 
     def __init__(self, tokens: Collection[str] | None, encrypted: bool = False) -> None:
@@ -93,8 +94,8 @@ class TokenUsers(UserManager):
     ) -> User | None:
         """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        It is None without a certificate if the server encrypts, and for a wrong user name or token
-        if it has tokens.
+        A session is refused if the server encrypts and the client has no certificate, or if the
+        server has tokens and the user name or the token is wrong.
         """
         if self._encrypted and not certificate:
             return None
@@ -128,18 +129,18 @@ async def opcua_server(
     ----------
     service : CellService
     port : int
-        0: a free one, `server.bserver.port`.
+        0: any free port, which is then `server.bserver.port` of the yielded server.
     host : str
     tokens : collection of str, optional
         Passwords of the user `dengine`; None: everybody may read and call.
     cert, key : path, optional
-        PEM or DER files. With both the server speaks only Basic256Sha256, signed and encrypted;
-        else it encrypts nothing.
+        PEM or DER files. With them the server speaks only Basic256Sha256, signed and encrypted;
+        without them it encrypts nothing.
 
     Yields
     ------
     Server
-        It listens, and its variables have the present status.
+        The server, which listens. Its variables have the present status, if it could be read.
 
     Raises
     ------
@@ -241,10 +242,10 @@ class AddressSpace:
 
         Returns a list of action (0 verify, 1 accept, 2 reject), id, reason, lower, upper, version.
 
-        If the queue is full or the service closing, the result is VERIFY with an empty id. Raises
-        SettingError for an empty trace, one that the channels do not divide, and other than 1 to
-        `MAX_CHANNELS` channels; TraceError for a trace, and ReportError for a request, that the
-        engine does not take.
+        If the queue is full, or the service or its engine is closed, the result is VERIFY with an
+        empty id. Raises SettingError if the trace is empty, if its length is not a multiple of
+        `channels`, or if `channels` is not from 1 to `MAX_CHANNELS`. Raises TraceError for a trace,
+        and ReportError for a request id, that the engine does not take.
         """
         if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
             raise SettingError(
@@ -278,8 +279,8 @@ class AddressSpace:
     async def refresh(self) -> None:
         """Read the cell's status and write it into the variables.
 
-        If it cannot be read, that is logged, and the variables keep their values, with a status
-        that says that these are old.
+        If the status cannot be read, a warning is logged, and the variables keep their values with
+        the OPC UA status code UncertainLastUsableValue, which marks them as old. Nothing is raised.
         """
         try:
             await self.write_status(await self._calls.status())
@@ -294,8 +295,8 @@ class AddressSpace:
     async def write_status(self, status: Mapping[str, Any]) -> None:
         """Write a status, as `RobotCalls.status` returns it, into the variables.
 
-        If the text of the alarm has changed since the last call, send an event; an empty text sends
-        the event that the alarm has ended.
+        If the text of the alarm differs from that of the last call, an event with the new text is
+        sent. If the new text is empty, the event says that the alarm has ended.
         """
         for name, key in STATUS_NAMES.items():
             value = status[key]
@@ -317,8 +318,9 @@ class AddressSpace:
     ) -> Callable[..., Awaitable[Any]]:
         """Return a method for asyncua that checks its arguments and calls `call` with their values.
 
-        The method raises nothing. It returns the results as variants; for wrong arguments and for
-        an error of `call` it returns a status code, and writes a line that says why to LastRefused.
+        The method raises nothing. It returns the results as variants. For wrong arguments, or if
+        `call` raises an error, it returns a bad status code and writes the reason into the variable
+        LastRefused; an unexpected error is also logged.
         """
         forms = [_form(_type_of(item), item.ValueRank > 0) for item in arguments]
         listed = ", ".join(

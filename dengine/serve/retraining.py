@@ -52,8 +52,9 @@ class RetrainingProcess(Executor):
         self._start()
 
     def _start(self) -> None:
-        """Start a process, and let it import what a retrain needs; set `ready` to the future of
-        that, and do not wait.
+        """Start a process that imports what a retrain needs, and do not wait for it.
+
+        `ready` is set to a new future, which is done when the imports are.
         """
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _prepare_process)
@@ -117,9 +118,9 @@ class _SharedPickle:
 
 
 def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
-    """Return the value of a `_SharedPickle`, reading arrays of these sizes in bytes from a file.
+    """Return the value of a `_SharedPickle`, whose arrays are read from the file at `path`.
 
-    Raises EOFError if the file is shorter.
+    `sizes` are the sizes of the arrays in bytes. Raises EOFError if the file is shorter.
     """
     arrays = [np.empty(size, np.uint8) for size in sizes]
     with Path(path).open("rb") as file:
@@ -142,12 +143,12 @@ def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _
 
 
 def _prepare_process() -> None:
-    """Prepare the retraining process, in which this runs first: it ends with its parent.
+    """Set up the retraining process; this runs in it before anything else.
 
-    The process ends even during a call into C++, and at once if the parent has ended already. Where
-    that can be set, it leaves one of several cores to decisions and has a lower priority. It
-    ignores the ending signals: Ctrl-C signals all processes of a terminal, and the server ends this
-    process in order.
+    From now on the process ends when its parent ends, even during a call into C++; it ends at once
+    if the parent has ended already. If the system allows it, the process leaves one of several
+    cores to decisions and has a lower priority. It ignores the ending signals: Ctrl-C reaches all
+    processes of a terminal, but the server ends this process in order.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned

@@ -86,13 +86,13 @@ class RobotCalls:
         return {name: getattr(self, name) for name in CALLS}
 
     async def begin(self, request: Any = "") -> str:
-        """Begin a new part: forget what `add` took of its trace, and have the recorder wait for its
-        insertion.
+        """Begin a new part: forget the pieces that `add` took for it, and have the recorder wait
+        for its insertion.
 
-        The newest `MAX_PARTS` parts may have pieces of a trace at once; an older part must begin
-        again. The recorder records the newest part alone: a recording of an earlier one that was
-        not decided on is dropped. A recorder that fails is logged, and `decide_recorded` then
-        verifies the part. Without a recorder only the pieces are begun.
+        Pieces are kept for the newest `MAX_PARTS` parts; an older part must begin again. The
+        recorder records the newest part alone: the recording of an earlier part that was not
+        decided on is dropped. If the recorder fails, that is logged, and `decide_recorded` then
+        verifies the part. Without a recorder the part can only be sent by `add`.
 
         Parameters
         ----------
@@ -142,8 +142,9 @@ class RobotCalls:
         Raises
         ------
         TraceError
-            For a part that was not begun, or not lately; for a piece that has no samples or several
-            channels; and for more than `MAX_SAMPLES` samples.
+            For a part that was not begun, or is not among the newest `MAX_PARTS` any more; for a
+            piece that has no samples or several channels; and for more than `MAX_SAMPLES` samples
+            of the part.
         ReportError
             For an invalid id.
         """
@@ -194,12 +195,14 @@ class RobotCalls:
         return await self.decide_array(as_samples(trace), request, part)
 
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
-        """Decide on the pieces that `add` took of a part's trace; return a struct as `decide`.
+        """Decide on the pieces that `add` took of a part's trace; return the struct that `decide`
+        returns.
 
-        A part that has a decision gets it again. A new decision with an id drops the pieces; after
-        a VERIFY with an empty id, for instance if the queue is full, they stay, so that the call
-        can be repeated. Raises TraceError if there are no pieces or the engine does not take the
-        trace, and ReportError if it does not take the id.
+        If the request already has a decision, it is returned again, and the pieces are ignored. A
+        new decision drops the pieces. If it could not be recorded, for instance because the queue
+        is full, the result is VERIFY with an empty id, and the pieces stay, so that the call can be
+        repeated. Raises TraceError if there are no pieces or the engine does not take the trace,
+        and ReportError for an invalid id.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -215,12 +218,12 @@ class RobotCalls:
         return result
 
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
-        """Decide on the insertion since `begin`, as recorded.
+        """Decide on the trace that the recorder took of the insertion since `begin`.
 
-        It waits up to `RECORD_SECONDS` for the recording, which one call uses up. A part that has a
-        decision gets it again. Only the part of the newest `begin` has a recording. Without a
-        recording the result is verify, with an id "" and the reason "not_recorded"; nothing is
-        stored then.
+        If the request already has a decision, it is returned again. Otherwise the call waits up to
+        `RECORD_SECONDS` for the recording. Only the part of the newest `begin` has a recording, and
+        only for one call, even if that call times out or is refused. Without a recording the result
+        is verify with an id "" and the reason "not_recorded", and nothing is stored.
 
         Parameters
         ----------
@@ -300,13 +303,13 @@ class RobotCalls:
         -------
         bool
             True if the label is on disk, also if it was reported before. False if the id is "" or
-            unknown, or the report cannot be stored now: repeat it then.
+            unknown, and False if the report cannot be stored now; only then repeat it.
 
         Raises
         ------
         ReportError
             For a report that contradicts an earlier one, unless it is a line stop after a
-            confirmation; and for what is no label or no id.
+            confirmation; for a value that is no label; and for an invalid id.
         """
         if decision_id == "":  # of an unrecorded VERIFY
             return False
@@ -326,15 +329,16 @@ class RobotCalls:
         Returns
         -------
         struct
-            decisions, accepted, rejected, bad (false accepts): so far. verified_share: of the
-            newest 500 decisions, 1 without any. version: of the model. safe_mode, alarm: why, or
-            "". shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy:
-            decisions past the deadline, and requests refused.
+            decisions, accepted, rejected, bad (false accepts): counts so far. verified_share: share
+            of verified parts among the newest 500 decisions, 1 if there are none. version: number
+            of the version in force. safe_mode, alarm: the reason as a text, "" if there is none.
+            shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy:
+            numbers of decisions past the deadline and of refused requests since the start.
 
         Raises
         ------
         BusyError, StoreError
-            If the queue is full, or the store cannot be read.
+            If the queue is full or the service is closing, or if the store cannot be read.
         """
         service = self._service
         status = await service.status()
@@ -356,10 +360,10 @@ class RobotCalls:
         }
 
     async def _find(self, request: Any) -> Struct | None:
-        """Return a request's decision as the struct that the robot gets.
+        """Return the decision that a request already has, as the struct that the robot gets.
 
-        None if there is none, or if the store is busy or fails. Raises ReportError for an id that
-        is none.
+        None if it has no decision, and also if the queue is full or the store cannot look it up.
+        Raises ReportError for an invalid id.
         """
         try:
             stored = await self._service.find(as_id(request))

@@ -73,7 +73,8 @@ class LineFormatter(logging.Formatter):
 def log_lines() -> None:
     """Write the logs of all libraries to stderr, a line each, in place of all earlier handlers.
 
-    dengine's own are written from INFO on, others from their level on.
+    dengine's own messages are written from level INFO on, those of other libraries from the level
+    that is set for them, which is WARNING by default.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter())
@@ -113,10 +114,10 @@ def serve(
     say : callable
         Called with a line that says where the server listens, once it does.
     beside : sequence of callable
-        Called with the service, each returns an async context that lasts as long as the server; one
-        that fails to start ends it, and its error is raised.
+        Each is called with the service and returns an async context that lasts as long as the
+        server. If one fails to start, the server ends, and the error is raised.
     recorder : callable
-        Opens the recorder of a robot's insertions, or gives None.
+        Returns a context manager that opens the recorder of a robot's insertions, or gives None.
     host : str
         Address to listen on.
     port : int
@@ -130,7 +131,7 @@ def serve(
     check_seconds : float
         Duration of a verification.
     opcua : int or None
-        Port of OPC UA; None: off.
+        Port of OPC UA; None: off. The tokens of operators are its passwords, those of viewers not.
     opcua_cert, opcua_key : path or None
         None: `cert` and `key`.
 
@@ -214,10 +215,11 @@ class CellServer(uvicorn.Server):
     def capture_signals(self) -> Iterator[None]:
         """Handle the ending signals, within the block, as a request to end in order.
 
-        The first one is logged, ends the listening to changes and lets uvicorn finish; a second
-        SIGINT makes it wait no longer. uvicorn would raise the signals again after the end, which
-        would change the exit code. After the block the earlier handlers act again. In another
-        thread than the main one nothing is handled.
+        Each signal is logged, ends every iteration over `CellService.changes`, and asks uvicorn to
+        end after the requests under way; a second SIGINT makes it end without waiting for them. The
+        earlier handlers are set again after the block. uvicorn's own method would raise the signals
+        again then, which would change the exit code. In another thread than the main thread nothing
+        is handled.
         """
         # Python delivers signals to the main thread alone.
         if threading.current_thread() is not threading.main_thread():

@@ -64,9 +64,10 @@ class Job(NamedTuple):
     read_only: bool = False
 
     def run(self, engine: DataEngine) -> None:
-        """Do the work, even if the caller timed out, and set the future's result or exception.
+        """Do the work, and set the future's result or exception.
 
-        Without a caller the result is dropped, and an exception is logged. Nothing is raised.
+        If the caller has timed out, the work is done too; its result is dropped, and an exception
+        is logged. Nothing is raised.
         """
         has_caller = self.future.set_running_or_notify_cancel()
         try:
@@ -206,17 +207,17 @@ class CellService:
         Returns
         -------
         ServiceResponse
-            If the engine has not begun by the deadline, the decision that the id has already, else
-            VERIFY with `Reason.LATE` or the fault of the trace or the store; it is counted in
-            `late`. A decision that the engine has begun is waited for. If the store cannot be
-            written, or the id not be looked up, VERIFY with `Reason.NO_STORE`, which may not be
-            recorded.
+            The engine's decision, which is waited for if the engine has begun it by the deadline.
+            Otherwise the response counts in `late`; it has the decision that the id already has, or
+            else VERIFY with `Reason.LATE` or the fault of the trace or the store. If the store
+            cannot be written or cannot look up the id, the decision is VERIFY with
+            `Reason.NO_STORE`, and may not be recorded.
 
         Raises
         ------
         TraceError
-            For a wrong shape, a first trace of less than 10 samples, a part's number that is none,
-            or an id that belongs to another trace.
+            For a wrong shape, a first trace of less than 10 samples, an invalid part number, or an
+            id that belongs to another trace.
         ReportError
             For an invalid id.
         StoreError
@@ -256,8 +257,8 @@ class CellService:
         success : bool or float
             1 or True: good. The same label twice is no error.
         author : str
-            Of a person's report, for the event log. "": a machine's, which is not an event. Nor is
-            a repeated one.
+            The person who reports, for the event log. "": a machine's report, which is not recorded
+            as an event. A repeated report is not recorded either.
 
         Returns
         -------
@@ -266,8 +267,8 @@ class CellService:
         Raises
         ------
         ReportError
-            For an unknown id, what is no label, and another label than was reported; but a line
-            stop after a confirmation corrects it.
+            For an unknown id, for a value that is no label, and for another label than the reported
+            one; but a line stop after a confirmation is no error and corrects the label.
         StoreError
             If the label is not known to be on disk: report it again.
         BusyError
@@ -334,11 +335,11 @@ class CellService:
     async def read(self, work: Callable[[SqlStore], T]) -> T:
         """Call a function with a store that has every decision so far, and return its result.
 
-        The engine is flushed first, so this waits in the queue; decisions that the disk or the
-        store does not take in time are missing. The function, which must only read, runs in a
-        thread of its own, over the second connection, or in the engine's thread if the store is in
-        memory. Raises BusyError if the queue is full or the service is closing, and what the
-        function raises.
+        The engine first writes its decisions to the store, so this call waits in the queue;
+        decisions that the disk or the store does not take in time are missing, without an error.
+        The function must only read. It runs in another thread over the second connection, or in the
+        engine's thread if the store is in memory. Raises BusyError if the queue is full or the
+        service is closing, and whatever the function raises.
         """
         with suppress(NotTakenError):
             await self.call(lambda engine: engine.flush(), read_only=True)
@@ -347,8 +348,8 @@ class CellService:
         return await asyncio.to_thread(work, self.read_store)
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Return the status, as `DataEngine.status`; the engine's thread only flushes for it.
-        Raises BusyError and StoreError like `read`.
+        """Return the status that `DataEngine.status` returns, without its work in the engine's
+        thread, which only flushes. Raises BusyError and StoreError like `read`.
         """
         stored = await self.read(lambda store: status(store, last, watching))
         return self.engine.state.complete(stored)
@@ -393,7 +394,8 @@ class CellService:
     def close(self) -> None:
         """Answer the requests in the queue, close the engine and the stores, and end the threads.
 
-        It blocks until then. Later requests get BusyError; a second call does nothing.
+        It blocks until all this is done. Requests that come after the call get BusyError. A second
+        call does nothing.
         """
         if self._closing:
             return
@@ -414,9 +416,10 @@ class CellService:
     def _enqueue(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
         """Put work into the queue for the engine's thread, and return a future of its result.
 
-        `work` gets the engine, and whether the future was cancelled: it runs then, too, and its
-        result is dropped. After work that is `read_only` listeners are not notified. Raises
-        BusyError if the service is closing, or if the queue is full; the latter counts in `busy`.
+        `work` is called with the engine and with whether the future was cancelled. It runs even if
+        it was, and its result is then dropped. After work that is `read_only`, iterations over
+        `changes` are not woken. Raises BusyError if the service is closing, or if the queue is
+        full; the latter counts in `busy`.
         """
         job = Job(Future(), work, read_only)
         if self._closing or not self._thread.is_alive():
@@ -451,8 +454,9 @@ class CellService:
         """Open the engine, run jobs until None comes, and close it; the body of the engine's
         thread.
 
-        Sets `opened` to the engine, or to the exception that opening it raised, which ends the
-        thread. The listeners are notified after each job that may have changed something.
+        `opened` gets the engine, or the exception that opening it raised; the thread ends after
+        such an exception. After each job that is not `read_only` the iterations over `changes` are
+        woken.
         """
         try:
             engine = make()
@@ -469,9 +473,10 @@ class CellService:
     def _next_job(self, engine: DataEngine) -> Job | None:
         """Wait for the next job in the queue and return it; None means that the service ends.
 
-        While the queue is empty, the engine's other work is done: a retrain that is due begins, a
-        new version is swapped in by steps, and safe mode is announced. A finished retrain is passed
-        to the observers, and the listeners are notified. Errors of that are logged.
+        While the queue is empty, the engine does its other work: it begins a retrain that is due,
+        swaps in a new version step by step, and announces a safe mode. The report of a finished
+        retrain is passed to all `observers`, and every iteration over `changes` is woken. An error
+        in this work is logged and not raised.
         """
         # The time right after a response is best for other work: the next part is farthest away.
         timeout = SHORT_WAIT

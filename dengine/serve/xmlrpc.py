@@ -64,7 +64,7 @@ def routes(service: CellService, recorder: RtdeRecorder | None = None) -> list[R
     ----------
     service : CellService
     recorder : RtdeRecorder, optional
-        Of the traces for `decide_recorded`; the caller closes it.
+        Records the traces for `decide_recorded`; the caller closes it.
 
     Returns
     -------

@@ -221,7 +221,8 @@ def test_what_is_no_xml_rpc_at_all_is_refused_before_it_is_read(cell: Cell) -> N
     body = call("status")
     assert cell.post(body, "application/json")[0] == 415
     assert cell.post(body, method="GET")[0] == 405
-    assert cell.post(b"x" * (MAX_BODY + 1))[0] == 413
+    # Announced, and not sent: the server closes while a client still sends.
+    assert cell.post(b"", **{"Content-Length": str(MAX_BODY + 1)})[0] == 413
     assert cell.post(body, "text/xml; charset=utf-8")[0] == 200
 
 

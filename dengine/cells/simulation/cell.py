@@ -54,9 +54,10 @@ def read_sensor(
     parameters: CellParameters,
     rng: np.random.Generator,
 ) -> TraceArray:
-    """Return what the sensor reports of a true force: low-pass, faults, quantisation, lost samples.
+    """Return what the sensor reports of a true force.
 
-    A lost sample repeats the last one that was not lost. `rng` is advanced.
+    The force passes a low-pass filter, gets the sensor's faults, and is quantised. Then samples are
+    lost: a lost sample repeats the last sample that was not lost. `rng` is advanced.
 
     Parameters
     ----------
@@ -66,7 +67,7 @@ def read_sensor(
     parameters : CellParameters
         Only `bandwidth_hz` is used.
     rng : numpy.random.Generator
-        Source of the noise.
+        Draws the noise, the phase of the ripple, and which samples are lost.
 
     Returns
     -------
@@ -147,6 +148,8 @@ def insert_once(
         If MuJoCo is not installed.
     SettingError
         For a time step or sizes that cannot be simulated.
+    ValueError
+        For ranges or probabilities that `draw_conditions` cannot draw from.
     """
     world_rng, sensor_rng, _ = _make_generators(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
@@ -170,8 +173,9 @@ def insert_once(
 def _find_cause(conditions: Conditions, pushed: Push) -> str:
     """Return the cause of a failed insertion, one of `CAUSES` but "none".
 
-    A missed grasp or a wrong part that was drawn is the cause, and so is debris if the part stopped
-    on it; else the cause follows from where the part stopped, and whether it slipped.
+    If a missed grasp or a wrong part was drawn, that is the cause. Debris that was drawn is the
+    cause only if the part stopped on it. Otherwise the cause follows from where the part stopped,
+    and whether it slipped in the gripper.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
@@ -249,8 +253,8 @@ class SimulatedCell:
     def insert(self) -> TraceArray:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
-        It is in newtons, 2 s at 500 Hz. `last` is set, and the clock goes on by `cycle_s`. Raise
-        DengineError if the last part still waits for verify, proceed or reject.
+        The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and the clock goes on
+        by `cycle_s`. Raise DengineError if the last part still waits for verify, proceed or reject.
         """
         if self._waiting:
             raise DengineError(
@@ -276,10 +280,10 @@ class SimulatedCell:
     def proceed(self) -> Outcome:
         """Pass the part on without a check; return what became known of it.
 
-        A bad part stops the line (STOPPED, and the clock goes on by `stop_s`), except for a share
-        `CellParameters.unreported_share`, of which nothing becomes known (UNKNOWN). Of good parts a
-        share `confirm_share` is CONFIRMED, the others are UNKNOWN. Raise DengineError if no part
-        waits.
+        A bad part stops the line: the result is STOPPED, and the clock goes on by `stop_s`. But
+        with the probability `CellParameters.unreported_share` nothing becomes known of a bad part
+        (UNKNOWN). A good part is CONFIRMED with the probability `confirm_share`, else UNKNOWN.
+        Raise DengineError if no part waits.
         """
         success = self._take_waiting("proceed").success
         # It depends on the part alone.

@@ -189,9 +189,10 @@ _DRAWN_BY: dict[str, str | Range] = {
 def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Conditions:
     """Draw the conditions of one insertion, its fault included; `rng` is advanced.
 
-    Every quantity is drawn in every cycle, so that a change of one does not change the others. At
-    most one fault is drawn; it replaces the normal values that it concerns. A missed grasp replaces
-    none, and is told by `fault` alone.
+    Every quantity is drawn in every cycle, even if it is not used, so that another range for one
+    quantity does not change the others. At most one fault is drawn; its values replace the normal
+    ones, for example a weak grip the normal grip. A missed grasp replaces no value: only the field
+    `fault` says so.
 
     Parameters
     ----------
@@ -205,7 +206,8 @@ def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Con
     Raises
     ------
     ValueError
-        For a range (high, low), a negative deviation, and probabilities of faults that are none.
+        For a range whose first number is larger than its second, a negative standard deviation, or
+        probabilities of faults that are negative or add up to more than 1.
     """
     p = parameters
 
@@ -257,9 +259,9 @@ def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
 
 
 def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return the parameters unchanged before half way, from then on those of a variant of the part.
+    """Return the parameters: unchanged in the first half of the cycles, then for another part.
 
-    The variant is 2.5 times as heavy, has a tighter fit and a smaller chamfer.
+    This variant of the part is 2.5 times as heavy, with a tighter fit and a smaller chamfer.
     """
     if cycle < cycles // 2:
         return parameters

@@ -37,7 +37,7 @@ def simulate(
     scenario : str, default "nominal"
         A name in `SCENARIOS`.
     n_jobs : int, default -1
-        Processes, as in joblib; `joblib.parallel_config` chooses the backend.
+        Number of processes; -1: one for each core. `joblib.parallel_config` chooses the backend.
     progress : callable, optional
         Called with 1 after each insertion.
     time_step_s : float
@@ -75,11 +75,9 @@ def save_insertions(
 ) -> Path:
     """Write insertions as a compressed .npz file that `load_dataset` reads; return its path.
 
-    The folder is created if need be, and the file is written in full or not at all. Traces are
-    rounded to integer steps of `scale`, 0.01 N or more.
-
-    The arrays are X int16 (n, 1000) with `scale`, so that X * scale is in `unit`; y int8 (n,);
-    rate_hz and unit.
+    The folder is created if it is missing, and the file is written in full or not at all. The
+    arrays are X int16 (n, 1000), scale, y int8 (n,), rate_hz and unit. X * scale are the traces in
+    newtons: they are rounded to multiples of `scale`, which is 0.01 N or more.
 
     Parameters
     ----------

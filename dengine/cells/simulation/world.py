@@ -107,9 +107,9 @@ def _drive(
 ) -> NDArray[np.float64]:
     """Run the controller of the push; return the force (1000,) in newtons, at 500 Hz.
 
-    `steps` is the number of physics steps per sample; `data` is advanced. The force is zeroed
-    before the motion, with the part in the gripper; pushing is positive. Near its limit the push
-    slows down, and above it the gripper moves back.
+    `steps` is the number of physics steps per sample; `data` is advanced. The force before the
+    motion, with the part in the gripper, counts as zero; pushing is positive. Near the force limit
+    the push slows down, and above the limit the gripper moves back.
     """
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
@@ -235,10 +235,10 @@ def _fixture_xml(c: Conditions) -> str:
 
 
 def _wall_xml(side: int, half: float, chamfer: float, depth: float) -> str:
-    """Return the MJCF of wall `side` (0 to 3): the wall at +x, turned by quarter turns about z.
+    """Return the MJCF of one wall of the hole, as text: three boxes, one of which is the chamfer.
 
-    It is text with three boxes, the chamfer among them. Half width, chamfer and depth of the hole
-    are in metres.
+    Wall 0 is at +x; wall `side` (0 to 3) is turned by `side` quarter turns about z. The half width
+    `half`, the chamfer and the depth of the hole are in metres.
     """
     wall = _WALL_MM / 1000
     reach = half + chamfer + wall

@@ -178,16 +178,18 @@ class UrCell(AbstractContextManager["UrCell"]):
         return OUTCOMES[self._execute_order(Verb.PROCEED)]
 
     def reject(self) -> None:
-        """Have the part put back to the bin without measuring; raise CellError as `insert`."""
+        """Have the part put back to the bin without measuring; raise CellError like `insert`."""
         self._execute_order(Verb.REJECT)
 
     def _execute_order(self, verb: Verb) -> ResultCode:
-        """Send an order, wait at most `order_timeout` seconds for its result, and return that.
+        """Send an order, wait at most `order_timeout` seconds for its result, and return the
+        result.
 
-        What was received before is discarded. Meanwhile the order is written again after a
-        reconnection. After INSERT, also wait, in the same time, for the end of the trace, and set
-        `last` to it, or to None if it was not seen. Raise CellError if the robot does not answer in
-        time, fails, or its program stops; then the order is not written again.
+        Packages that were received before are discarded. While this waits, a new connection has the
+        order written again, as `RtdeStream.write` says. INSERT also waits, within the same time,
+        for the end of a trace that has begun. It sets `last` to the insertion, or to None if none
+        was complete by then. Raise CellError if the robot does not answer in time, fails, or its
+        program stops; after that the order is not written again.
         """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
@@ -209,9 +211,9 @@ class UrCell(AbstractContextManager["UrCell"]):
         return result
 
     def _timeout_error(self, expected: str) -> CellError:
-        """Return the CellError for a robot that did not do in time what was expected of it.
+        """Return the CellError for a robot that did not do in time what `expected` says.
 
-        The message ends with the reason, as far as the connection tells it.
+        The message ends with why there is no connection, or with advice if there is one.
         """
         stream = self.recorder.stream
         reason = "it did not; does its program do what ur_cell.script does, is it paused?"
@@ -222,8 +224,8 @@ class UrCell(AbstractContextManager["UrCell"]):
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
         """Return the result code of the present order if this package holds it, else None.
 
-        Raise CellError if the order failed, is void or has a result that it cannot have; without a
-        result, if the robot's program has stopped.
+        Raise CellError if the result is FAILED, VOID or one that this order cannot have, or if the
+        robot's program has stopped and this package holds no result.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
         state = int(row.values[RUNTIME])
@@ -244,10 +246,11 @@ class UrCell(AbstractContextManager["UrCell"]):
         return None
 
     def _wait_until_ready(self) -> int:
-        """Wait until the program runs and owes no result; return the number of its last order.
+        """Wait until the robot's program runs and has answered its last order; return the number of
+        this order.
 
-        Packages that arrive meanwhile are discarded. Raise CellError after `start_timeout` seconds,
-        with what is missing.
+        Packages that arrive meanwhile are discarded. Raise CellError after `start_timeout` seconds;
+        its message says whether the program does not run, or has not answered.
         """
         problem = ""
         for row in self.recorder.rows(self.start_timeout):

@@ -41,7 +41,10 @@ TYPES = {  # by field type: the letter of `struct`, and the number of values
 
 
 class HeldError(CellError):
-    """Another client writes this input; maybe one that has gone, as the controller will notice."""
+    """Another client of the controller writes this input.
+
+    It may have gone already: the controller notices that after a short time.
+    """
 
 
 class PackageType(IntEnum):
@@ -122,8 +125,9 @@ class RtdeRecipe:
     def pack(self, values: Mapping[str, float]) -> bytes:
         """Return a data package, with its header, of these values by column.
 
-        Columns that are left out are 0, and names that are no columns are ignored. Numbers for an
-        integer field are cut to integers. Raise struct.error for one that its field cannot hold.
+        Columns that are left out are 0, and names that are no columns are ignored. A number for an
+        integer field loses its fraction. Raise struct.error for a number that its field cannot
+        hold, for example one that is too large.
         """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))

@@ -140,8 +140,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def record(self, timeout: float = 60.0) -> InsertionRecord:
         """Wait for the next insertion after the last one, or after `arm`, and return it.
 
-        An insertion that is not complete after `timeout` seconds, for example since the controller
-        fell silent, is returned with NaN for what is missing; one whose start was lost is all NaN.
+        An insertion that is not complete after `timeout` seconds, for example because the
+        controller fell silent, is returned with NaN for the missing samples. If its start was lost,
+        all samples are NaN.
 
         Parameters
         ----------
@@ -173,9 +174,10 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         )
 
     def rows(self, seconds: float) -> Iterator[Row]:
-        """Yield packages as they arrive, for this many seconds; each is taken from the stream.
+        """Yield packages as they arrive, for this many seconds, and remove them from the buffer.
 
-        The time runs from the first package that is asked for. A closed stream ends it early.
+        The time runs from the first package that is asked for. If the stream is closed, the
+        iteration ends early.
         """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -192,9 +194,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def feed(self, row: Row) -> InsertionRecord | None:
         """Add a package of the stream; return the insertion that it completes, else None.
 
-        Samples that were lost are NaN in its trace; all are if its start was lost. If the
-        controller's clock was set back, as by a restart, an insertion that has begun is returned as
-        far as it was received, and everything before is discarded.
+        Samples that were lost are NaN in its trace; all samples are NaN if its start was lost. If
+        the clock of the controller went back, because it was restarted, an insertion that has begun
+        is returned as far as it was received, and all earlier packages are discarded.
         """
         record = None
         # An earlier time: the controller was restarted.
@@ -246,7 +248,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _reset(self) -> None:
-        """Discard packages, start and arming, so that the next insertion is looked for."""
+        """Discard the packages and the start of an insertion, and what `arm` set; the recorder then
+        looks for the next insertion.
+        """
         self._finder.forget()
         self._rows = []
         self._start = None

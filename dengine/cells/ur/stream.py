@@ -131,9 +131,10 @@ class RtdeClient:
     def _request(self, type_: PackageType, payload: bytes) -> bytes:
         """Send a request, wait for its response, and return the payload of the response.
 
-        Other packages that arrive before are dropped. For START the first data package counts as a
-        yes, and is kept for `rows`. Raise CellError if the connection is lost or silent for
-        `timeout` seconds, or for bytes that are no RTDE.
+        Packages of another type that arrive before it are dropped. But if the request is START, a
+        data package that arrives first counts as the response "accepted", and is kept for `rows`.
+        Raise CellError if the connection is lost or silent for `timeout` seconds, or for bytes that
+        are no RTDE.
         """
         self._send(Package(type_, payload).to_bytes())
         while (package := next(self._incoming)).type is not type_:
@@ -153,10 +154,10 @@ class RtdeClient:
             self._socket.sendall(data)
 
     def _receive_packages(self) -> Iterator[Package]:
-        """Yield packages as they arrive, without an end, but texts, of which the newest is kept.
+        """Yield packages as they arrive, without an end, except the controller's text messages.
 
-        Raise CellError if the connection is lost or silent for `timeout` seconds, with a message
-        that quotes the newest text, or if it sends no RTDE.
+        The newest text is kept for error messages. Raise CellError if the connection is lost or
+        silent for `timeout` seconds (the message quotes the text), or for bytes that are no RTDE.
         """
         packages = PackageReader()
         while True:
@@ -231,11 +232,11 @@ class StreamReport:
 class RtdeStream(AbstractContextManager["RtdeStream"]):
     """Receives packages in a thread and buffers them for `take`.
 
-    The parameters are those of `RtdeClient`, and `clock`, which returns seconds. The first
-    connection raises CellError if it fails, SettingError for an unknown column. A connection that
-    is lost later is made again, with as many attempts as that takes, and the newest inputs are
-    written again, unless they are old or the controller was restarted. The buffer holds 60 s of
-    packages; older ones are dropped.
+    The parameters are those of `RtdeClient`, and `clock`, a function that returns seconds. If the
+    first connection fails, CellError is raised, or SettingError for an unknown column. If a
+    connection is lost later, the thread reconnects, with as many attempts as that takes. It then
+    writes the newest inputs again, unless they are old or the controller was restarted. The buffer
+    holds 60 s of packages; older packages are dropped.
 
     Attributes
     ----------
@@ -296,8 +297,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def take(self, timeout: float) -> Row | None:
         """Remove and return the oldest buffered package.
 
-        It waits `timeout` seconds for one, but not once the stream is closed; None if there is none
-        then.
+        If the buffer is empty, it waits up to `timeout` seconds for a package, and no longer once
+        the stream is closed. It returns None if no package came.
         """
         with self._news:
             self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
@@ -315,9 +316,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         All fields that the stream was opened with are written: columns that are left out become 0,
         and names that are no columns are ignored.
 
-        If the connection is lost, the next one has them written again, unless they are `REPEAT_S`
-        old by then or the controller was restarted. Raises struct.error for a number that its field
-        cannot hold.
+        If the connection is lost, the newest inputs are written again on the next connection,
+        unless they are `REPEAT_S` old by then or the controller was restarted. Raises struct.error
+        for a number that its field cannot hold.
 
         Parameters
         ----------
@@ -330,10 +331,10 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             self._send()
 
     def _send(self) -> None:
-        """Write the newest inputs, if there are some and a connection; the caller holds the lock.
+        """Write the newest inputs; do nothing without inputs or a connection.
 
-        A lost connection is noted in `trouble` and not raised: the thread reconnects and writes
-        them again, unless they are old by then.
+        The caller holds the lock `_news`. A lost connection is noted in `trouble` and not raised:
+        the thread reconnects and writes the inputs again, unless they are old by then.
         """
         if self._client is not None and self._written is not None:
             try:
@@ -344,7 +345,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def _read_loop(self) -> None:
         """Receive packages and reconnect until the stream is closed: the body of the thread.
 
-        Each new connection is counted; without one, `trouble` says why.
+        Each new connection is counted. While there is no connection, `trouble` says why.
         """
         while self._client is not None:
             client = self._client
@@ -368,11 +369,12 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                         new_client.close()
 
     def _count_and_buffer(self, row: Row) -> None:
-        """Count a package and what is missing before it, buffer it, and wake who waits in `take`.
+        """Count a package and the packages missing before it, buffer it, and wake callers of
+        `take`.
 
-        If the buffer is full, its oldest package is dropped. The first package of a new connection
-        also has the inputs written again, if they are less than `REPEAT_S` old. After a restart of
-        the controller they are forgotten instead.
+        If the buffer is full, its oldest package is dropped. At the first package of a new
+        connection the newest inputs are written again, if they are less than `REPEAT_S` old. But if
+        the package shows that the controller was restarted, the inputs are forgotten.
         """
         with self._news:
             if self._newest is not None:
@@ -393,8 +395,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def _connect(self, until: float = float("inf")) -> RtdeClient | None:
         """Try to connect until it succeeds; return the connection, None if the stream is closed.
 
-        `until`, a time of `time.monotonic`, is given for the first connection. Then a failure
-        raises its error; but an input that another client writes is waited for until that time.
+        The first connection gives `until`, a time of `time.monotonic`. A failure then raises its
+        CellError or SettingError at once; only if another client still writes an input, the
+        attempts go on until that time. Later failures are noted in `trouble`.
         """
         wait, longest_wait = RETRY_S
         while not self._closing.is_set():

@@ -60,18 +60,20 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     source : path or DataFrame
         A folder, a file or a table of recordings.
     stated : mapping, optional
-        Keys that are known, like `{"label.column": "verdict"}`; the others follow from them.
+        Keys whose values are known, like `{"label.column": "verdict"}`. They are kept, and the
+        proposals for the other keys follow from them.
 
     Returns
     -------
     Description
-        With `?` where no rule proves a value. `open_keys` lists these, and `notes` has the evidence
-        and the candidates by key.
+        A key has the value `?` if no rule proves a value. `open_keys` lists these keys, and
+        `notes` has the evidence and the possible values by key.
 
     Raises
     ------
     DataError
-        If there is no file, or none that holds samples, or if what is stated does not exist.
+        If there is no file, or no file that holds samples, or if a stated column, source of
+        labels or text form does not exist.
     """
     p = Proposal(stated or {}, Description().with_values(stated or {}))
     check_text(p.description.text)
@@ -90,10 +92,11 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
 def choose_files(p: Proposal, root: Path) -> bool:
     """Set in `p` which files are the recordings, and their format; return whether that is clear.
 
-    They are the stated files, or else those of the only suffix that several files, or a bag
-    (`.mcap`), have; if there is no such suffix, those of the only suffix at all. If several
-    suffixes remain, `files` is set to `?` with a note that lists them, the format stays as it was,
-    and False is returned. Raises DataError if there is no file of recordings.
+    If the user stated `files`, they are these. Otherwise they are the files with the only suffix
+    that several files have; the suffix of a bag, `.mcap`, counts even for one file. If no suffix
+    qualifies, all suffixes do. If several suffixes qualify, `files` is set to `?` with a note that
+    lists the suffixes, the format is not set, and the result is False. Raises DataError if there
+    is no file of recordings.
     """
     stated = p.description.files
     every = names_in(root, ())
@@ -117,7 +120,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
 
 def likely_suffixes(names: Names) -> Names:
-    """Return the suffixes that several files have, and that of a bag; if there is none, all."""
+    """Return the suffixes that several files have, and `.mcap`; if there is none, all suffixes."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 
@@ -128,13 +131,13 @@ def suffix_of(name: str) -> str:
 
 
 def names_in(root: Path, patterns: Names) -> Names:
-    """Return the files of a folder, each as seen from it, in their natural order.
+    """Return the files of a folder that may be recordings: relative paths, run_2 before run_10.
 
-    Left out are hidden files, descriptions, pages for people, and, without patterns, files of
-    suffixes that no format has. Of a single file it is that file, whatever it is called; the list
-    is empty if nothing is found. Raises DataError for a malformed pattern.
+    Hidden files, descriptions, and files like README or LICENSE are left out. Without `patterns`,
+    files with an unknown suffix are left out too. If `root` is a file, the list has only its name.
+    If nothing is there, the list is empty. Raises DataError for a malformed pattern.
 
-    patterns : of the files, if they are known.
+    patterns : patterns of the files, like `*.csv`; empty: all files below the folder.
     """
     if root.is_file():
         return [root.name]
@@ -144,16 +147,16 @@ def names_in(root: Path, patterns: Names) -> Names:
 
 
 def globs(names: Names) -> list[str]:
-    """Return patterns that match files, one for each suffix; of a single file, its name."""
+    """Return patterns that match the files, one for each suffix; for a single file its name."""
     folders = "**/" if any("/" in name for name in names) else ""
     endings = {name.removeprefix(without_suffix(name)) for name in names}
     return sorted(f"{folders}*{end}" for end in endings) if len(names) > 1 else [*names]
 
 
 def contents_of(p: Proposal) -> dict[str, bytes]:
-    """Return the contents of some files, by their names: of 60, evenly spread, until 2 MB are read.
+    """Return the contents of at most 60 files, evenly spread over all, by name.
 
-    Files that cannot be read are left out.
+    No further file is read once 2 MB were read. Files that cannot be read are left out.
     """
     contents = dict[str, bytes]()
     for name in p.names[:: math.ceil(len(p.names) / MOST_FILES)]:
@@ -164,10 +167,10 @@ def contents_of(p: Proposal) -> dict[str, bytes]:
 
 
 def read_tables(p: Proposal) -> list[Table]:
-    """Return the first tables of some files, of those with the columns of most.
+    """Return one table for each file that is looked at, if it has the most frequent columns.
 
-    For texts the keys of `[text]` are set in `p` before, and files of another form leave `p.names`.
-    Damaged files are left out; raises DataError if all are.
+    For text files the keys of `[text]` are set in `p` first, and files of another form move from
+    `p.names` to `p.others`. Damaged files are left out. Raises DataError if all are damaged.
     """
     contents = contents_of(p)
     if p.description.format == "text":
@@ -185,11 +188,12 @@ def read_tables(p: Proposal) -> list[Table]:
 
 
 def table_in(p: Proposal, content: bytes, name: str) -> Table:
-    """Return the first table of a file, of a text with all cells as words.
+    """Return the table of a file; a text file gives all cells as texts.
 
-    A single .npz file holds all parts if the layout `npz` is stated, or none and its arrays hold
-    curves. Of long texts only the beginning is read, and `p.is_cut` is set. Raises DataError if the
-    file is damaged.
+    An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
+    is stated, if it is the only file and its arrays hold curves. Of a text or jsonl file of more
+    than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is
+    damaged.
     """
     kind = p.description.format
     if kind == "npz":
@@ -206,12 +210,13 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 
 
 def propose_tables(p: Proposal, files: Tables) -> None:
-    """Find the layout, and the role of each column, and set their keys in `p`.
+    """Find the layout, then the role of each column, and set their keys in `p`.
 
-    Of each file at most `MOST_ROWS` rows are read; `p.is_cut` says so. `p.tables` becomes the
-    recordings, and `p.names` is emptied unless each file is one. If the layout, or the column that
-    tells the parts apart, is `?`, the roles stay open, with a note, and tables and names as they
-    were. Raises DataError if there is no table, no part in them, or no samples.
+    At most the first 50,000 rows of each file are used; `p.is_cut` is set if a file has more.
+    `p.tables` becomes the tables of the parts, and `p.names` is emptied unless each file is one
+    part. If the layout or `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names`
+    stay, and a note on `channels` says why. Raises DataError if there is no table, no part, or no
+    samples.
     """
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")

@@ -25,10 +25,12 @@ LISTING = "windows={listing=FILE, key=COLUMN, start=COLUMN, end=COLUMN}"
 
 
 def propose_bag(p: Proposal) -> None:
-    """Find the channels, clock, parts and labels of a bag by the first messages of its first file.
+    """Propose the channels, the clock and the source of labels of a bag, and how it is cut.
 
-    Unless they are stated, `traces.samples`, `windows.trigger` and `label.topic` are set to `?`,
-    with a note on the topics and their words. Raises DataError if the file cannot be read.
+    It looks at the first 50,000 messages of the first file. `traces.samples` is set to `?` unless
+    it is stated; so is `windows.trigger` unless it or `windows.listing` is stated, and
+    `label.topic` unless anything of the label is stated. The notes on the last two list the topics
+    and their words. Raises DataError if no message can be read.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()
@@ -65,10 +67,10 @@ def propose_bag(p: Proposal) -> None:
 
 
 def _fields(message: Any, path: str) -> Iterator[tuple[str, str]]:
-    """Yield the fields of a message that hold numbers, `TOPIC.FIELD`, with their units.
+    """Yield (TOPIC.FIELD, unit) for each number in a message, also in nested fields.
 
-    The unit is that of a field `force` or `torque` in which the number stands, else "". The header
-    is left out.
+    The unit is N or Nm if the number stands in a field named `force` or `torque`, else "". The
+    header is left out.
     """
     for name in getattr(message, "__slots__", ()):
         value = getattr(message, name)

@@ -45,11 +45,11 @@ ANSWERS = (  # to a clock that the reader would refuse
 
 
 def propose_clock(p: Proposal) -> None:
-    """Find the column of the clock, and its form, and set them in `p`.
+    """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
-    If several columns may be the clock or a part of it, as a date is, or no header names the
-    columns, `time.column` is set to `?`, with a note. If none may be, only a note says that the
-    rate is unknown.
+    `time.column` is set to `?`, with a note, if several columns may tell the time or a part of it,
+    like a date, or if no column has a name. If no column may tell the time, it stays empty, and a
+    note says that the rate is unknown. A stated column is kept; only its form is found.
     """
     stated = p.description.time.column
     clocks = [column for column in p.columns.values() if is_clock(column)]
@@ -70,10 +70,10 @@ def propose_clock(p: Proposal) -> None:
 
 
 def is_clock(column: Column) -> bool:
-    """Return whether a column may tell the times of samples.
+    """Return whether a column may hold the times of the samples.
 
-    Dates and times do if they change, and so does what is named like a clock if it is a number that
-    rises, or no number.
+    Dates and times of day may if they change within a recording. So may a column that is named like
+    a clock, if it has numbers that rise, or if it changes and not all cells are numbers.
     """
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
@@ -99,11 +99,14 @@ def is_rising(column: Column) -> bool:
 
 
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
-    """Return the unit or form of a column of times; `?` where several fit or none is proved.
+    """Return the unit or the form of a column of times; `?` if several fit or none is proved.
 
-    A note in `p` says why it is `?`, or which size of numbers proves the unit. Dates of one day
-    read the same whether the day or the month comes first, if another column tells the time; of
-    several days, or with the time, they do not.
+    A note on `time.format` in `p` says why it is `?`, or which size of numbers proves the unit. If
+    day and month can be confused, the form is `?` for a column that alone tells the time or that
+    changes within a recording. Beside a column of times, dates of one day get the first form: the
+    order of day and month does not change the steps between samples.
+
+    is_alone : whether no other column tells a part of the time.
     """
     forms = column.forms
     if len(forms) > 1 and (is_alone or not column.fixed):
@@ -117,7 +120,7 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
 
 def _unit_in(name: str) -> str:
-    """Return the unit of times that a column's name has, `t [ms]`, or is, `millis`; "" for none."""
+    """Return the unit of time in a column's name, `ms` for `t [ms]` or `millis`; "" for none."""
     if match := UNIT_IN_NAME.search(name):
         return match[1].replace(",", ".")
     match = NAMED_UNIT.search(name)
@@ -125,9 +128,9 @@ def _unit_in(name: str) -> str:
 
 
 def _unit_by_size(column: Column) -> tuple[str, str]:
-    """Return the unit of numbers, by their size and their steps, and a note on what proves it.
+    """Return the unit of time that the size and the steps of numbers prove, and a note on it.
 
-    The unit is `?` if nothing does; the note then has the units that are possible.
+    The unit is `?` if nothing proves it; the note then lists the possible units.
     """
     rising = column.steps[column.steps > 0]
     if not len(rising):
@@ -152,12 +155,12 @@ def is_rate(step: float) -> bool:
 
 
 def propose_rate(p: Proposal, tables: Tables) -> None:
-    """Set the rate of the clock in `p`, by the median of the mean steps of recordings.
+    """Set `time.rate_hz` in `p`, from the median of the mean steps of the recordings.
 
-    It is `?` if no force is recorded at such a rate. If more than 10 % of the recordings would be
-    faults because of their times, `time.gap` is `?`, with a note on the first. If all times are
-    dates after the year 2000, the order is set to `time`. Recordings whose times cannot be read are
-    passed over.
+    It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then no gaps are looked for. If
+    more than 10 % of the recordings plus one would be faults because of their times, `time.gap` is
+    set to `?`, with a note on the first. If all recordings start after the year 2000, `order` is
+    set to `time`. Recordings whose times cannot be read are skipped.
     """
     clocks = list[tuple[Table, Floats]]()
     starts, means = list[float](), list[float]()

@@ -63,39 +63,39 @@ class Column:
 
     @cached_property
     def odd(self) -> Counter[str]:
-        """How often each word comes that is no number, with whatever decimal mark."""
+        """How often each word comes that is not a number with any decimal mark."""
         return Counter({w: n for w, n in self.counts.items() if not NUMBER.fullmatch(w)})
 
     @cached_property
     def fixed(self) -> list[str]:
-        """The word of each recording; none if it changes within one."""
+        """The word of each recording; empty if the words of any recording differ between rows."""
         is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
         return [str(words[0]) for words in self.words] if is_fixed else []
 
     @cached_property
     def numbers(self) -> list[Floats]:
-        """The numbers of each recording; an empty list if any cell is no number of the form."""
+        """The numbers of each recording; empty if any cell is not a number as `form` writes it."""
         with suppress(DataError):
             return [table.numbers(self.name, self.form) for table in self.tables]
         return []
 
     @cached_property
     def steps(self) -> Floats:
-        """The steps from number to number within the recordings; none if a cell is no number."""
+        """The differences of successive numbers in each recording; empty if a cell is no number."""
         return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for it; "" if none does."""
+        """The unit that most files state for the column; "" if most state none."""
         units = Counter(bare(table.units.get(self.name, "")) for table in self.tables)
         return units.most_common(1)[0][0]
 
     @cached_property
     def forms(self) -> list[str]:
-        """All forms of dates and times that fit its cells; none if there is a cell of another kind.
+        """All forms of dates and times that fit its cells; none if a cell is no date or time.
 
-        It looks at the first 20 cells and the last of each recording. If an ISO date or moment
-        fits, it is the only form.
+        The first 20 cells and the last cell of each recording are looked at. If an ISO date fits,
+        with or without a time of day, it is the only form.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
@@ -121,11 +121,11 @@ def columns_of(tables: Tables, form: TextForm) -> dict[str, Column]:
 class Proposal:
     """A description that is put together key by key, and what its keys are inferred from.
 
-    stated : keys that the user gave, with their values. description : with all keys so far. base :
-    the folder. names : the recordings' files, if each is one. others : the other files. is_cut :
-    whether some file was read in part. tables : of the recordings that were looked at. columns : of
-    the rows that are samples, as far as that is known. notes : a comment for each key that needs
-    one.
+    stated : keys that the user gave, with their values. description : the description with all keys
+    so far. base : the folder. names : the files of the recordings; empty if a file holds several
+    parts. others : the other files in the folder. is_cut : whether only the beginning of some file
+    was read. tables : the recordings that are looked at. columns : their columns by name, without
+    rows that are known to be no samples. notes : a comment by key.
     """
 
     stated: Stated

@@ -53,12 +53,13 @@ Words = Mapping[str, str]  # by recording
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
-    """Return a source with its words' meanings, good, bad and unchecked; stated ones stay.
+    """Return a source in which the words that it has are sorted into good, bad and unchecked.
 
-    Words of known meaning, whatever their case, fill the others. `good` and `bad` are `?` where
-    they would be empty if the meaning of any word is not known, and in a path if either is empty:
-    `pass_1.csv` alone may be anything. In a column of only true, yes or 1 and their opposites (and
-    words for unchecked) they are known only if its name is one like `success`, not for `failed`.
+    Each of these lists that the user stated stays; the others get the words of known meaning, in
+    any case of letters. If a word stays without a meaning, `good` and `bad` become `?` if they
+    would be empty. The same holds for a path if either is empty: `pass_1.csv` alone proves nothing.
+    A column with only true, yes or 1, their opposites, and words for unchecked has known meanings
+    only if its name is one for good, like `success`; for one named `failed` they stay unknown.
     """
     words = sorted({*words})
     name = source.column or source.line or source.topic
@@ -82,7 +83,12 @@ def is_plain(source: LabelSource) -> bool:
 
 
 def in_paths(paths: Names) -> list[str]:
-    """Return the expressions that find verdicts in paths; none if a not stands before one."""
+    """Return the regular expressions that find words like "ok" or "failed" in paths.
+
+    Such a word is the name of a folder, or begins or ends a file name. Each expression has only the
+    words that it finds. The list is empty if a path negates such a word, like "not_passed", or has
+    true or false after a name, like "leak=False": the meaning is open then.
+    """
     stems = [*map(without_suffix, paths)]
     patterns = []
     for pattern in () if any(map(NEGATED.search, stems)) else PATHS:
@@ -103,10 +109,10 @@ def is_verdict(name: str, words: Names) -> bool:
 
 
 def row_of(column: Column) -> Literal["", "same", "last"]:
-    """Return which row of a recording has the label in a column; "" if the column is no verdict.
+    """Return which row of a recording has the label in this column; "" if it holds no labels.
 
-    `same`: each recording has one word. `last`: only words for not checked stand above the last
-    row. See `is_verdict`.
+    "same": each recording has one word in all rows. "last": the last row has the label, and all
+    rows above have the same word or a word for unchecked. The column must pass `is_verdict`.
     """
     last = [str(words[-1]) for words in column.words if len(words)]
     above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
@@ -115,13 +121,19 @@ def row_of(column: Column) -> Literal["", "same", "last"]:
 
 
 def lines_of(p: Proposal, pattern: re.Pattern[str]) -> list[str]:
-    """Return the beginnings of lines above a header, before the first mark, that a pattern fits."""
+    """Return how lines above the header begin, up to the first `; : = , tab`, if a pattern fits.
+
+    Only the first table is looked at.
+    """
     lines = [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
     return [*filter(pattern.search, (line.strip(" \"'") for line in lines))]
 
 
 def part_words(source: PartSource, tables: Tables) -> Words:
-    """Return the number of the part of each recording that states one; "" if there is no source."""
+    """Return the part number of each recording that has one, by its source.
+
+    The number is "" if `[part]` states nothing.
+    """
     words = dict[str, str]()
     for table in tables:
         with suppress(DataError):
@@ -130,9 +142,11 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 
 
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
-    """Yield the stated source, or those that may hold labels in listings, paths, columns, lines.
+    """Yield the sources that may hold the labels; if the user stated a source, only that.
 
-    They come in this order. A file that cannot be read as a listing is passed over.
+    They come in this order: listings among the other files, the paths (if a file or a column is a
+    part), columns without a role, and lines above the header. A file that cannot be read as a
+    listing is skipped.
     """
     label = p.description.label
     if any(getattr(label, kind) for kind in KINDS):
@@ -155,8 +169,8 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
     """Return the word of each recording that has one in a source.
 
-    A stated source must have one: raises DataError if it has none or cannot be read. Any other then
-    gives no words.
+    If the source is the stated one, raises DataError if no recording has a word or its listing
+    cannot be read. Any other source then gives an empty mapping.
     """
     words = dict[str, str]()
     is_stated = source == p.description.label
@@ -171,17 +185,18 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
 
 
 def title_of(source: LabelSource, words: Words) -> str:
-    """Return what to type for a source, with the counts of its words."""
+    """Return the settings that state a source, like `label.column=result`, with the word counts."""
     stated = [f"label.{kind}={getattr(source, kind)}" for kind in KINDS if getattr(source, kind)]
     return f"{' '.join(stated)} ({counts_of(words.values())})"
 
 
 def count_sources(p: Proposal) -> dict[LabelSource, Words]:
-    """Return the sources of labels, each with the word of every recording that has one.
+    """Return the possible sources of labels, each with the word of every recording that has one.
 
-    It is the stated source alone, or else each candidate that has words for more than half of the
-    recordings. For listings and paths all recordings count, whose names are enough; for columns and
-    lines only those whose tables were read. Raises DataError if the stated source has no words.
+    If the user stated a source, only that one is returned. Otherwise it is each source that has
+    words for more than half of the recordings. For listings and paths all recordings count, since
+    their names are enough; for columns and lines only those whose tables were read. The meanings of
+    the words are set as in `with_meanings`. Raises DataError if the stated source has no words.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
@@ -197,9 +212,9 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
 
 
 def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
-    """Return 1 for each recording with a word for good, -1 for bad, 0 for not checked.
+    """Return, by recording, 1 for a word for good, -1 for bad and 0 for unchecked.
 
-    The mapping is empty if the meaning of a word is not known, or no word is for good or bad.
+    The dict is empty if a word has no known meaning, or if no word is for good or bad.
     """
     is_known = {*source.good, *source.bad, *source.unchecked}.issuperset(words.values())
     sides = {name: (word in source.good) - (word in source.bad) for name, word in words.items()}
@@ -207,12 +222,13 @@ def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
 
 
 def propose_label(p: Proposal) -> None:
-    """Find the source of the labels, and those that must agree with it, and set them in `p`.
+    """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
-    The first source whose words are known is the label if all such agree with it, and the others
-    are checks if they have a word for each recording. If no words are known, a single source is the
-    label, with `?` for its words. If sources disagree, or none is certain, `label.column` is `?`,
-    and the note lists them all. Raises DataError if a stated source has no words.
+    Certain are the sources whose words all have a known meaning. If two certain sources disagree,
+    `label.column` is `?`, with a note that lists all sources; so too if none is certain, unless it
+    is the only source, which then is the label with `?` for its words. Otherwise the first certain
+    source is the label. The other certain ones that have a word for each of its recordings become
+    checks, unless checks are stated. Raises DataError if a stated source has no words.
     """
     counted = count_sources(p)
     certain = [source for source, words in counted.items() if sides_of(source, words)]
@@ -229,9 +245,11 @@ def propose_label(p: Proposal) -> None:
 
 
 def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
-    """Put the words of the label, and its other sources, into the notes of `p`.
+    """Note in `p.notes` which words stand in the source of the label, and how often.
 
-    If it is open which words are good or bad, the notes ask for that.
+    The words are the texts that stand for a label, like "ok". `words` has one for each recording;
+    `others` describes the other possible sources, which the same note lists. If the meaning of a
+    word is unknown, the notes on `label.good` and `label.bad` ask for it.
     """
     counts = counts_of(words.values())
     if UNKNOWN in label.good + label.bad:
@@ -241,7 +259,12 @@ def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) ->
 
 
 def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
-    """Return in words on how many recordings a source disagrees with the first; "" if none."""
+    """Return a sentence if a source contradicts the first source, with the number of recordings.
+
+    Only the first source that contradicts it is reported; "" if none does.
+
+    sides : of each source, 1 for good, -1 for bad and 0 for unchecked, by recording.
+    """
     for other in sides[1:]:
         if n := sum(side * other.get(name, 0) < 0 for name, side in sides[0].items()):
             return f"two of these disagree on {n:,} of {len(sides[0]):,} recordings"
@@ -249,7 +272,11 @@ def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
 
 
 def _few_words(p: Proposal) -> list[str]:
-    """Return texts on columns, and folders, of few words that may be labels under other names."""
+    """Return a text on each possible source of labels that may have an unusual name.
+
+    These are the unused columns with one word in each recording, and the folders of the files, if
+    there are 2 to 12 different words.
+    """
     few = {column.name: column.fixed for column in p.unused}
     few[f"label.path={FOLDER}"] = [name.split("/")[-2] for name in p.names if "/" in name]
     return [

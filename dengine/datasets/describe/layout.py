@@ -24,12 +24,13 @@ MOST_PARTS = 240
 
 
 def layout_of(p: Proposal, files: Tables) -> str:
-    """Return how parts are laid out, as `Description.layout` has it; `?` if nothing tells.
+    """Return how the files hold parts, as `Description.layout` names it; `?` if it cannot be told.
 
-    It is `long` if a column may tell the parts apart, or if the stated one has several words. Then
-    `part.column` in `p` is the only such column that is named like a part, or `?`. Nothing tells
-    for a single table without such a column; `p.notes` then says what to state. Raises DataError
-    for a table with one row for each verdict and no samples.
+    It is `long` if a column may tell the parts apart, or if the stated `part.column` has several
+    words; `part.column` is then set in `p` to the only such column with a name like a part's, or to
+    `?` with a note. It is `?` for a single table without lists, numbered columns or such a column;
+    a note says what to state. Raises DataError for a table of results: one row for each part, with
+    its label, and no samples.
     """
     kind = p.description.format
     first = files[0]
@@ -54,9 +55,10 @@ def layout_of(p: Proposal, files: Tables) -> str:
 
 
 def may_tell_parts(column: Column) -> bool:
-    """Return whether the words of a column come in one run each, of 8 rows or more in the mean.
+    """Return whether each word of a column stands in consecutive rows, in the mean 8 or more.
 
-    A column that is fixed in each table, or is a clock, tells no parts.
+    It is False for a column with only one word in each table or with an empty cell, and for a
+    column of times, unless it is named like a part.
     """
     n_runs = sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
     is_long = column.counts.total() >= LEAST_RUN * n_runs
@@ -67,7 +69,7 @@ def may_tell_parts(column: Column) -> bool:
 
 
 def numbered_columns(table: Table) -> list[str]:
-    """Return the patterns, like `x*`, of at least 20 columns with numbers behind one name."""
+    """Return a pattern like `x*` for each name, as in `x0`, `x1`, that 20 columns or more share."""
     counts = Counter(re.sub(r"\d+$", ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
 
@@ -79,9 +81,10 @@ def has_lists(table: Table) -> bool:
 
 
 def _refuse_results(columns: Iterable[Column]) -> None:
-    """Raise DataError for a table with a row for each result, and no samples.
+    """Raise DataError for a table of results: a row for each part, with its label, but no samples.
 
-    That is one with a column of known verdicts, good and bad, that changes within 8 rows.
+    A column shows this if all its words are known, both for good and for bad, and a word stands in
+    fewer than 8 rows between two others.
     """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
@@ -95,10 +98,12 @@ def _refuse_results(columns: Iterable[Column]) -> None:
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:
-    """Return the tables of the parts that are looked at: the first 240 without damage.
+    """Return the tables of the parts that are looked at: the first 240 parts without damage.
 
-    In the layout `long` the last part of each file is left out if a file was read only in part,
-    since it may be cut. Raises DataError if the files do not split as the layout says.
+    The layout of a description says how files hold parts; in `long` one file holds several parts,
+    one below the other. If a file was read only in part, the last of several parts of each file is
+    left out in this layout, since it may be cut. Raises DataError if the files do not split as the
+    layout says.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])

@@ -37,11 +37,12 @@ FORCES = (
 
 
 def propose_roles(p: Proposal) -> None:
-    """Give each column a role, one after the other, by keys in `p`; what is stated stays.
+    """Find what each column is for, and set the keys that say so in `p`; stated keys stay.
 
-    Roles that nothing proves are `?`. While it is open which rows are samples, `traces.samples` is
-    `?`, and no rate is set. Raises DataError for a stated clock, channel or label that does not
-    exist.
+    In this order: columns that tell which rows are samples, clock, part, label, channels. A key is
+    `?` if no rule proves a value. If it is open which rows are samples, `traces.samples` is `?` and
+    no rate is set. Raises DataError if a stated column of times or channel does not exist, or a
+    stated source of labels has no words.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -64,9 +65,9 @@ def propose_roles(p: Proposal) -> None:
 
 
 def samples_only(p: Proposal, table: Table) -> Table:
-    """Return the rows of a table that are samples, as far as their words are known.
+    """Return the rows of a table that are samples, by the columns of `[rows]` with known words.
 
-    All rows are returned if a word in them has no stated meaning.
+    If a cell of these columns has a word without a meaning, all rows are returned.
     """
     rows = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
     with suppress(DataError):
@@ -75,9 +76,9 @@ def samples_only(p: Proposal, table: Table) -> Table:
 
 
 def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
-    """Set in `p` what the words of columns mean for their rows, and leave out those that are none.
+    """Set `[rows]` in `p`, and leave the rows that are no samples out of `p.columns`.
 
-    From then on `p.columns` has only the rows that are samples. Without words nothing changes.
+    Nothing changes if `rows` is empty.
     """
     if rows:
         p.description = replace(p.description, rows=rows)
@@ -85,11 +86,11 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
 
 
 def qualify_rows(p: Proposal) -> None:
-    """Find the columns that qualify rows: few words that change within a recording.
+    """Find the columns that tell which rows are samples, and set them as `[rows]` in `p`.
 
-    They are set in `p`, with `?` for the words to keep and a note that counts them, or with the
-    word if there is only one. Where the user states some words, the others are kept, or dropped if
-    those to keep are stated.
+    Such a column has few words, and they change within a recording. If it has several, its `keep`
+    is `?`, with a note that counts them; if it has one, that word is kept. If the user stated some
+    words of a column, its other words are added to `keep`, or to `drop` if `keep` is stated.
     """
     rows = dict(p.description.rows)
     unused = p.unused
@@ -112,10 +113,11 @@ def qualify_rows(p: Proposal) -> None:
 
 
 def qualifies(column: Column) -> bool:
-    """Return whether the words of a column, at most 12, tell which rows are samples.
+    """Return whether the words of a column may tell which rows are samples.
 
-    `Status` does, also if it has only one word; `TagName` does if it changes within a recording.
-    Numbers do so only in a column that is named like a status, and labels do not.
+    It must have at most 12 words, and each recording several rows. A column that is named like a
+    status (`Status`, `valid`) may have numbers, and also just one word. Any other must have texts
+    that change within a recording. A column that holds labels with known words is none.
     """
     name = column.name
     words = column.counts
@@ -130,10 +132,10 @@ def qualifies(column: Column) -> bool:
 
 
 def propose_part(p: Proposal) -> None:
-    """Set in `p` the column or line with the part's number, if exactly one has its name.
+    """Set `[part]` in `p` to the column or the line above the header that has the part's number.
 
-    It must tell most recordings apart. If there are several, only a note lists them; what is stated
-    stays.
+    Its name must be like a part's, and it must have different words for more than half of the
+    recordings. If several qualify, only a note lists them. A stated source stays.
     """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
@@ -147,13 +149,13 @@ def propose_part(p: Proposal) -> None:
 
 
 def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
-    """Choose the channel: the only column, or the only one of the first rule that any fits.
+    """Set `[channels]` in `p` to one column, with its unit; does nothing if channels are stated.
 
-    These are a force along z, then any force, by its name or by a unit of force or torque. If
-    several fit, or no column does, the channels stay open, with a note that lists the columns.
-    Nothing changes if channels are stated.
+    The rules are tried in order, and the first that any column fits decides: a name like a force
+    along z, a name like a force, a unit of force or torque, a name like `F` or `value`, any column.
+    If several columns fit it, or there is no column, the channels stay open, with a note.
 
-    units : of the columns that may be channels.
+    units : the columns that may be channels, with their units.
     """
     if p.description.channels:
         return
@@ -170,10 +172,11 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
 
 def _units(p: Proposal) -> dict[str, str]:
-    """Return the columns that may be channels, with their units, "" for none.
+    """Return the unused columns that may be channels, with their units; "" for no unit.
 
-    Their numbers change, no word but one for a lost sample is in more than 1 % of the cells, and
-    they are neither clocks nor counters.
+    Such a column has at least two different numbers, at most 10 % of its cells are no numbers, and
+    no text, except one for a lost sample, is in more than 1 % of them. Times, counters of rows and
+    columns that are constant in each recording are left out.
     """
     units = dict[str, str]()
     for column in p.unused:
@@ -190,10 +193,10 @@ def _units(p: Proposal) -> dict[str, str]:
 
 
 def find_lost(p: Proposal) -> None:
-    """Set in `p` the words for lost samples of the channels.
+    """Set `text.missing` in `p` to the words that stand for lost samples in the channels.
 
-    If more than 10 % of a channel's cells are empty, these are no lost samples: their rows are
-    dropped, since they are samples of something else.
+    If more than 10 % of the cells of a channel are empty, empty cells are not lost samples: such
+    rows belong to another signal, and `[rows]` drops them.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
@@ -210,10 +213,10 @@ def find_lost(p: Proposal) -> None:
 
 
 def propose_lengths(p: Proposal) -> None:
-    """Set in `p` how many samples the traces have, the median of the recordings.
+    """Set `traces.samples` in `p` to the median length of the recordings.
 
-    If some have other lengths, a note counts them; if they are more than 10 %, `traces.lengths`
-    becomes `pad`.
+    If some have other lengths and `traces.lengths` is `strict`, a note counts them; if these are
+    more than 10 %, `traces.lengths` becomes `pad`.
     """
     words = [p.columns[name].words for name in p.description.channels if name in p.columns]
     lengths = [n for n in map(len, words[0] if words else ()) if n]
@@ -227,9 +230,10 @@ def propose_lengths(p: Proposal) -> None:
 
 
 def list_others(p: Proposal) -> None:
-    """Set in `p` the columns without a role as ignored, and the other files as excluded.
+    """Set in `p` the columns without a role as `ignored`, and the other files as `exclude`.
 
-    Files get a note; they are left alone if it is open, `?`, whether they are recordings.
+    Listings are not excluded, and `exclude` gets a note. If it is `?`, because other files may be
+    recordings, it stays.
     """
     listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)

@@ -52,9 +52,9 @@ class Look:
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
-    """Return how a file is written, by its first 200 lines; None if it is empty or no text.
+    """Return how a text file is written, by its first 200 lines; None if it is empty or no text.
 
-    stated : keys that the user gave, of which the encoding and the delimiter are used.
+    stated : keys that the user gave; only `text.encoding` and `text.delimiter` are used.
     """
     encoding, text = decode(content, stated.get("text.encoding", ""))
     lines = text.splitlines()[:MOST_LINES]
@@ -73,9 +73,10 @@ def look(content: bytes, stated: Stated) -> Look | None:
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
-    """Return the encoding of a text and its first part of 400 kB; both "" if it is none.
+    """Return the encoding of a text, and the first 400 kB decoded; ("", "") if that fails.
 
-    The encoding is what is stated, else UTF-16 by the mark at its beginning, UTF-8 or cp1252.
+    The stated encoding is used if there is one. Otherwise it is UTF-16 if the text begins with a
+    byte order mark of it, else UTF-8, or cp1252 if UTF-8 fails.
     """
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
@@ -87,10 +88,11 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
 
 
 def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]:
-    """Return how well a delimiter parts lines into rows of numbers, and the cells of a row.
+    """Return a score of how well a delimiter splits lines into numbers, and the cells per line.
 
-    The share is that of the lines with the usual number of cells, times that of numbers in their
-    cells; a single cell scores 0. The first third of the lines may be a preamble.
+    The score is the share of lines with the usual number of cells, times the share of numbers among
+    their cells, and is lower for blanks; 0 if the usual line has one cell. The first third of the
+    lines is left out, since it may be text above the samples.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
@@ -108,9 +110,9 @@ def _count_numbers(cells: Sequence[str]) -> int:
 
 
 def _first_row(rows: Rows, width: int) -> int:
-    """Return the first row of samples: as many numbers as usual, as have those behind it.
+    """Return the first row of samples, from 0; 0 if there is none.
 
-    It is counted from 0, and 0 if there is no such row.
+    It is the first of four successive rows that each have about as many numbers as is usual.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
@@ -118,7 +120,10 @@ def _first_row(rows: Rows, width: int) -> int:
 
 
 def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
-    """Return the lines, from 1, of the header and of the units above the samples; 0 for none."""
+    """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
+
+    rows : the cells of the lines above the samples.
+    """
     heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(map(str.strip, row))]
     units = 0
     if len(heads) > 1:
@@ -129,13 +134,13 @@ def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
-    """Set the keys of `[text]` in `p` for most of the files, and leave out files of another form.
+    """Set `[text]` in `p` for the form that most files have, and set aside files of another form.
 
-    These have another delimiter, another number of columns, or another header than most, and move
-    from `p.names` to `p.others`. If several of them have samples, `exclude` is set to `?`, with a
-    note that asks whether they are recordings. Raises DataError if no file is a text.
+    Those have another delimiter, number of columns or header, and move from `p.names` to
+    `p.others`. If two or more of them have samples, `exclude` is set to `?`, with a note that asks
+    whether they are recordings. Raises DataError if no file is a text.
 
-    contents : of the files that are looked at, by their names.
+    contents : the contents of the files that are looked at, by name.
     """
     groups = defaultdict[Any, dict[str, Look]](dict)
     for name, content in contents.items():
@@ -153,10 +158,12 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 
 
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
-    """Set the keys of `[text]` in `p` for files of one form, as the first of them is written.
+    """Set the keys of `[text]` in `p`, as the first of these files is written.
 
-    If the header stands at another line in some, `text.header` becomes the text of its line. A note
-    warns if an encoding is guessed, and the decimal mark is `?` if nothing proves it.
+    If the header stands at different lines, `text.header` becomes its text. A note warns if the
+    encoding is guessed. The marks in numbers are set by `propose_marks`.
+
+    looks : the first lines of files of one form.
     """
     usual = looks[0]
     form = usual.form
@@ -176,11 +183,12 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 
 
 def _column_names(usual: Look) -> Sequence[str]:
-    """Return names for the columns where the header does not give one for each; else none.
+    """Return the names for `text.names`; empty if the header names each column.
 
-    If the header has more names than there are columns, they are its first. Without a header they
-    are `c0`, `c1`, ..., or for 20 columns or more `x*`, which stands for all. In such a matrix,
-    whose rows are parts, a first column of few whole numbers is their `class`.
+    If the header has more names than there are columns, its first names are used. Without a header
+    the names are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names all of them. Such
+    a matrix has a part in each row; if its first column has few different whole numbers, it is
+    named `class`.
 
     usual : the first lines of a typical file.
     """
@@ -197,12 +205,14 @@ def _column_names(usual: Look) -> Sequence[str]:
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
-    """Set in `p` the decimal mark and that of groups with which most numbers are read.
+    """Set in `p` the decimal mark and the mark between groups of digits that read most numbers.
 
-    `1.043,5` is read with a decimal comma and a point between groups alone. The decimal mark is
-    `?`, with a note, if as many are read with the other one, since `1.043` is read with both, or if
-    more than 5 % with neither. The mark between groups is `?` if few numbers need it, and
-    none has both marks: `7,286` among numbers with a decimal point may be damaged.
+    `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if both
+    marks read as many numbers, or if more than 5 % of the numbers cannot be read at all. The mark
+    between groups is `?`, with a note, if fewer than 5 % of the numbers need it and no number has
+    both a point and a comma: `7,286` among `7.1` and `8.2` may be a damaged number.
+
+    cells : texts that are numbers with some marks.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
     n_read = dict[tuple[str, str], int]()

@@ -31,11 +31,11 @@ Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, d
 
 
 def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Message]:
-    """Yield the messages of some topics, or of all for None, in their order in the file.
+    """Yield (topic, time in ns, message) for each message of some topics, as the file has them.
 
-    Raises DataError if its name does not end in .mcap, or if a package that reads such files is not
-    installed. If the file is damaged, or was not closed, UnreadableError is raised behind the
-    messages before that.
+    `topics` None means all topics. Raises DataError if the file is not a .mcap file, or if a
+    package that reads such files is not installed. If the file is damaged or was not closed, the
+    whole messages are yielded first; then UnreadableError is raised.
     """
     if path.suffix.lower() != SUFFIX:
         do = "`ros2 bag convert` makes them of .db3 files"
@@ -64,26 +64,27 @@ def read_bag(
     description: Description,
     faults: list[Fault],
 ) -> Table:
-    """Return a table with a row for each message of the channels, in the order of the log.
+    """Return a table with a row for each message that has the channels, in the order of its time.
 
-    The column of a topic of labels has each of its messages in the last row before it, of several
-    the first, and `None` elsewhere; that of another topic has the newest message in each row.
+    Other topics that the description names are columns too. If a topic is a label, each of its
+    messages stands in the last row before it, other rows have None; of several messages after one
+    row, the first stands there. Any other topic has its newest message in each row.
 
     Parameters
     ----------
     files : sequence of (Path, str)
-        In their order, each with its name for messages.
+        The files of the bag in their order, each with its name for error messages.
     title : str
-        What the bag is called in messages.
+        The bag's name in error messages.
     description : Description
     faults : list
-        Gets the files that are damaged; their messages before the damage are read.
+        Gets a fault for each damaged file; its messages before the damage are read.
 
     Raises
     ------
     DataError
-        If the channels are of several topics, or their topic has no messages, or if a file before
-        the last is not whole and a trigger cuts.
+        If the channels are of several topics, if their topic has no messages, or if a trigger cuts
+        the bag and a file other than the last is damaged.
     """
     columns = [*description.channels]
     topics = {column.partition(".")[0] for column in columns}
@@ -108,9 +109,11 @@ def _rows_of(
     events: Events,
     faults: list[Fault],
 ) -> list[Any]:
-    """Return the times and values of each message of the channels, and put others into `events`.
+    """Return (time, header time, values) of each message with the channels, both times in ns.
 
-    A file that is damaged, or whose messages lack a field, becomes a fault. Raises as `read_bag`.
+    Messages of other topics are appended to `events`. A file that is damaged, or with a message
+    that lacks a field, adds a fault. Raises DataError if no message has the channels, or if a
+    trigger cuts the bag and a file before the last has a fault.
     """
     fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
@@ -135,7 +138,11 @@ def _rows_of(
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
-    """Return the column of a topic beside the rows of the log, see `read_bag`; sorts `messages`."""
+    """Return the column of a topic: its message for each row, as `read_bag` describes it.
+
+    messages : (time in ns, data) of the topic; they are sorted in place. logs : the times of the
+    rows.
+    """
     messages.sort(key=itemgetter(0))
     times = [time for time, _ in messages]
     words = [word for _, word in messages]

@@ -31,7 +31,10 @@ def has_day(unit: str) -> bool:
 
 
 def scale_of(unit: str) -> float:
-    """Return the seconds of a unit of time, `ms` or `0.001 ms`; DataError for another text."""
+    """Return how many seconds a unit of time has: 0.001 for `ms`, 1e-6 for `0.001 ms`.
+
+    Raises DataError for any other text.
+    """
     match = re.fullmatch(r"(\d*\.?\d*)\s*([^\d.]+)", unit.strip())
     if not match or match[2].strip() not in UNITS:
         wanted = f"a unit of time of {', '.join(UNITS)}, {ISO}, or a form like %d.%m.%Y"
@@ -40,15 +43,21 @@ def scale_of(unit: str) -> float:
 
 
 def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
-    """Return the seconds of each row since the first, shape (rows,), and the time of the first.
+    """Return the time of each row in seconds since the first row, and the time of the first row.
 
     Parameters
     ----------
     table : Table
     clock : Clock
-        Its columns are added up.
+        The times in its columns are added up. Without columns there is one time, 0.
     form : TextForm
         How numbers are written.
+
+    Returns
+    -------
+    seconds : array of float64, shape (rows,)
+    start : float
+        In seconds, from the zero of the clock: 1970 (UTC) for dates.
 
     Raises
     ------
@@ -70,10 +79,10 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
 
 
 def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextForm) -> Times:
-    """Return the times of one column since its first, and the first, in seconds.
+    """Return the times of one column in seconds since its first row, and the time of that row.
 
-    A fall by more than half a day counts as midnight in times of day, if no column has the date;
-    one by more than half of `clock.wrap` counts as a new beginning of a counter. Raises as
+    If times of day fall by more than half a day, midnight has passed, unless a column has the date.
+    If a counter falls by more than half of `clock.wrap`, it began again at 0. Raises the errors of
     `times_of`.
     """
     cells = table.column(name)
@@ -97,10 +106,11 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
-    """Return the seconds of each row since the first, and the first, of dates or times of day.
+    """Return the times in a column of dates or times of day, as `column_times` does.
 
-    The first counts from 1970 (UTC), of times of day from midnight. Dates without a time zone are
-    in `clock.zone`, or else UTC. Raises UnreadableError if a cell is neither.
+    The time of the first row is in seconds since 1970 (UTC), or since midnight if the cells have no
+    date. Dates without a time zone are in `clock.zone`, or UTC if that is empty. Raises
+    UnreadableError if a cell does not have the form.
     """
     import pandas as pd
 
@@ -123,9 +133,9 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
-    The longest step is `clock.gap` steps of the rate; 0 allows any. A rate of 0 stands for any that
-    is even: steps are then compared with their mean. Equal times are refused too, unless any gap is
-    allowed.
+    No step may be longer than `clock.gap` steps of the rate; if the rate is 0, than `clock.gap`
+    mean steps. With `clock.gap` 0 steps may have any length, also 0; otherwise equal times are
+    refused.
     """
     steps = np.diff(seconds)
     rate = clock.rate_hz

@@ -35,11 +35,11 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
 
 
 def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
-    """Return the files of a description below a folder, each with its path as seen from there.
+    """Return the path of each file that a description names, with its path relative to the folder.
 
-    They are in the order of their names, with numbers by their size. Listings, the description
-    itself and files that it excludes are left out. Of a single file, that file. Raises DataError if
-    there is none, or for a malformed pattern.
+    They are sorted by file name, run_2 before run_10. Listings, the description file and the files
+    in `exclude` are left out. If `root` is a file, only that is returned. Raises DataError if there
+    is no file, or for a malformed pattern.
     """
     if root.is_file():
         return [(root, root.name)]
@@ -74,9 +74,9 @@ def read_file(path: Path) -> bytes:
 
 @contextmanager
 def caught(faults: list[Fault], source: str) -> Iterator[None]:
-    """Context manager that turns a DataError of its block into a fault; the program goes on.
+    """Turn a DataError that is raised in the `with` block into a fault, and go on behind the block.
 
-    The fault, with `source`, the file or part, is appended to `faults`.
+    The fault, with `source` as the file or part, is appended to `faults`.
     """
     try:
         yield

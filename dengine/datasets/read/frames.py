@@ -24,12 +24,11 @@ Columns = dict[str, Cells]
 
 
 def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> Table:
-    """Return the table of a JSON file: a row for the object, for each of a list, or for each line.
+    """Return the table of a JSON file, with a row for each object.
 
-    Its cells may be lists; a key that an object lacks is None. Raises UnreadableError if the text
-    is no JSON, or not one or more objects.
-
-    has_lines : whether each line is JSON by itself.
+    The file may hold one object, a list of objects, or (with `has_lines`) these in each line. A
+    cell may be a list; it is None if the object lacks the key. Raises UnreadableError if the text
+    is no JSON, or holds anything but objects, or nothing.
     """
     text = to_utf8(content, form.encoding).decode()
     rows: list[Mapping[str, Any]] = []
@@ -55,7 +54,10 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
 
 
 def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the items of nested objects, with dots in their names."""
+    """Return nested objects as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
+
+    prefix : stands before each name.
+    """
     items: dict[str, Any] = {}
     for name, item in value.items():
         is_nested = isinstance(item, Mapping)
@@ -64,12 +66,13 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def columns_of(prefix: str, value: Any) -> Columns:
-    """Return the columns of a nested object, each with its cells; a scalar is a column of one.
+    """Return a value of JSON or NumPy as columns; a scalar becomes a column with one cell.
 
-    Of an array (C, n), or (n, C) with C < n, each channel is a column. Raises UnreadableError if
-    the items of a list are of several forms.
+    An object has a column for each key, and a list of objects too. An array (C, n), or (n, C) with
+    C < n, has a column for each channel. Raises UnreadableError if the items of a list are not all
+    alike.
 
-    prefix : of the columns' names, which go on with a dot and the key, or the channel from 0.
+    prefix : the name of the value; a dot and the key, or the channel from 0, are appended.
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
@@ -83,9 +86,10 @@ def columns_of(prefix: str, value: Any) -> Columns:
 
 
 def _turned(items: Any) -> Mapping[Any, Any]:
-    """Return objects by their keys, or lists by their channels; nothing for other items.
+    """Return a list of objects as a list for each key, or a list of lists as one for each channel.
 
-    Raises one of `DAMAGES` if the items are not all like the first.
+    The dict is empty if the first item is neither. Raises one of `DAMAGES` if the items are not all
+    like the first.
     """
     first = items[0] if len(items) else None
     if isinstance(first, Mapping):
@@ -97,7 +101,10 @@ def _turned(items: Any) -> Mapping[Any, Any]:
 
 
 def as_cells(values: Any) -> Cells:
-    """Return values as an array (n,) of numbers if all are numbers, else of objects."""
+    """Return values as an array (n,): of numbers if all are int or float, otherwise of objects.
+
+    An array is returned as it is.
+    """
     if isinstance(values, np.ndarray) or {*map(type, values)} <= {int, float}:
         return np.asarray(values)
     cells = np.empty(len(values), dtype=object)
@@ -113,7 +120,10 @@ def read_frame(frame: Any, source: str) -> Table:
 
 
 def read_parquet(content: bytes, source: str) -> Table:
-    """Return the table of a Parquet file; DataError if it is none, or pyarrow is not installed."""
+    """Return the table of a Parquet file.
+
+    Raises DataError if it is not a Parquet file, or if pyarrow is not installed.
+    """
     with read_errors(source, "a Parquet file", "pyarrow", "files"):
         import pandas as pd
 
@@ -121,11 +131,12 @@ def read_parquet(content: bytes, source: str) -> Table:
 
 
 def read_npz(content: bytes, source: str, has_all: bool) -> Table:
-    """Return the table of a NumPy archive.
+    """Return the table of a NumPy archive, which holds one part, or all parts if `has_all`.
 
-    Of one part each array, without its axes of length 1, becomes columns, see `columns_of`. Of all
-    parts (`has_all`) row i has item i of each array; the largest array says how many rows there
-    are. Raises DataError if it is damaged, and UnreadableError for items of several forms.
+    Of one part, each array becomes columns as in `columns_of`, after axes of length 1 were dropped.
+    Of all parts, row i has item i of each array, and there are as many rows as the largest array
+    has items. Raises DataError if the archive is damaged, and UnreadableError if the items of an
+    array are not all alike.
     """
     arrays, _ = read_archive(content, name=source)
     if not has_all:
@@ -140,7 +151,8 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
-    `class`. Raises UnreadableError if it is no text, or has no series below a line `@data`.
+    `class`. Raises UnreadableError if the file is not in its encoding, or has no series below a
+    line `@data`.
 
     References
     ----------

@@ -28,9 +28,10 @@ def without_suffix(path: str) -> str:
 
 
 def path_word(path: str, pattern: str) -> str:
-    """Return the group of a regular expression in a path without the file's suffix.
+    """Return what the group of a regular expression matches in a path without the file's suffix.
 
-    Raises UnreadableError if it is not found, DataError if it is no expression with one group.
+    Raises UnreadableError if it does not match, and DataError if `pattern` is no regular expression
+    with exactly one group.
     """
     wanted = f"Expected a regular expression with one group, got {pattern}"
     with instead(DataError, wanted, re.error):
@@ -44,9 +45,10 @@ def path_word(path: str, pattern: str) -> str:
 
 
 def line_word(lines: Sequence[str], beginning: str) -> str:
-    """Return the cell behind the beginning of the first line above the header that has it.
+    """Return the cell that follows a text with which a line above the header begins.
 
-    Raises UnreadableError if no line begins so.
+    The first such line is used; comment marks before the text are skipped. Raises UnreadableError
+    if no line begins with it.
     """
     for line in lines:
         text = line.lstrip(f"#%*{MARKS}")
@@ -58,11 +60,11 @@ def line_word(lines: Sequence[str], beginning: str) -> str:
 def words_of(
     source: PartSource | LabelSource, table: Table, columns: Sequence[str], at: str = "same"
 ) -> list[str]:
-    """Return the words of a source of parts or labels, of which these are the columns.
+    """Return what a source of the label or the part number says for a recording.
 
-    A path or a line has one word, and without these there is one for each column. Raises
-    UnreadableError if one is not there, and DataError for a path that is no expression with one
-    group.
+    A path or a line gives one word; otherwise each of `columns` gives one. Raises UnreadableError
+    if a word is missing or changes within the recording (see `LabelSource.at`), and DataError if
+    the path is no regular expression with one group.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -72,9 +74,10 @@ def words_of(
 
 
 def part_of(source: PartSource, table: Table) -> str:
-    """Return the number of the part, of several columns with blanks between; "" if none is stated.
+    """Return the part number of a recording; "" if `[part]` states nothing.
 
-    Raises UnreadableError if the recording does not have what is stated.
+    The words of several columns are joined by blanks. Raises UnreadableError if the stated place is
+    missing or empty.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -83,10 +86,11 @@ def part_of(source: PartSource, table: Table) -> str:
 
 
 def listing_table(path: Path, form: TextForm) -> Table:
-    """Return the table of a listing, a .parquet file or a text, whose cells are words.
+    """Return the table of a listing, which is a Parquet file or a text file.
 
-    A text is parted by the one of `, ; tab |` that its header has most of. Raises UnreadableError,
-    or for a .parquet file DataError, if it cannot be read or a row has another number of cells.
+    The delimiter of a text is the one of `, ; tab |` that is most frequent in its first line; its
+    cells stay texts. Raises UnreadableError if it cannot be read or a row has another number of
+    cells, and DataError for a damaged Parquet file.
     """
     content = read_file(path)
     if path.suffix == ".parquet":
@@ -98,7 +102,7 @@ def listing_table(path: Path, form: TextForm) -> Table:
 
 @contextmanager
 def in_listing(name: str) -> Iterator[None]:
-    """Context manager that raises DataError, with its name, for a listing that cannot be read."""
+    """Turn an UnreadableError in the `with` block into a DataError that names the listing."""
     try:
         yield
     except UnreadableError as error:
@@ -110,7 +114,7 @@ def in_listing(name: str) -> Iterator[None]:
 class LabelReader:
     """Finds the label of a recording in one source.
 
-    listing : the words of each key of its listing, if it has one. used : keys that were asked for.
+    listing : the words by key, if the source is a listing. used : the keys that were found in it.
     """
 
     source: LabelSource
@@ -118,12 +122,19 @@ class LabelReader:
     used: set[str] = field(default_factory=set)
 
     def words(self, table: Table, part: str) -> Sequence[str]:
-        """Return the words for a recording.
+        """Return the words that stand for the label of a recording, like "ok".
 
-        In a listing these are the words of all rows with the recording's key: its part's number,
-        path or file name, or one of the last two without a suffix, the first that is listed. This
-        key is added to `used`. Raises UnreadableError if there are no words, and DataError for a
-        path that is no expression with one group.
+        If the source is a listing, a file that lists the labels of all recordings, they are the
+        words of all rows with the key of the recording. The key is the first of these that is
+        listed: the number of the part, the path, the file name, the path without suffix, the file
+        name without suffix. It is added to `used`. Any other source gives one word.
+
+        Raises
+        ------
+        UnreadableError
+            If there are no words for the recording.
+        DataError
+            If `source.path` is no regular expression with one group.
         """
         source = self.source
         path = table.path
@@ -138,9 +149,10 @@ class LabelReader:
         return self.listing[keys[0]]
 
     def label(self, table: Table, part: str) -> int | None:
-        """Return 1 for good, 0 for bad, None for not checked; adds to `used` as `words` does.
+        """Return the label of a recording: 1 good, 0 bad, None not checked.
 
-        Raises UnreadableError if there is no label, several, or a word of unknown meaning.
+        In a listing the key is added to `used`. Raises UnreadableError if there is no label, if
+        rows of the listing contradict each other, or if a word has no stated meaning.
         """
         source = self.source
         words = self.words(table, part)
@@ -152,7 +164,10 @@ class LabelReader:
         return labels.pop()
 
     def meaning(self, word: str, line: int = 0) -> int | None:
-        """Return what a word means; raise UnreadableError for an unknown one."""
+        """Return what a word means: 1 good, 0 bad, None not checked.
+
+        Raises UnreadableError for a word whose meaning is not stated.
+        """
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
         meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
@@ -169,15 +184,15 @@ class LabelReader:
 
 
 def as_key(word: str) -> str:
-    """Return the key in a listing: whole numbers match by their value, and paths in any writing."""
+    """Return a word as a key of a listing: without leading zeros in a number, with / in a path."""
     return word.lstrip("0") or "0" if word.isdecimal() else word.replace("\\", "/")
 
 
 def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
-    """Return the reader of a source of labels; its listing stands in the folder `base`.
+    """Return the reader of a source of labels, after reading its listing, if it has one.
 
-    The listing is read here. Raises DataError if it cannot be read or lacks its two columns, or
-    these are not stated.
+    Raises DataError if the listing, in the folder `base`, cannot be read, or if `key` and `column`
+    are not both stated and in it.
     """
     reader = LabelReader(source)
     if source.listing:

@@ -38,20 +38,22 @@ WORDS = {1: "good", 0: "bad", None: "not checked"}
 def recording_of(
     table: Table, description: Description, labels: Sequence[LabelReader]
 ) -> Recording | None:
-    """Return the recording of a part; None if the part was not checked, whatever its length.
+    """Return the recording of a part; None if the part was not checked, whatever its length is.
 
     Parameters
     ----------
     table : Table
-        Of the part.
+        The table of the part.
     description : Description
     labels : sequence of LabelReader
-        Of its source of labels, and of those that must agree with it.
+        A reader for the source of labels, then for each source that must agree with it.
 
     Raises
     ------
     UnreadableError
-        If it does not follow the description.
+        If the table does not follow the description.
+    DataError
+        If a regular expression or a format of times in the description is invalid.
     """
     clock = description.time
     form = description.text
@@ -86,9 +88,11 @@ def recording_of(
 
 
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
-    """Return the rows of a table that are samples, and for each of these whether it is lost.
+    """Return the rows of a table that are samples, and for each row whether its samples are lost.
 
     Raises UnreadableError for a word whose meaning is not stated, or a column that is missing.
+
+    rows : for each column, which of its words keep a row, drop it, or mark its samples as lost.
     """
     n = max(map(len, table.columns.values()), default=0)
     is_lost: Cells = np.zeros(n, dtype=bool)
@@ -106,11 +110,12 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
 
 
 def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> Floats:
-    """Return the samples of a channel in its unit, shape (n,).
+    """Return the samples of a channel, converted to its unit and times its factor, shape (n,).
 
-    They are converted from the unit in the file's row of units, or else in the column's name; a
-    unit in a name is passed over if it is of another quantity. Raises UnreadableError if one in the
-    row is, and for a cell that is no number.
+    They are in the unit that the file states, or else in the unit in the column's name, or else in
+    the channel's unit. Raises UnreadableError if the unit that the file states is of another
+    quantity, if the column is missing, or if a cell is no number; a unit of another quantity in the
+    name is ignored.
     """
     values = table.numbers(column, form)
     factor = 1.0
@@ -128,7 +133,7 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
     """Return the label of a part, 1 or 0; None if it was not checked.
 
-    Raises UnreadableError if there is no label, or the sources do not agree.
+    Raises UnreadableError if a source has no label for it, or if the sources do not agree.
     """
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
@@ -201,10 +206,10 @@ def read_recordings(
 def files_of(
     source: Any, description: Description, faults: list[Fault]
 ) -> tuple[str, Path, Sequence[tuple[Path | Table, str]]]:
-    """Return the name of a data set, its folder, and its files or its table, each with a name.
+    """Return the name of a data set, its folder, and a list of (file or table, name) to read.
 
-    A bag is read as one table here, which adds to `faults`. Raises DataError if there
-    is no file, or as `read_bag`.
+    All files of a bag are read here, into one table; damaged files add to `faults`. A DataFrame
+    gives one table. Raises DataError if there is no file, and the errors of `read_bag`.
     """
     if not isinstance(source, Path):
         return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
@@ -221,8 +226,9 @@ def files_of(
 def parts_of(
     file: Path | Table, name: str, description: Description, base: Path
 ) -> Iterator[Table]:
-    """Yield the tables of the parts in a file or a table, cut as `[windows]` says, if it does.
+    """Yield the tables of the parts in a file or a table.
 
+    Each table that `split` yields is one part, or is cut into parts if `[windows]` is stated.
     Raises UnreadableError if the file cannot be read, and DataError if it cannot be split or cut.
     """
     table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
@@ -234,10 +240,10 @@ def parts_of(
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
-    """Return the data set of recordings in their order.
+    """Return the data set of recordings, in the given order.
 
-    It counts as not ordered if the label changes only once. Recordings that were resampled at the
-    rate of their clock have the fit `strict`.
+    `ordered` is False if the label changes exactly once. `fit` is "strict" if the recordings were
+    resampled at the rate of their clock, since live traces then come at this rate.
     """
     labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
@@ -265,12 +271,12 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
 def fitted(
     samples: Floats, seconds: Floats | None, description: Description
 ) -> NDArray[np.float32]:
-    """Return the trace (C, T) of samples (C, n), as `[traces]` says.
+    """Return the trace (C, T) of samples (C, n), brought to its length as `[traces]` says.
 
-    With `resample` and a clock it is interpolated at the stated rate, from the first time on: the
-    rest of a longer recording is left out, and the last time may be up to one step short. Without a
-    stated rate the whole recording is interpolated to `samples` samples. Otherwise it is fitted
-    like a live trace; `pad-all` repeats the last sample, however short the recording is.
+    With `resample`, a clock and a stated rate, it is interpolated at that rate from the first time
+    on. A longer recording loses its end; one that ends up to one step early is accepted. With a
+    clock but without a rate the whole recording is interpolated evenly. Otherwise it is fitted like
+    a live trace; `pad-all` repeats the last sample, however short the recording is.
 
     Raises
     ------

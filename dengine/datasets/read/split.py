@@ -21,9 +21,9 @@ OBJECTS = ("json", "jsonl", "ts")
 
 
 def table_of(content: bytes, name: str, description: Description) -> Table:
-    """Return the table of a file.
+    """Return the table of a file in the format of the description.
 
-    Raises UnreadableError or DataError if it is no file of the described format, and of a text
+    Raises UnreadableError or DataError if the file does not have this format; for a text file also
     SettingError if `windows.trigger` is malformed.
     """
     kind, form = description.format, description.text
@@ -39,9 +39,10 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 
 
 def column_kind(description: Description) -> Kind:
-    """Return the function that tells the kind of a column by its name; see `read_text`.
+    """Return a function from the name of a column to its kind: NUMBER, WORD, or "" if not needed.
 
-    Raises SettingError if `windows.trigger` is malformed.
+    A column is needed if the description names it. Raises SettingError if `windows.trigger` is
+    malformed.
     """
     clock = zip(description.time.column, description.time.format, strict=False)
     dated = {name for name, form in clock if is_dated(form)}
@@ -70,7 +71,7 @@ def signals_of(description: Description) -> Sequence[str]:
 
 
 def verdicts_of(description: Description) -> set[str]:
-    """Return the topics of a bag that have labels."""
+    """Return the topics of a bag that hold labels."""
     return {source.topic for source in description.labels} - {""}
 
 
@@ -82,13 +83,15 @@ def pattern_of(column: str, any_text: str = ".*") -> re.Pattern[str]:
 def split(table: Table, description: Description) -> Iterator[Table]:
     """Yield the table of each part of a file, by the layout of the description.
 
-    `long`: a part is the rows with one word in its columns; they must stand together, unless they
-    are sorted by time. `columns`: each column that the channel's pattern matches is a part. `wide`,
-    `npz`, and the formats json, jsonl and ts: each row is a part, whose samples are the list in a
-    cell, or the cells of the columns that the channel's pattern matches, in the order of their
-    numbers. Else the file is one part. Cells that are empty at the end are no samples. A part that
-    cannot be told from others, or has a damaged row, has `damage`. Raises DataError if `long` has
-    no column of parts.
+    `long`: the rows with the same words in `part.column` are a part; they must stand together,
+    unless `time.sort` is set. `columns`: each column that matches the first channel is a part.
+    `wide`, `npz`, and the formats json, jsonl and ts: each row is a part; its samples are the list
+    in a cell, or the cells of the numbered columns that match the channel, in the order of their
+    numbers. Otherwise the file is one part.
+
+    In numbered columns and in the layout `columns`, empty cells at the end are no samples. A part
+    has `damage` if one of its rows is damaged, or if rows of other parts stand between its own.
+    Raises DataError if `long` is stated without `part.column`.
     """
     if description.layout == "long":
         yield from _split_rows(table, description)
@@ -101,10 +104,11 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
-    """Yield the rows of each part, by the words in its columns.
+    """Yield the rows of each part, which have the same words in `part.column`.
 
-    A part has damage if a row of another number of cells stands within it or beside it, or if rows
-    of others stand between its own. Raises DataError if the columns are not stated or not there.
+    A part has damage if a row with a wrong number of cells stands within or beside it, or if rows
+    of other parts stand between its own and `time.sort` is not set. Raises DataError if
+    `part.column` is not stated or not in the table.
     """
     import pandas as pd
 
@@ -144,10 +148,10 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _row_of(table: Table, i: int) -> Table:
-    """Return the part in a row, with the columns that its cells hold.
+    """Return row i as the table of a part; a list in a cell becomes a column.
 
-    Columns of another number of rows hold for all parts. It has damage if the row had another
-    number of cells, or items in a cell are of several forms.
+    Columns that do not have a cell for each row hold for all parts, whole. The part has damage if
+    the row had a wrong number of cells, or if the items in a cell are not all alike.
     """
     n = len(table.lines)
     line = table.lines[i]
@@ -162,12 +166,15 @@ def _row_of(table: Table, i: int) -> Table:
 
 
 def _numbered(key: str, table: Table) -> list[str]:
-    """Return the columns that a channel's pattern matches with numbers for `*`, by the numbers."""
+    """Return the columns that match a channel's pattern with a number for `*`, by that number."""
     return sorted(filter(pattern_of(key, DIGITS).fullmatch, table.columns), key=natural_key)
 
 
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
-    """Yield each column that the first channel's pattern matches, with the clock beside it."""
+    """Yield each column that matches the first channel as a part.
+
+    The columns of times and of `[rows]` stay beside it; a channel cannot be one of them.
+    """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}
     beside = {key: cells for key, cells in table.columns.items() if key in shared}
@@ -183,9 +190,11 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
 def _with_samples(
     table: Table, samples: frames.Columns, origin: Mapping[str, Sequence[str]]
 ) -> Table:
-    """Return a table with the samples of channels, which stood in other columns.
+    """Return a table with the samples of channels, which stood in other columns of the file.
 
-    Cells at their end that are empty or NaN are no samples.
+    Cells at the end of a channel that are empty or NaN are left out.
+
+    origin : for each channel the column of each sample.
     """
     units = {key: table.units.get(names[0], "") for key, names in origin.items() if names}
     columns = {**table.columns, **{key: without_empty_end(cells) for key, cells in samples.items()}}
@@ -193,7 +202,7 @@ def _with_samples(
 
 
 def without_empty_end(cells: Cells) -> Cells:
-    """Return cells without those at the end that are empty or NaN."""
+    """Return the cells without those at the end that are empty or NaN."""
     n = len(cells)
     while n and as_word(cells[n - 1]) in ("", "NaN", "nan"):
         n -= 1

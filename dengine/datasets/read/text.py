@@ -35,18 +35,19 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
         Name of the file.
     form : TextForm
     kind_of : callable
-        The kind of a column, by its name: NUMBER, which in a plain file comes as such; WORD, whose
-        cells are kept as they are; or "", of which only the number of cells counts.
+        Returns the kind of a column by its name. NUMBER: numbers if the file is plain, otherwise
+        texts. WORD: texts. "": the column is not needed, and is empty if the file is plain.
 
     Returns
     -------
     Table
-        Lines of another number of cells are its `damage`.
+        A line with a wrong number of cells is in its `damage`.
 
     Raises
     ------
     UnreadableError
-        If the file is empty, in another encoding, or has no such header, or no row fits it.
+        If the file is empty, has another encoding, lacks the header, or if all rows have a wrong
+        number of cells.
     """
     content = to_utf8(content, form.encoding)
     header = _header_line(content, form.header)
@@ -71,9 +72,9 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
-    """Return a text in UTF-8 with plain line ends, without a mark at its beginning.
+    """Return a text in UTF-8 with plain line feeds and without a byte order mark.
 
-    Raises UnreadableError, with the line, if it is not in its encoding, or has a zero byte;
+    Raises UnreadableError, with the line, if a byte does not fit the encoding or is zero, and
     LookupError for an encoding that Python does not know.
     """
     is_utf8 = codecs.lookup(encoding).name == "utf-8"
@@ -102,16 +103,21 @@ def split_line(line: str, delimiter: str) -> list[str]:
 
 
 def header_names(cells: Sequence[str]) -> list[str]:
-    """Return the columns' names: those that repeat get a number, like `X.2`, empty ones too."""
+    """Return the names of columns in a header; empty cells become `column1`, `column2`, ...
+
+    A name that repeats gets a number, like `X.2`.
+    """
     names = [cell.strip() or f"column{i}" for i, cell in enumerate(cells, 1)]
     places = [names[: i + 1].count(name) for i, name in enumerate(names)]
     return [f"{name}.{n}" if n > 1 else name for name, n in zip(names, places, strict=True)]
 
 
 def _header_line(content: bytes, header: int | str) -> int:
-    """Return the line of the header, from 1: the one that is stated, or that begins with a text.
+    """Return the line of the header, from 1; 0 for none.
 
-    Raises UnreadableError if no line begins so.
+    Raises UnreadableError if no line begins with a stated text.
+
+    header : this line, or the text with which it begins.
     """
     if isinstance(header, int):
         return header
@@ -122,9 +128,11 @@ def _header_line(content: bytes, header: int | str) -> int:
 
 
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
-    """Return the names of the columns: as stated, or those of the header among the lines on top.
+    """Return the names of the columns: those of `text.names`, otherwise the cells of the header.
 
-    Raises UnreadableError if there is neither.
+    Raises UnreadableError if there are neither names nor a header.
+
+    top : the lines from the first to the first row of samples.
     """
     names = [*form.names]
     if names and names[-1].endswith(REST):
@@ -142,7 +150,11 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
 def _read_plain(
     content: bytes, table: Table, form: TextForm, kinds: Mapping[str, str]
 ) -> dict[str, Cells]:
-    """Return the columns of numbers and words by pandas' parser; none if anything is not plain."""
+    """Return the needed columns as pandas reads them; empty if anything in the file is not plain.
+
+    Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
+    that is not a finite number in a column of numbers.
+    """
     import pandas as pd
 
     try:
@@ -176,10 +188,10 @@ def _read_plain(
 
 
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
-    """Return the table with the cells of a text, without lines that are empty or dropped.
+    """Return the table with all cells as texts, without lines that are empty or dropped.
 
-    A line of another number of cells is damage, and its row has empty cells. Raises UnreadableError
-    if all lines are.
+    Lines that begin with a text of `form.drop` are dropped. A line with a wrong number of cells is
+    added to `damage`, and its row has empty cells. Raises UnreadableError if all lines are such.
     """
     n = len(table.columns)
     rows = dict[int, list[str]]()

@@ -21,12 +21,13 @@ Windows = Iterator[tuple[str, slice, str]]  # the key of a part, its rows, and w
 
 
 def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
-    """Yield the table of each part of a recording.
+    """Yield the table of each part of a long recording.
 
-    A part has `damage` if it begins in a gap, or if its window has no samples, overlaps the window
-    before, or goes beyond the recording. A topic of labels has the first word from the start of a
-    part up to the next part, or to the end. Raises DataError if `time.column`, or for a trigger the
-    rate, is not stated, if no part is found, or if the listing or the times cannot be read.
+    A part has `damage` if it begins in a gap of the times, or if its window has no samples,
+    overlaps an earlier one, or goes beyond the recording. The column of a topic of labels has one
+    cell: the first label between the start of the part and the start of the next. Raises DataError
+    if `time.column` is not stated, if a trigger cuts and the rate is not stated, if no part is
+    found, or if the times or the listing cannot be read.
     """
     name = table.source
     if not description.time.column:
@@ -48,11 +49,11 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
 
 
 def _triggered(table: Table, times: Floats, description: Description, base: Path) -> Windows:
-    """Yield the number, the rows and the fault of each part that a trigger begins.
+    """Yield the number, the rows and the fault ("" for none) of each part that a trigger begins.
 
-    The parts are numbered from 1, and have the samples that `[traces]` states; the rows of the last
-    may go beyond the table, which is no fault here. One that begins in a gap has a fault. A start
-    within the part before is passed over. Raises DataError without a rate.
+    The numbers count from 1. Each part has `traces.samples` rows; those of the last may go beyond
+    the table, which is not noted here. It has a fault if it begins in a gap. A start within the
+    previous part is ignored. Raises DataError if the rate is not stated.
     """
     samples = description.traces.samples
     rate = description.time.rate_hz
@@ -73,10 +74,12 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
 
 
 def _listed(table: Table, times: Floats, description: Description, base: Path) -> Windows:
-    """Yield the key, the rows and the fault of each window, in the order of their starts.
+    """Yield the key, the rows and the fault ("" for none) of each window, by increasing start.
 
-    Times below 1e8 s count from the start of the recording if its own are dates. A window without
-    samples has the first row. Raises DataError if the listing cannot be read.
+    If the recording has dates and all times of the listing are below 1e8 s, they count from its
+    first sample. A window has a fault if it overlaps an earlier one, has no samples, or goes beyond
+    the recording; one without samples gets the first row. Raises DataError if the listing cannot be
+    read.
     """
     about = description.windows
     form = description.text
