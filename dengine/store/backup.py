@@ -54,7 +54,9 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
     Engines may run meanwhile: everything that they had acknowledged when this was called is in the
-    copy. The copy is written in full or not at all. The store and the journals are only read.
+    copy. Damaged records of a journal are left out, and a record that contradicts the copy becomes
+    an event of kind "dead letter" there. The copy is written in full or not at all. The store and
+    the journals are only read.
 
     Parameters
     ----------
@@ -70,11 +72,12 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     Raises
     ------
     StoreError
-        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), and if a journal
-        cannot be read. If a journal holds records, and the ledger of its cell was begun with
-        another key than the one in the file that DENGINE_LEDGER_KEY names.
+        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), if a journal cannot
+        be read, and if copying fails, for example on a full disk. If a journal holds records, and
+        the ledger of its cell was begun with another key than the one in the file that
+        DENGINE_LEDGER_KEY names.
     OutputError
-        If `out` exists, or cannot be written.
+        If `out` exists, or cannot be created.
     """
     with reading(os.fspath(url)) as connection:
         dialect = connection.dialect.name
@@ -113,7 +116,8 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
 
     Each cell gets a journal that names its newest ledger entry, so that the engine that opens the
     cell next can tell that nothing is missing. A journal that is already beside `store` is not
-    changed: the engine of its cell later takes from it the records that the copy lacks.
+    changed: the next engine of its cell takes the records from it that the copy lacks. If the
+    journal names a ledger entry that the copy lacks, this engine also records an alarm.
 
     Parameters
     ----------
@@ -131,9 +135,10 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     StoreError
         If `copy` is no store, if its history is not as it was written, and if a ledger was begun
         with another key than the one in the file that DENGINE_LEDGER_KEY names. If a journal
-        cannot be made; the store has been copied by then, and stays.
+        cannot be made: the store has been copied by then, and stays. If copying fails, for example
+        on a full disk.
     OutputError
-        If `store` exists, or cannot be written.
+        If `store` exists, or cannot be created.
     """
     report = verify_history(os.fspath(copy))
     if not report.ok:
@@ -154,7 +159,7 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
 def _copy(url: str, target: Path) -> None:
     """Copy an SQLite store into the file `target` by SQLite's own online backup.
 
-    The copy replaces what `target` held.
+    The copy replaces what `target` held. Raise StoreError if either file fails.
     """
     with reading(url) as connection, closing(sqlite3.connect(target)) as copy:
         source: Any = connection.connection.driver_connection
@@ -162,10 +167,10 @@ def _copy(url: str, target: Path) -> None:
 
 
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
-    """Commit a cell's journal records to the copy.
+    """Commit a cell's journal records to the copy; without records it is not opened.
 
     Records that the copy already has change nothing. A record that contradicts the copy is stored
-    there as an event of kind "dead letter".
+    there as an event of kind "dead letter". Raise StoreError if the cell's ledger has another key.
     """
     if not records:
         return
