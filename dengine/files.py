@@ -193,7 +193,8 @@ def toml_value(value: Any) -> str:
     """Return a text, a number, a boolean, or a list or tuple of these, as TOML writes it.
 
     NumPy's numbers are numbers, too. Another object is written as a quoted text, its `str`. TOML
-    has no None, so the caller must replace it.
+    has no None, so the caller must replace it. An infinity or NaN is written as TOML only if it is
+    the value itself and a Python float.
     """
     if isinstance(value, float):
         return repr(float(value))  # JSON has no infinity
@@ -215,7 +216,8 @@ def check_output(path: FilePath, force: bool = False) -> None:
     Parameters
     ----------
     path : path
-        File to write. A database, folder, link, pipe or device is always refused.
+        File to write. A database, folder, link, pipe or device is always refused, and so is an
+        existing file that cannot be read.
     force : bool, default False
         Whether another file that exists may be replaced.
     """
@@ -263,7 +265,8 @@ def output_file(
     force : bool, default False
         Whether a file that exists may be replaced; see `check_output`.
     make_folder : bool, default False
-        Whether the folder of `path` is made, with its parents, if it does not exist.
+        Whether the folder of `path` is made, with its parents, if it does not exist. It stays even
+        if the block raises.
 
     Yields
     ------

@@ -383,8 +383,8 @@ def as_success(value: Any, owner: str = "") -> bool:
 def as_outcome(value: Any, owner: str = "") -> Outcome:
     """Convert an `Outcome`, or its text such as "stopped", to an `Outcome`.
 
-    Raises ReportError for any other value, also for True and None. `owner` says in its message
-    whose outcome it is.
+    Raises ReportError for any other value, also for True and None; its message says that the value
+    is `owner`'s, if that is given.
     """
     whose = f" of {owner}," if owner else ""
     with instead(

@@ -113,7 +113,7 @@ class Explanation:
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:
-    """Return the id of the only decision on a part that was no reject, or of its only reject.
+    """Return the id of the only decision on a part that is no reject, else of its only reject.
 
     A rejected part may come again, so rejects count only if there is no other decision. Only the
     newest 20 decisions of this cell on the part are looked at.
@@ -122,7 +122,8 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     ----------
     store : SqlStore
     part : str
-        The part's number; or a decision's id, which is returned if no part has this number.
+        The part's number, which `decide` got; or a decision's id, which is returned if no decision
+        is on a part of this number.
 
     Returns
     -------
@@ -228,7 +229,7 @@ def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
     """Return the policy that was in force at a time, in seconds since 1970.
 
     It is the policy that the first change of policy after this time replaced. If there was no
-    change since, it is `present`, the policy in force now.
+    change since, or no event holds the old policy, it is `present`, the policy in force now.
     """
     for event in store.events.newest():
         if event.kind in POLICY_KINDS and event.time > time and event.data is not None:
