@@ -212,8 +212,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     Returns
     -------
     DecisionRule or None
-        None before the first version, and if its class is not imported. Also None if the newest
-        version has no state that fits the rule: another cell of the product made the version, it
+        None before the first version, and if a user's class of rule is not imported. Also None if
+        the newest version has no state that fits the rule: another cell of the product made it, it
         was made under another policy, or the rule was stale (it had missed an update). A rule that
         learns nothing, like that of "local" with stops="some", has no state: another cell's version
         will do for it, and it is never stale.

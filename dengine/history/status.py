@@ -437,7 +437,7 @@ COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
 def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
-    """Return the counts over the decisions of a tally, and over the retrains since the oldest one.
+    """Return the counts over a tally's decisions, and over the retrains since the first decision.
 
     Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
     properties, like action and reason. The intervals of `would_accept` and `would_reject` (how

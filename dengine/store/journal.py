@@ -84,7 +84,10 @@ def encode_record(record: Record) -> bytes:
 
 
 def decode_record(blob: bytes) -> Record:
-    """Return the record that `encode_record` wrote; raise StoreError for other bytes."""
+    """Return the record that `encode_record` wrote; raise StoreError for bytes that have no record.
+
+    A changed number or sample is not noticed here; `Journal.read` checks for that.
+    """
     errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
     with instead(
         StoreError,
@@ -255,7 +258,7 @@ class Journal:
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
 
-        Raise StoreError if no intact record begins there.
+        Raise StoreError if no intact record begins there. An OSError of the disk passes unchanged.
         """
         if (record := self._read_record(offset)) is None:
             raise StoreError(

@@ -87,8 +87,8 @@ class JournalledStore(Outbox):
         If one is missing, the store was cut off or restored from an older copy: an event DATA_LOST
         (an alarm) is stored, and all records of the journal count as undrained, so that they are
         copied to the database again. An event that is no alarm is stored if the journal or its head
-        is new though the store is not. Raise StoreError only if the database cannot be read or
-        written.
+        is new or damaged though the store is not new. Raise StoreError only if the database cannot
+        be read or written.
         """
         journal = self._journal
         database = self.store.database

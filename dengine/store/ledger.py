@@ -270,10 +270,10 @@ class LedgerEntry:
         self.settings = False
 
     def add_rows(self, table: str, rows: Sequence[Row]) -> list[Row]:
-        """Add the sums of rows, which are about to be inserted into a table, to this entry.
+        """Add the checksums of rows, which are about to be inserted into a table, to this entry.
 
         Return copies of the rows with two more columns: `entry`, the number of this entry, and
-        `sum`.
+        `sum`, the checksum (`row_sum`).
         """
         chained = [{**row, "entry": self._number} for row in rows]
         for row in chained:

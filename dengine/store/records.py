@@ -119,8 +119,8 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data as JSON gives it back, in a new dict; None for None.
 
-    A tuple becomes a list. Raise StoreError for values that JSON does not have, NaN and infinity
-    included.
+    A tuple becomes a list, and a key that is a number a text. Raise StoreError for values that JSON
+    does not have, NaN and infinity included.
     """
     with instead(
         StoreError,
