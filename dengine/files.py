@@ -193,17 +193,16 @@ def toml_value(value: Any) -> str:
     """Return a text, a number, a boolean, or a list or tuple of these, as TOML writes it.
 
     NumPy's numbers are numbers, too. Another object is written as a quoted text, its `str`. TOML
-    has no None, so the caller must replace it. An infinity or NaN is written as TOML only if it is
-    the value itself and a Python float.
+    has no None, so the caller must replace it.
     """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
     if isinstance(value, float):
-        return repr(float(value))  # JSON has no infinity
-    # JSON's texts, lists and booleans are TOML's, but for DEL, which TOML wants escaped.
-    text = json.dumps(
-        value,
-        ensure_ascii=False,
-        default=lambda item: item.item() if isinstance(item, np.generic) else str(item),
-    )
+        return repr(value)  # JSON has no infinity
+    # JSON's texts and booleans are TOML's, but for DEL, which TOML wants escaped.
+    text = json.dumps(value if isinstance(value, str | int) else str(value), ensure_ascii=False)
     return text.replace("\x7f", "\\u007f")
 
 

@@ -72,12 +72,11 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     Raises
     ------
     StoreError
-        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), if a journal cannot
-        be read, and if copying fails, for example on a full disk. If a journal holds records, and
-        the ledger of its cell was begun with another key than the one in the file that
-        DENGINE_LEDGER_KEY names.
+        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), and if a journal
+        cannot be read. If a journal holds records, and the ledger of its cell was begun with
+        another key than the one in the file that DENGINE_LEDGER_KEY names.
     OutputError
-        If `out` exists, or cannot be created.
+        If `out` exists, or cannot be written, for example on a full disk.
     """
     with reading(os.fspath(url)) as connection:
         dialect = connection.dialect.name
@@ -92,7 +91,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.
     waiting = {cell: read_undrained(path)[0] for cell, path in paths.items() if path.exists()}
-    with output_file(out) as partial:
+    with output_file(out) as partial, reading(os.fspath(url)) as connection:
         try:
             with instead(
                 OutputError,
@@ -100,7 +99,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
                 sqlite3.Error,
                 do="choose a folder that has room",
             ):
-                _copy(os.fspath(url), partial)
+                _copy(connection, partial)
                 for cell, records in waiting.items():
                     _add_records(partial, cell, records)
                 decisions, labels = _fold_wal_and_count(partial)
@@ -135,10 +134,9 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     StoreError
         If `copy` is no store, if its history is not as it was written, and if a ledger was begun
         with another key than the one in the file that DENGINE_LEDGER_KEY names. If a journal
-        cannot be made: the store has been copied by then, and stays. If copying fails, for example
-        on a full disk.
+        cannot be made: the store has been copied by then, and stays.
     OutputError
-        If `store` exists, or cannot be created.
+        If `store` exists, or cannot be written, for example on a full disk.
     """
     report = verify_history(os.fspath(copy))
     if not report.ok:
@@ -156,12 +154,12 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     return report.cells
 
 
-def _copy(url: str, target: Path) -> None:
+def _copy(connection: sa.Connection, target: Path) -> None:
     """Copy an SQLite store into the file `target` by SQLite's own online backup.
 
-    The copy replaces what `target` held. Raise StoreError if either file fails.
+    The copy replaces what `target` held. Raise sqlite3.Error if either file fails.
     """
-    with reading(url) as connection, closing(sqlite3.connect(target)) as copy:
+    with closing(sqlite3.connect(target)) as copy:
         source: Any = connection.connection.driver_connection
         source.backup(copy)
 

@@ -258,9 +258,11 @@ class Journal:
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
 
-        Raise StoreError if no intact record begins there. An OSError of the disk passes unchanged.
+        Raise StoreError if no intact record begins there, or if the disk cannot be read.
         """
-        if (record := self._read_record(offset)) is None:
+        with _os_errors(self.path):
+            record = self._read_record(offset)
+        if record is None:
             raise StoreError(
                 f"Expected the record that was written to {self.path} at byte {offset}, found "
                 "another."
