@@ -243,8 +243,8 @@ class Learner:
         -------
         RetrainReport or None
             The report of a retrain that was done in this thread. None if there is no reason, if the
-            store is unavailable, if a training or its preparation is under way, or if the executor
-            now trains.
+            store or its journal has a fault, if a training or its preparation is under way, or if
+            the executor now trains.
         """
         peers = self._peers
         may_train = self.labels.is_due(retrain_every) and not self.live.pinned
