@@ -1,4 +1,4 @@
-"""The verb `dengine run`: an engine drives a cell, and continues where its store ended.
+"""The subcommand `dengine run`: an engine drives a cell, and continues where its store ended.
 
 `CELLS` has a function for each kind of cell: the parts of a recording, the simulated cell, or a
 Universal Robots controller.
