@@ -59,7 +59,7 @@ class DrivenRun(NamedTuple):
     replay : Replay
         The finished cycles.
     safe_mode_changes : list of dict
-        `cycle` after which safe mode began or ended, and its `reason`, "" where it ended.
+        `cycle` after which safe mode began or ended, and its `reason`, "" if it ended.
     failure : CellError or None
         What ended the run, if the cell failed.
     """

@@ -389,9 +389,9 @@ class Corrections:
 
         A model that cannot change its references is retrained, in this thread. If a safe mode
         begins or ends by this, an event is recorded, and `on_safe_mode` is called. Returns what was
-        done, with the number of the change's event. Raises StoreError if the store does not answer;
-        a change that is stored by then is applied with the next one, or when the store is opened
-        again.
+        done, with the number of the newest event, see `_finish_change`. Raises StoreError if the
+        store does not answer; a change that is stored by then is applied with the next one, or when
+        the store is opened again.
         """
         self._store.corrections.apply(change)
         for id_ in change.decisions:
@@ -402,10 +402,11 @@ class Corrections:
     def _finish_change(
         self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
     ) -> Changed:
-        """Announce a safe mode that a stored change began or ended, and return what the change did.
+        """Record an event and call `on_safe_mode` if a stored change began or ended a safe mode;
+        return what the change did.
 
-        `reason_ended` is recorded as the reason if a safe mode ended. The result names the newest
-        event of the store as the event of the change.
+        `reason_ended` is recorded as the reason if a safe mode ended. The result names the event
+        that was the store's newest before that as the event of the change.
         """
         number = self._store.events.newest(1)[0].number
         self._feedback.announce_safe_mode(reason_ended)

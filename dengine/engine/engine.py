@@ -609,8 +609,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         go on or rejects it. A known outcome is reported, and retrains happen between cycles. When
         the iteration ends, also by an error of the cell, everything known is written. If the cell
         has a `TraceSpec` as its attribute `spec`, the engine takes from this spec what it does not
-        know about the traces yet. Python's garbage collector works between decisions, and only on
-        objects that are newer than the first cycle (`gc.freeze`).
+        know about the traces yet. The attribute `part`, if there is one, is each part's number.
+        Python's garbage collector works between decisions, and only on objects that are newer than
+        the first cycle (`gc.freeze`).
 
         Parameters
         ----------
@@ -857,8 +858,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._outbox.find_decision(as_id(decision_id))
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Flush, and return how the engine is doing; arguments and errors as of
-        `history.status.status`.
+        """Flush, and return how the engine is doing; arguments and errors are those
+        of `history.status.status`.
 
         If the disk does not take everything, `store_fault` says why, and the counts lack the rest.
         """
@@ -869,7 +870,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
         """Yield the decisions so far, newest last.
 
-        Arguments and errors as of `history.status.history`.
+        Arguments and errors are those of `history.status.history`.
         """
         return history(self.store, last, **where)
 

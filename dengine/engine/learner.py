@@ -272,12 +272,12 @@ class Learner:
 
     @property
     def is_swapping(self) -> bool:
-        """Whether a trained version is being swapped in, one step with each call of the engine."""
+        """Whether a trained version is being put in force, a step with each call of the engine."""
         return self._candidate is not None
 
     @property
     def is_at_work(self) -> bool:
-        """Whether a training is under way in the executor, or its version is being swapped in."""
+        """Whether a training is under way in the executor, or its version is not in force yet."""
         return self._retrainer.future is not None or self._candidate is not None
 
     @property

@@ -572,7 +572,7 @@ def create_app(
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         """Enter what `beside` returns, and leave it when the application ends.
 
-        Where that fails, the error is kept in `app.state.failure` and raised.
+        If that fails, the error is kept in `app.state.failure` and raised.
         """
         async with AsyncExitStack() as stack:
             try:

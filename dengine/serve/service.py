@@ -219,7 +219,7 @@ class CellService:
             For a wrong shape, a first trace of less than 10 samples, an invalid part number, or an
             id that belongs to another trace.
         SettingError
-            As of `DataEngine.decide`.
+            For the reasons of `DataEngine.decide`.
         ReportError
             For an invalid id.
         StoreError
