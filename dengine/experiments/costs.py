@@ -1,5 +1,5 @@
 """From three prices to a policy: what a part costs under each that may pay, in replays of the
-user's own recordings. The verb `costs` prints it.
+user's own recordings. The subcommand `dengine costs` prints it.
 
     curve = cost_curve("insertion", check=5, escape=600, false_reject=30, recipe="pca", n_jobs=2)
     print(curve.sentence)
@@ -303,7 +303,8 @@ class CostCurve:
 def policy_name(policy: Policy) -> str:
     """Return a policy's name for people, like "alpha 0.1, LB 95 %" or "pooled, LB 95 %".
 
-    Under the guarantee "cost" it is only "the cost guarantee".
+    Under the guarantee "cost" it is only "the cost guarantee". A user's own rule is named by its
+    `module:Class`.
     """
     if policy.guarantee == "cost":
         return "the cost guarantee"
@@ -505,7 +506,7 @@ class PolicySearch:
 def candidates(
     contender: Contender, costs: Costs, alphas: Sequence[float], lower_bounds: Sequence[float]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the settings of each policy that is to be tried, as keyword arguments.
+    """Yield the settings of each policy that is to be tried, as keyword arguments of `Policy`.
 
     First come all pairs of an alpha and a lower bound LB (the success probability that accepted
     parts must have) for the guarantee "local", or for the user's own rule if the contender has one.
@@ -513,8 +514,9 @@ def candidates(
     If stops="some" and no audits are set, these two get an audit rate of 5 %, because they need
     outcomes of accepted parts.
 
-    If `alphas` is empty, it is `ALPHA` alone. If `lower_bounds` is empty, LBs are taken around
-    break-even, where 1 - LB is check / escape.
+    If `alphas` is empty, it is `ALPHA` alone. "pooled" has the given `lower_bounds`, too. If these
+    are empty, LBs are taken around break-even, at which 1 - LB is check / escape, but none below
+    80 %.
     """
     policy = contender.recipe.policy
 
@@ -609,6 +611,8 @@ def cost_curve(
         As `PolicySearch`; with `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
+    OutputError
+        With `keep`, a replay that cannot be written.
     """
     data = load_dataset(dataset)
     search = PolicySearch(data, recipe, Costs(check, escape, false_reject), **settings)

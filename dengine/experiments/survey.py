@@ -1,5 +1,5 @@
-"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift. The
-verb `data` prints it.
+"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift.
+`dengine data` prints it.
 
     survey_dataset(load_dataset("cell_3/"))
 

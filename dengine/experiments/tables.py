@@ -1,5 +1,5 @@
 """Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy on
-the screen, and sentences about them. The verbs `replay` and `compare` print them.
+the screen, and sentences about them. `dengine replay` and `dengine compare` print them.
 
     frame = frame_of(replays)
     rows = pool(frame, replays)

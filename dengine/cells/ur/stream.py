@@ -109,7 +109,8 @@ class RtdeClient:
     def rows(self) -> Iterator[Values]:
         """Yield the values of every data package by column, as they arrive, without an end.
 
-        Raise CellError if the connection is lost or silent for `timeout` seconds.
+        Raise CellError if the connection is lost or silent for `timeout` seconds, or for bytes that
+        are no RTDE or no package with these columns.
         """
         for package in self._incoming:
             if package.type is PackageType.DATA:
@@ -154,10 +155,10 @@ class RtdeClient:
             self._socket.sendall(data)
 
     def _receive_packages(self) -> Iterator[Package]:
-        """Yield packages as they arrive, without an end, except the controller's text messages.
+        """Yield packages as they arrive, without an end; the controller's texts are left out.
 
         The newest text is kept for error messages. Raise CellError if the connection is lost or
-        silent for `timeout` seconds (the message quotes the text), or for bytes that are no RTDE.
+        silent for `timeout` seconds (its message quotes the text), or for bytes that are no RTDE.
         """
         packages = PackageReader()
         while True:
