@@ -203,7 +203,7 @@ def import_parts(
     decision, nothing is changed: the new label is counted as repeated or contradicted. A trace with
     a fault is stored but never trains, and its decision gets the fault as its reason. With
     `stops="some"` each label also stores the number of accepted parts without a report since the
-    label before.
+    label before; the label of a trace with a fault stores 0, and the next label counts these parts.
 
     Parameters
     ----------

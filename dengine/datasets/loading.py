@@ -39,14 +39,14 @@ def load_dataset(
     ----------
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
         The name of a bundled set, or recordings that a description describes: a folder, a file or a
-        DataFrame. These need no description, and are read without one unless it is given or saved
-        beside the file: a `Dataset`; arrays X (n, T) or (n, C, T) and y (n,); an .npz file with X,
-        y, and perhaps scale, rate_hz, unit, cause (why a part failed), channels and part; a Parquet
-        file of a table that `Dataset.to_frame` made; the SQLite file of a store, of which the
-        labelled traces are read.
+        DataFrame. No description is needed for a `Dataset`; arrays X (n, T) or (n, C, T) and y
+        (n,); an .npz file with X, y, and perhaps scale, rate_hz, unit, cause (why a part failed),
+        channels and part; a table that `Dataset.to_frame` made, or its Parquet file; the SQLite
+        file of a store, of which the labelled traces are read. A file or table of these is read by
+        a description all the same if one is given, or saved beside the file.
     description : Description, dict or path, optional
-        How the recordings are written. None: the description that was saved, as `recordings.toml`
-        in the folder or `FILE.toml` beside the file.
+        How the recordings are written; not beside a `Dataset` or a pair. None: the description that
+        was saved, as `recordings.toml` in the folder or `FILE.toml` beside the file.
     channels : str or sequence of str, optional
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
         the data set names. None: all channels.

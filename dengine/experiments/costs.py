@@ -186,7 +186,7 @@ class CostCurve:
     def missing(self) -> Missing | None:
         """How many more parts would turn "may pay" into "pays".
 
-        None if the verdict is another, or if `MOST_MORE` times as many recordings are too few.
+        None if the verdict is another, or if 10,000 times as many recordings are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -435,8 +435,8 @@ class PolicySearch:
         """Halve the candidates in rounds, and let the last two play fresh shuffles.
 
         While more than two remain, they play two shuffles, and the dearer half is removed from
-        `remaining`. The replays are kept, and `curve` computes the result from them. Call this
-        once.
+        `remaining`; candidates that verified every part count as the dearest. The replays are kept,
+        and `curve` computes the result from them. Call this once.
 
         Parameters
         ----------
@@ -514,7 +514,7 @@ def candidates(
     If stops="some" and no audits are set, these two get an audit rate of 5 %, because they need
     outcomes of accepted parts.
 
-    If `alphas` is empty, it is `ALPHA` alone. "pooled" has the given `lower_bounds`, too. If these
+    If `alphas` is empty, it is 0.1 alone. "pooled" has the given `lower_bounds`, too. If these
     are empty, LBs are taken around break-even, at which 1 - LB is check / escape, but none below
     80 %.
     """
@@ -595,7 +595,7 @@ def cost_curve(
     keep : path or None, default None
         Folder of finished replays: those in it are not played again, others are added.
     **settings
-        alphas, lower_bounds : sequences of float to try; by default `ALPHA`, and levels around
+        alphas, lower_bounds : sequences of float to try; by default 0.1, and levels around
         1 - check / escape that the number of recordings allows. repeats : fresh shuffles that the
         last policies play, 4, at least 2. seed : of the first shuffle, 0. cycles : parts of each
         shuffle, by default all.

@@ -275,9 +275,8 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the policy's
     lower bound LB; bad parts among the accepted parts (solid), good parts among the rejected parts
-    (dashed), and the tolerance 100 - LB. The legend below has the counts. Shares of fewer than
-    `FEWEST` parts are not drawn. The window is `WINDOW` cycles, or a third of the longest replay if
-    that is less.
+    (dashed), and the tolerance 100 - LB. The legend below has the counts. Shares of fewer than 20
+    parts are not drawn. The window is 300 cycles, or a third of the longest replay if that is less.
 
     Parameters
     ----------

@@ -146,7 +146,7 @@ class Replay:
     n_success, n_failure : array of int, shape (n,)
         Labels that were counted.
     position : array of float, shape (n, d)
-        Scaled embedding, the mean over the spaces; NaN where no model embedded the trace.
+        Scaled embedding, the mean over the spaces; NaN if no model embedded the trace.
     decide_seconds : array of float, shape (n,)
         Wall time of each decision.
     stopped : array of bool, shape (n,)
@@ -394,7 +394,7 @@ class ObservedCycle(NamedTuple):
     ----------
     cycle : Cycle
     truth : float
-        1.0 good, 0.0 bad, NaN where the cell does not tell.
+        1.0 good, 0.0 bad, NaN if the cell does not tell.
     clock : float or None
         Seconds of production; None for a cell without a clock.
     """

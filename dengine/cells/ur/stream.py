@@ -318,8 +318,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         and names that are no columns are ignored.
 
         If the connection is lost, the newest inputs are written again on the next connection,
-        unless they are `REPEAT_S` old by then or the controller was restarted. Raises struct.error
-        for a number that its field cannot hold.
+        unless they are 10 s old by then or the controller was restarted. Raises struct.error for a
+        number that its field cannot hold.
 
         Parameters
         ----------
@@ -374,8 +374,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         `take`.
 
         If the buffer is full, its oldest package is dropped. At the first package of a new
-        connection the newest inputs are written again, if they are less than `REPEAT_S` old. But if
-        the package shows that the controller was restarted, the inputs are forgotten.
+        connection the newest inputs are written again, if they are less than 10 s old. But if the
+        package shows that the controller was restarted, the inputs are forgotten.
         """
         with self._news:
             if self._newest is not None:

@@ -42,8 +42,8 @@ def propose_roles(p: Proposal) -> None:
     In this order: columns that tell which rows are samples, clock, part, label, channels. A key is
     `?` if no rule proves a value. If it is open which rows are samples, `traces.samples` is `?` and
     no rate is set; a clock that is open gives no rate either. Raises DataError if a stated column
-    of times or channel does not exist, a stated format is none of times, or a stated source of
-    labels has no words, and SettingError for a malformed `windows.trigger`.
+    of times or channel does not exist, a stated `time.format` is none, or a stated source of labels
+    has no words, and SettingError for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -119,8 +119,8 @@ def qualifies(column: Column) -> bool:
 
     It must have at most 12 words, and each recording several rows. A column that is named like a
     status (`Status`, `valid`) may have numbers, and also just one word. Any other must have texts
-    that change within a recording, and no name like a clock. A column that holds labels, some with
-    known words, is none.
+    that change within a recording, and no name like a clock. A column of labels with a known word
+    is none.
     """
     name = column.name
     words = column.counts
