@@ -303,13 +303,14 @@ class ScaledComponents:
         self._pca = PcaReducer(n_components=n_components, random_state=seed)
 
     def fit(self, X: Traces) -> Floats | None:
-        """Find the components of traces (n, C, T) and their scale.
+        """Find the principal components of traces (n, C, T), as rows of C * T, and their scale.
 
         Returns
         -------
-        Z : array, shape (n, d), or None
-            The scaled components of these traces. None if there are no more traces than components,
-            or fewer samples in a trace than components; then nothing is changed.
+        Z : array, shape (n, n_components), or None
+            The scaled components of these traces. None if there are `n_components` traces or fewer,
+            or fewer samples in a trace (C * T) than components; components and scale then stay as
+            they were.
         """
         try:
             components = np.asarray(self._pca.fit(X).transform(X), dtype=np.float64)
@@ -510,7 +511,8 @@ def guaranteed_threshold(confidence: Floats, wrong: Labels, risk: float, delta: 
 
     If these traces and the later ones are independent draws from one distribution, then with
     probability 1 - delta the share of errors at or above the threshold is at most `risk`.
-    ceil(log2 m) thresholds are tried by bisection, each with an equal share of delta.
+    ceil(log2 m) thresholds, at least one, are tried by bisection, each with an equal share of
+    delta.
 
     Parameters
     ----------

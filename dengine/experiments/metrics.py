@@ -56,13 +56,13 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     samples. The unit is therefore the trace: the variance of the share is estimated from the
     differences between traces, by linearisation. The interval is Wilson's, for the number of
     independent decisions that would have this variance. If the variance is 0, for example because
-    no decision was wrong, it is Wilson's for the number of different traces. The interval holds for
-    other parts of the same kind, not for another cell.
+    no decision was wrong, it is Wilson's for the number of different traces among these decisions.
+    The interval holds for other parts of the same kind, not for another cell.
 
     Parameters
     ----------
     replays : sequence of Replay
-        All of one data set, none of a live run.
+        All of one data set. None of a live run, which does not record which traces it had.
     side : {"accepted", "rejected"}, default "accepted"
         Which decisions are judged.
     alpha : float, default 0.05
@@ -71,6 +71,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Returns
     -------
     error_rate : ErrorRate
+        Without decisions of that side the rate is NaN and its interval (0, 1).
 
     Raises
     ------
@@ -176,8 +177,9 @@ class Costs:
         return checks - self.escape * false_positive - self.false_reject * false_negative
 
     def of_part(self, accepted: float, rejected: float, bad: float, good: float) -> float:
-        """Return the mean cost of a part where so many are accepted, and rejected, by the model.
+        """Return the mean cost of a part if the model accepts and rejects these shares of parts.
 
-        All are shares: `bad` of the accepted parts, and `good` of the rejected ones, are wrong.
+        `bad` is the share of bad parts among the accepted ones, `good` that of good parts among the
+        rejected ones. All other parts are checked.
         """
         return self.check - self.saved(accepted + rejected, accepted * bad, rejected * good)

@@ -1,5 +1,5 @@
 """One stream of parts through one engine: `replay` plays recordings, `watch` drives any cell.
-`grid` plays by `replay`, the verb `run` by `observe_cycles` and `to_replay`.
+`grid` plays by `replay`, `dengine run` by `observe_cycles` and `to_replay`.
 
 Both return a `Replay`, the record of each cycle. `replay` uses a fresh engine, as the paper's
 prototype online environment does. A `Contender` says who plays: a recipe or a baseline.
@@ -146,7 +146,7 @@ class Replay:
     n_success, n_failure : array of int, shape (n,)
         Labels that were counted.
     position : array of float, shape (n, d)
-        Scaled embedding, the mean over the spaces; NaN where no model embedded the trace.
+        Scaled embedding, the mean over the spaces; NaN if no model embedded the trace.
     decide_seconds : array of float, shape (n,)
         Wall time of each decision.
     stopped : array of bool, shape (n,)
@@ -299,6 +299,7 @@ class Replay:
             of cycles: verified, accepted, rejected (by the model), false_positive, false_negative,
             novel, safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts
             passed on per hour: None if the cell has no clock, no time passed, or there is no cycle.
+            The time of the first cycle of the run begins at 0 of the cell's clock.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -393,7 +394,7 @@ class ObservedCycle(NamedTuple):
     ----------
     cycle : Cycle
     truth : float
-        1.0 good, 0.0 bad, NaN where the cell does not tell.
+        1.0 good, 0.0 bad, NaN if the cell does not tell.
     clock : float or None
         Seconds of production; None for a cell without a clock.
     """
@@ -536,8 +537,9 @@ def replay(
     Raises
     ------
     SettingError
-        A number of cycles that the data set does not have, alpha or lower_bound beside an engine,
-        or a policy with force limits in seconds for a data set of an unknown rate.
+        A number of cycles that the data set does not have, anything that is no recipe, a baseline
+        whose library is missing, alpha or lower_bound beside an engine, or a policy with force
+        limits in seconds for a data set of an unknown rate.
     DataError
         A data set that cannot be read.
     """

@@ -57,7 +57,8 @@ def read_sensor(
     """Return what the sensor reports of a true force.
 
     The force passes a low-pass filter, gets the sensor's faults, and is quantised. Then samples are
-    lost: a lost sample repeats the last sample that was not lost. `rng` is advanced.
+    lost: a lost sample repeats the last sample that was not lost. The first is never lost. `rng` is
+    advanced.
 
     Parameters
     ----------
@@ -254,7 +255,8 @@ class SimulatedCell:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
         The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and the clock goes on
-        by `cycle_s`. Raise DengineError if the last part still waits for verify, proceed or reject.
+        by `cycle_s`. Raise DengineError if the last part still waits for verify, proceed or reject,
+        or if MuJoCo is not installed, and the other errors of `insert_once`; nothing changes then.
         """
         if self._waiting:
             raise DengineError(

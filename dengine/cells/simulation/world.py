@@ -135,7 +135,7 @@ def cell_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
     """Return the MuJoCo model (MJCF, as text) of the whole cell under these conditions.
 
     It has the fixture, the carriage with its drive, the elastic wrist with the force sensor, and
-    the part.
+    the part, unless the grasp missed it.
     """
     c = conditions
     tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06

@@ -49,7 +49,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     ----------
     table : Table
     clock : Clock
-        The times in its columns are added up. Without columns there is one time, 0.
+        The times in its columns are added up; a column of one cell holds for all rows. Without
+        columns there is one time, 0.
     form : TextForm
         How numbers are written.
 
@@ -134,8 +135,8 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
     No step may be longer than `clock.gap` steps of the rate; if the rate is 0, than `clock.gap`
-    mean steps. With `clock.gap` 0 steps may have any length, also 0; otherwise equal times are
-    refused.
+    mean steps. With `clock.gap` 0 steps may have any length, and some may be 0; otherwise equal
+    times are refused. A single time passes.
     """
     steps = np.diff(seconds)
     rate = clock.rate_hz
