@@ -389,9 +389,8 @@ class Corrections:
 
         A model that cannot change its references is retrained, in this thread. If a safe mode
         begins or ends by this, an event is recorded, and `on_safe_mode` is called. Returns what was
-        done, with the number of the newest event, see `_finish_change`. Raises StoreError if the
-        store does not answer; a change that is stored by then is applied with the next one, or when
-        the store is opened again.
+        done. Raises StoreError if the store does not answer; a change that is stored by then is
+        applied with the next one, or when the store is opened again.
         """
         self._store.corrections.apply(change)
         for id_ in change.decisions:
@@ -405,10 +404,10 @@ class Corrections:
         """Record an event and call `on_safe_mode` if a stored change began or ended a safe mode;
         return what the change did.
 
-        `reason_ended` is recorded as the reason if a safe mode ended. The result names the event
-        that was the store's newest before that as the event of the change.
+        `reason_ended` is recorded as the reason if a safe mode ended.
         """
-        number = self._store.events.newest(1)[0].number
+        newest = self._store.events.newest(100)  # a refitted model is an event of its own
+        number = max(event.number for event in newest if event.kind == change.kind)
         self._feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._live.version)
 
