@@ -109,8 +109,8 @@ class DecisionMaker:
                 return as_trace(trace, self._settings.now.trace)
         elif self._settings.is_unsaved:
             self._settings.save()
-        has_contract = self._settings.now.trace is not None
-        if not self._has_seen_trace and has_contract and np.isfinite(x).all():
+        has_spec = self._settings.now.trace is not None
+        if not self._has_seen_trace and has_spec and np.isfinite(x).all():
             self._has_seen_trace = True
             if not self._live.version:  # what will answer is compiled before there is much to do
                 guarded(NOT_PRECOMPUTED, self._live.template.precompute, x[None])
@@ -242,7 +242,7 @@ class DecisionMaker:
         `Reason.MODEL_ERROR`.
         """
         part_hash_ = 0 if part is None else part_hash(part)
-        # Without a contract the trace has a fault, and is decided all the same.
+        # Without a TraceSpec the trace has a fault, and is decided all the same.
         conditions = self._settings.conditions or DecisionConditions(
             TraceSpec(samples=x.shape[1], channels=x.shape[0])
         )
