@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import DataError
 from ..files import FilePath, is_database, read_archive, read_errors
 from ..records import stored_trace_spec
-from .dataset import OWN, Dataset, Progress, expect_data, make_dataset
+from .dataset import OWN, Dataset, Progress, expect_data, make_dataset, unit_text
 from .describe import describe
 from .description import FOLDER_FILE, Description, Stated
 from .read.files import find_files
@@ -266,7 +266,7 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
         arrays["y"],
         name=name,
         rate_hz=rate_hz and float(rate_hz),
-        unit=", ".join(units),
+        unit=unit_text(units),
         channels=channels,
         limit=arrays.get("limit"),
         fit=arrays.get("fit", "strict"),
@@ -303,7 +303,7 @@ def _read_store(path: Path) -> Dataset:
         part=hashes if len({*hashes.tolist()}) < len(hashes) else None,
         name=path.stem,
         rate_hz=spec.rate_hz,
-        unit=spec.unit if isinstance(spec.unit, str) else ", ".join(spec.unit or ()),
+        unit=unit_text(spec.units),
         channels=spec.columns,
         limit=spec.limit,
         fit=spec.fit,

@@ -69,6 +69,16 @@ def test_a_damaged_file_or_one_of_objects_is_a_data_error(
         load_dataset(path)
 
 
+def test_selected_channels_are_some_and_keep_their_units(make_data) -> None:
+    data = replace(make_data(4, samples=8, channels=3), channels=("a", "b", "c"))
+    units = {"": "", "N, N, mm": "mm, N", ", , mm": "mm, "}
+    for unit, selected in units.items():
+        assert replace(data, unit=unit).select(("c", "a")).unit == selected
+    assert replace(data, unit="N, N, mm").select(("a", "b")).unit == "N"
+    with pytest.raises(DataError, match=r"Expected channels of .*, a, b, c, got \[\]"):
+        data.select(())
+
+
 @pytest.mark.parametrize("channels", [1, 2])
 def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(
     make_data, channels: int, tmp_path: Path

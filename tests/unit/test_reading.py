@@ -381,6 +381,13 @@ def test_equal_samples_under_two_labels_are_faults_and_repeats_are_left_out(tmp_
     assert [fault.source[:6] for fault in data.faults] == ["part_0", "part_1", "part_4"]
 
 
+def test_a_channel_of_an_unknown_unit_does_not_get_that_of_another(tmp_path: Path) -> None:
+    written = write(tmp_path, "files text", *some(), PLAIN)
+    channels = dict(zip(written.description.channels, (Channel("N"), Channel()), strict=True))
+    data = load_dataset(tmp_path, replace(written.description, channels=channels))
+    assert data.spec.units == ("N", "")
+
+
 # Bad input.
 
 

@@ -18,7 +18,7 @@ from ...errors import DataError, instead, listed
 from ...records import FITS
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, lost_note, without_repeats
-from ..dataset import Dataset, Fault, make_dataset
+from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, Channel, Description, RowWords, TextForm
 from ..table import Cells, Floats, Recording, Table, UnreadableError
 from ..units import conversion, unit_in
@@ -263,7 +263,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
         np.stack([recording.trace for recording in recordings]),
         labels,
         rate_hz=clock.rate_hz or None,
-        unit=", ".join(channel.unit for channel in channels).strip(", "),
+        unit=unit_text([channel.unit for channel in channels]),
         limit=channels[0].limit or None,
         part=parts if parts.any() else None,
         channels=tuple(description.channels),
