@@ -480,6 +480,25 @@ def test_a_stated_value_that_cannot_be_is_refused(
         describe(in_files(tmp_path), {key: value})
 
 
+@pytest.mark.parametrize("time", ["{:.3f}", "2024-05-01 10:00:00.{:03d}"])
+def test_a_first_row_that_lost_a_sample_is_no_header(tmp_path: Path, time: str) -> None:
+    for i in range(6):
+        times = [time.format(j / 500 if "f" in time else 2 * j) for j in range(40)]
+        rows = [f"{t},{j % 10 and i + j % 7 + 1},k" for j, t in enumerate(times)]
+        text = "\n".join(["time,force,remark", *rows]).replace(",0,", ",,")
+        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text(text)
+    data = load_dataset(tmp_path, describe(tmp_path))
+    assert (data.channels, data.X.shape) == (("force",), (6, 40))
+    assert np.isnan(data.X[:, ::10]).all()
+
+
+def test_a_long_text_of_wide_characters_is_cut_between_lines(tmp_path: Path) -> None:
+    rows = "".join(f"{i / 500:.3f},{i % 17}.5\n" for i in range(90_000))
+    for word in WORDS.values():
+        (tmp_path / f"1_{word}.csv").write_bytes(f"\ufefftime,force\n{rows}".encode("utf-16-be"))
+    assert "force" in describe(tmp_path, {"layout": "files"}).channels
+
+
 def test_a_cell_that_is_too_long_is_a_fault(tmp_path: Path) -> None:
     (in_files(tmp_path) / "9_OK.csv").write_text(
         "\n".join(["time,force", *FORCE, f"0.048,{'1' * 200_000}"])

@@ -27,7 +27,7 @@ from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
 from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
-from .text_form import propose_form
+from .text_form import MOST_BYTES, decode, propose_form
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -47,7 +47,6 @@ NO_RECORDING = re.compile(
 )
 BAG = ".mcap"
 MOST_FILES = 60  # that are read
-MOST_BYTES = 2_000_000  # of all files that are read, and of one
 MOST_ROWS = 50_000
 Names = Sequence[str]
 
@@ -209,7 +208,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
         if p.stated.get("layout") == "npz" or (is_single and has_lists(table)):
             return table
     if kind in ("text", "jsonl") and len(content) > MOST_BYTES:
-        content = content[: content.rfind(b"\n", 0, MOST_BYTES)]
+        encoding = p.description.text.encoding
+        content = decode(content, encoding)[1].rpartition("\n")[0].encode(encoding) or content
         p.is_cut = True
     if kind == "text":
         return read_text(content, name, p.description.text).whole()
