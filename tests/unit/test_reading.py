@@ -31,7 +31,7 @@ from dengine.datasets.description import (
     TextForm,
     TraceForm,
 )
-from dengine.errors import DataError
+from dengine.errors import DataError, DengineError
 
 WORDS = {0: "NOK", 1: "OK"}
 RATE = 500.0
@@ -398,7 +398,7 @@ def test_one_sentence_says_what_to_type(tmp_path: Path) -> None:
     listed = replace(LABEL, listing="list.csv", key="part", column="verdict")
     (empty / "recordings.toml").write_text(d.to_toml())
     cases = {
-        "does not exist": (tmp_path / "none", None),
+        "Expected a file, a folder or": (tmp_path / "none", None),
         f"dengine data {re.escape(str(tmp_path))} --save": (tmp_path, None),
         r"another folder\? See `dengine data": (empty, None),
         "Expected a description in .*none.toml": (tmp_path, tmp_path / "none.toml"),
@@ -467,10 +467,17 @@ def in_files(folder: Path) -> Path:
         ("label.path", "(", "a regular expression with one group"),
         ("label.listing", "x.csv", "label.key"),
         ("text.encoding", "utf-99", "text.encoding"),
+        ("text.encoding", "undefined", "text.encoding"),
+        ("text.encoding", "a\0b", "text.encoding"),
         ("text.delimiter", ";;", "text.delimiter"),
+        ("text.thousands", ".", "two marks in text.decimal and text.thousands"),
+        ("text.thousands", 0, "two marks in text.decimal and text.thousands"),
+        ("time.format", ["s", "ms"], "a format for each of 1 columns"),
+        ("time.zone", "Foo/Bar", "time.zone"),
         ("text.header", 9, "none: 0_NOK.csv, line 9: Expected a header"),
         ("text.data", 500, "line 500: Expected rows of samples"),
         ("files", "/x/*.csv", "patterns below a folder"),
+        ("files", ".", "patterns below a folder"),
     ],
 )
 def test_a_stated_value_that_cannot_be_is_refused(
@@ -478,6 +485,33 @@ def test_a_stated_value_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(DataError, match=re.escape(message)):
         describe(in_files(tmp_path), {key: value})
+
+
+def test_stated_sections_are_kept_and_a_question_mark_is_answered(tmp_path: Path) -> None:
+    proposal = describe(in_files(tmp_path), {"traces": {"samples": 7}, "time.rate_hz": "?"})
+    assert (proposal.traces.samples, proposal.time.rate_hz) == (7, 500.0)
+
+
+VALUES = ["?", "\0", "%Y%Y", 0, -1, 1e308, True, None, [], ["a", "b"], {1: 2}, "punycode", "force"]
+STATED = [f"{name}.{f.name}" for name, cls in SECTIONS.items() if cls for f in fields(cls)]
+TOP = [f.name for f in fields(Description)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = in_files(tmp_path_factory.mktemp("stated"))
+    describe(folder).save(folder / "recordings.toml")
+    return folder
+
+
+@settings(QUICK, max_examples=50, derandomize=True)
+@given(st.sampled_from([*TOP, *STATED, "rows.force.keep"]), st.sampled_from(VALUES))
+def test_any_stated_value_is_read_or_refused(folder: Path, key: str, value: Any) -> None:
+    with suppress(DengineError):
+        describe(folder, {key: value})
+    with suppress(DengineError):
+        saved = Description.load(folder / "recordings.toml")
+        load_dataset(folder, saved.with_values({key: value}))
 
 
 @pytest.mark.parametrize("time", ["{:.3f}", "2024-05-01 10:00:00.{:03d}"])
