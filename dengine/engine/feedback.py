@@ -299,10 +299,9 @@ class Feedback:
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
         """Record, and tell `on_safe_mode`, if a safe mode began or ended since the last call.
 
-        In a safe mode every part is verified after an alarm of the rule. `reason_ended` is recorded
-        if one ended. If recording the event or the user's function fails, that is logged and not
-        tried again; callers announce only after labels are stored, so that such a failure costs no
-        label.
+        A safe mode begins after an alarm of the rule. `reason_ended` is recorded if one ended. If
+        recording the event or the user's function fails, that is logged and not tried again;
+        callers announce only after labels are stored, so that such a failure costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

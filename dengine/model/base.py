@@ -302,7 +302,8 @@ class EngineModel(ABC):
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
         """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
 
-        In a safe mode every part is verified; NONE is no safe mode. The default does nothing.
+        In a safe mode parts are verified until new outcomes allow decisions again; NONE is no safe
+        mode. The default does nothing.
         """
 
     @abstractmethod
@@ -318,7 +319,7 @@ class EngineModel(ABC):
 
     @property
     def safe_mode(self) -> str:
-        """Why every part is verified at present; "" outside a safe mode."""
+        """Why the safe mode began; "" outside a safe mode."""
         return ""
 
     def defect(self) -> str:
