@@ -50,15 +50,16 @@ class Policy:
     interval : str, default "wilson"
         A name in `INTERVALS`.
     audit_rate : float, optional
-        Share of certain decisions that are verified all the same, from 0 to 1. A guarantee on
-        rejects needs it, and so do "pooled" and "cost" if not all line stops are known. None: 0,
-        or 0.05 if `prices` are given without a guarantee.
+        Share of certain decisions that are verified all the same, from 0 to 1. "pooled" and "cost"
+        need it if not all line stops are known; "pooled" then covers rejected parts as well. None:
+        0, or 0.05 if `prices` are given without a guarantee.
     guarantee : str, optional
         The rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a
         subclass of `DecisionRule`. "local", the paper's rule, is about the neighbourhood of one
-        trace. "pooled" is about all parts together. "cost" is about what all parts cost by
-        `prices`; then `lower_bound` does not influence decisions, and `alpha` influences only the
-        safe mode. None: "local", or "cost" if `prices` are given.
+        trace. "pooled" is about all members together. "cost" is about what all members cost by
+        `prices`, as far as their outcomes are known; then `lower_bound` does not influence
+        decisions, and `alpha` influences only the safe mode. None: "local", or "cost" if `prices`
+        are given.
     stops : {"some", "all"}, default "some"
         "all": every bad accepted part stops the line and is reported before the next decision. If
         nothing is reported until then, the part is confirmed. "some": a missing report says
