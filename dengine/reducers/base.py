@@ -488,7 +488,7 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     if folds is None:
         return content_fold(traces, n_folds)
     given = np.asarray(folds, dtype=np.int64)
-    within = given.shape == (len(traces),) and given.min() >= 0 and given.max() < n_folds
+    within = given.shape == (len(traces),) and set(range(n_folds)).issuperset(given)
     expect(within, f"{len(traces)} folds from 0 to {n_folds - 1}", given)
     return given
 
