@@ -87,8 +87,8 @@ class Baseline(ABC):
     seed: int = 0
     thresholds: tuple[float, float] | None = field(default=None, init=False)
     is_trained: bool = field(default=False, init=False)
-    # The engine asks three times about the same trace: its bytes, and the prediction.
-    _last: tuple[bytes, BaselinePrediction] | None = field(default=None, init=False)
+    # The engine asks three times about the same trace: its shape and bytes, and the prediction.
+    _last: tuple[Any, BaselinePrediction] | None = field(default=None, init=False)
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Train from scratch and return self.
@@ -162,11 +162,13 @@ class Baseline(ABC):
         labels returns the integer 0, and no array, for both counts; so does an untrained one.
         """
         traces = as_traces(X)
-        key = traces.tobytes()
+        key = traces.shape, traces.tobytes()
         if self._last is None or self._last[0] != key:
-            prediction = BaselinePrediction(np.zeros(len(traces)), np.ones(len(traces)))
-            if self.is_trained:
-                prediction = self._predict(traces)
+            prediction = (
+                self._predict(traces)
+                if self.is_trained
+                else BaselinePrediction(np.zeros(len(traces)), np.ones(len(traces)))
+            )
             self._last = (key, prediction)
         return self._last[1]
 
