@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from .errors import ReportError, SettingError, StoreError, expect, instead, shortened
 
 PartNumber = str | int | None  # as a caller gives it
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
 State = dict[str, NDArray[Any]]  # arrays of a version of the model, by name
 Arrays = Mapping[str, NDArray[Any]]  # the same, only read

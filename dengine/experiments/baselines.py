@@ -22,11 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import Policy
 from ..errors import SettingError, expect
-from ..records import ACTIONS, is_number, is_whole
+from ..records import ACTIONS, Floats, Ints, is_number, is_whole
 from ..traces import as_traces
 
-Floats = NDArray[np.float64]
-Counts = NDArray[np.int64]
+Counts = Ints
 Labels = NDArray[np.bool_]
 Traces = NDArray[np.float32]
 
