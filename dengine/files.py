@@ -195,14 +195,14 @@ def toml_value(value: Any) -> str:
     NumPy's numbers are numbers, too. Another object is written as a quoted text, its `str`. TOML
     has no None, so the caller must replace it.
     """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
     if isinstance(value, float):
-        return repr(float(value))  # JSON has no infinity
-    # JSON's texts, lists and booleans are TOML's, but for DEL, which TOML wants escaped.
-    text = json.dumps(
-        value,
-        ensure_ascii=False,
-        default=lambda item: item.item() if isinstance(item, np.generic) else str(item),
-    )
+        return repr(value)  # JSON has no infinity
+    # JSON's texts and booleans are TOML's, but for DEL, which TOML wants escaped.
+    text = json.dumps(value if isinstance(value, str | int) else str(value), ensure_ascii=False)
     return text.replace("\x7f", "\\u007f")
 
 
@@ -215,7 +215,8 @@ def check_output(path: FilePath, force: bool = False) -> None:
     Parameters
     ----------
     path : path
-        File to write. A database, folder, link, pipe or device is always refused.
+        File to write. A database, folder, link, pipe or device is always refused, and so is an
+        existing file that cannot be read.
     force : bool, default False
         Whether another file that exists may be replaced.
     """
@@ -263,7 +264,8 @@ def output_file(
     force : bool, default False
         Whether a file that exists may be replaced; see `check_output`.
     make_folder : bool, default False
-        Whether the folder of `path` is made, with its parents, if it does not exist.
+        Whether the folder of `path` is made, with its parents, if it does not exist. It stays even
+        if the block raises.
 
     Yields
     ------

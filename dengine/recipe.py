@@ -247,9 +247,9 @@ class Recipe:
         """Parse ``settings["recipe"]`` of a store's settings, and return the recipe.
 
         No class that the recipe names is imported. The defaults of `radius` and `retrain_every`
-        stand in the reducer's class. If either setting is missing and the reducer is a user's
-        class, StoreError is raised, because the store is damaged. Raises SettingError for a text
-        that is no recipe.
+        stand in the reducer's class. If either setting is missing and the reducer is no name in
+        `RECIPES`, StoreError is raised, because the store is damaged. Raises SettingError for a
+        text that is no recipe.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
@@ -339,7 +339,8 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
 
     A name is returned unchanged, with `params`. Of an object the result is its `module:Class` and
     its own parameters, without those that are None. It is "object Class" and no parameters if a
-    parameter is no plain value, or if the class is local or defined in `__main__`.
+    parameter is no plain value, or is None though its default is not, or if the class is local or
+    defined in `__main__`.
     """
     if isinstance(reducer, str):
         return reducer, params

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from .errors import ReportError, SettingError, StoreError, expect, instead, shortened
 
 PartNumber = str | int | None  # as a caller gives it
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
 State = dict[str, NDArray[Any]]  # arrays of a version of the model, by name
 Arrays = Mapping[str, NDArray[Any]]  # the same, only read
@@ -383,8 +385,8 @@ def as_success(value: Any, owner: str = "") -> bool:
 def as_outcome(value: Any, owner: str = "") -> Outcome:
     """Convert an `Outcome`, or its text such as "stopped", to an `Outcome`.
 
-    Raises ReportError for any other value, also for True and None. `owner` says in its message
-    whose outcome it is.
+    Raises ReportError for any other value, also for True and None; its message says that the value
+    is `owner`'s, if that is given.
     """
     whose = f" of {owner}," if owner else ""
     with instead(

@@ -202,7 +202,7 @@ def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
     """Assert that `fit` and `transform` raise ValueError for a trace with a NaN.
 
     `fit` is called on an unfitted clone, `transform` on a clone that was trained on test traces, so
-    `reducer` may be unfitted and stays unchanged.
+    `reducer` may be unfitted and stays unchanged. An error of another type passes unchanged.
     """
     X, y = toy_traces()
     X[3, 0, 7] = np.nan

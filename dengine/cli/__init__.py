@@ -1,9 +1,10 @@
-"""The `dengine` command: each verb parses its options, calls one function and prints the result.
+"""The `dengine` command: each subcommand parses its options, calls one function and prints the
+result.
 
     dengine replay --data insertion --reducer conv --alpha 0.1 --lower-bound 0.9 --repeats 3
 
-A verb is a function in one of this folder's modules and a name in the list at the end of this one.
-Verbs import what they need when they run, so that `--help` answers at once.
+A subcommand is a function in one of this folder's modules and a name in the list at the end of this
+one. Subcommands import what they need when they run, so that `--help` answers at once.
 """
 
 import sys
@@ -40,14 +41,14 @@ from .store import (
 
 
 class Verbs(click.Group):
-    """A group of verbs that prints an expected error as one line on stderr.
+    """The subcommands of `dengine`; an expected error is printed as one line on stderr.
 
     The exit code is then 1, or 2 for an error that the option `--allow-import` avoids. Any other
     exception passes with its traceback.
     """
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Parse the arguments and run a verb, as click does; it usually ends the process.
+        """Parse the arguments and run a subcommand, like click; it usually ends the process.
 
         Before that stdout and stderr are set to print "?" for a character that their encoding
         lacks.
@@ -58,8 +59,8 @@ class Verbs(click.Group):
         return super().main(*args, **options)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a verb and return its result; raise its expected errors as `click.ClickException`,
-        exit code 1.
+        """Run a subcommand of `dengine` and return its result; raise its expected errors as
+        `click.ClickException`, exit code 1.
 
         Expected are DengineError, OSError (but BrokenPipeError, which passes) and UnicodeError. An
         ImportRefusedError, which `--allow-import` avoids, becomes `click.UsageError`, exit code 2.

@@ -1,5 +1,5 @@
-"""The verbs `dengine data`, which surveys a data set, `simulate`, which generates one, and `train`,
-which imports one into a store and trains an engine on it.
+"""The subcommands `dengine data`, which surveys a data set, `simulate`, which generates one, and
+`train`, which imports one into a store and trains an engine on it.
 """
 
 import math
@@ -60,10 +60,11 @@ def data(
     """Describe recordings, and list what is wrong with them.
 
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
-    .npz, .ts or .mcap. The verb shows the saved description or, without one, a proposal, in which ?
-    marks what you have to state with --set. While a ? is left, no recording is read. Below, it
-    shows what was read by the description, and drift. --out draws the traces. Look at them, and
-    write the description with --save, because every other verb needs it to read the recordings.
+    .npz, .ts or .mcap. The subcommand shows the saved description or, without one, a proposal, in
+    which ? marks what you have to state with --set. While a ? is left, no recording is read, and
+    --check ends with exit code 1. Below, it shows what was read by the description, and drift.
+    --out draws the traces. Look at them, and write the description with --save, because every other
+    subcommand needs it to read the recordings.
 
     DATA may also be a source that needs no description: a bundled set, the file of a store, or an
     .npz file with X (traces, samples) and y (1 success, 0 failure).
@@ -120,7 +121,7 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
 
 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
-    """Yield the tables and sentences that the verb `data` prints of a survey and of the notes.
+    """Yield the tables and sentences that `dengine data` prints of a survey and of the notes.
 
     A sentence may be "".
     """

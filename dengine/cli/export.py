@@ -1,5 +1,5 @@
-"""The verb `dengine export`: writes an engine's decision to a file for a controller, its checksum
-and signature, and the C++ sources that run such a file.
+"""The subcommand `dengine export`: writes an engine's decision to a file for a controller, its
+checksum and signature, and the C++ sources that run such a file.
 """
 
 from pathlib import Path

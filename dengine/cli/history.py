@@ -1,5 +1,5 @@
-"""The verbs `dengine history`, which lists the decisions of a store with the retrains and events
-between them, and `dengine explain`, which says why one decision came out as it did.
+"""The subcommands `dengine history`, which lists the decisions of a store with the retrains and
+events between them, and `dengine explain`, which says why one decision came out as it did.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Options that several verbs share, their types, and the records that verbs receive for them.
+"""Options that several subcommands share, their types, and the records that these receive for them.
 
-Options that belong together reach a verb as one argument: `RecipeChoice` (which recipe, with which
-settings), `DataChoice` (which data set, read how), a store's address, or an `Out`.
+Options that belong together reach a subcommand as one argument: `RecipeChoice` (which recipe, with
+which settings), `DataChoice` (which data set, read how), a store's address, or an `Out`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def example_epilog(example: str) -> str:
 
 
 def verb(example: str) -> Callable[[Command], click.Command]:
-    """Make a function a verb of `dengine`, with `--json` and a help that ends in an example."""
+    """Make a function a subcommand, with `--json` and a help that ends in an example."""
     return lambda command: click.command(epilog=example_epilog(example))(json_option(command))
 
 
@@ -150,12 +150,12 @@ class CommaList(click.ParamType[Any]):
 
 
 def bundle_options(into: str, make: Callable[..., Any], options: Mapping[str, Option]) -> Option:
-    """Return a decorator that adds several options and hands them to the verb as one argument.
+    """Return a decorator that adds options and hands them to the subcommand as one argument.
 
     Parameters
     ----------
     into : str
-        Name of the verb's argument.
+        Name of the subcommand's argument.
     make : callable
         Takes the options' values by their names, and returns that argument.
     options : mapping of str to option
@@ -218,8 +218,8 @@ store_argument = existing_store(click.argument("store", metavar="STORE"))
 def store_option(text: str, *names: str, required: bool = False) -> Option:
     """Return a decorator that adds `--store`, `--cell-id` and `--product`.
 
-    The verb gets them as one address, its argument `store`; the store need not exist. The address
-    is None without `--store`. A cell or product without `--store` is a usage error.
+    The subcommand gets them as one address, its argument `store`; the store need not exist. The
+    address is None without `--store`. A cell or product without `--store` is a usage error.
 
     Parameters
     ----------
@@ -289,7 +289,7 @@ class RecipeChoice:
     def load_if_given(self) -> Recipe | None:
         """Return the recipe if a name or a setting was given; None means the store's own recipe.
 
-        Raises SettingError as `load` does.
+        Raises SettingError like `load`.
         """
         return self.load() if self.name or self.settings else None
 
@@ -298,7 +298,7 @@ class RecipeChoice:
 
         It is the baseline if the name is that of a baseline, and otherwise the recipe that `load`
         returns. Both get the settings that were given. Without a name it is the recipe conv. Raises
-        SettingError as `load` does.
+        SettingError like `load`.
         """
         from ..experiments.replay import Contender
 
@@ -437,13 +437,14 @@ class DataChoice:
         """Return the description with the stated keys; None for a source that needs none.
 
         A bundled set, the file of a store and a file in a format of dengine need none, unless a key
-        is stated, or a description is given or saved beside the file. While the description is read
-        or proposed, a progress bar is shown.
+        is stated, or a description is given, or one is saved beside the file. A progress bar is
+        shown while the description is read or proposed. Nothing is saved.
 
         Parameters
         ----------
         propose : bool
-            If no description was saved: True proposes one, False raises DataError.
+            If no description is given or saved: True proposes one, in which `?` marks what is open;
+            False raises DataError.
 
         Raises
         ------
@@ -464,7 +465,8 @@ class DataChoice:
         Its notes, and the first three recordings that were left out, are printed to stderr, but not
         with `--json`. Raises DataError if it cannot be read.
 
-        description : the description to read by; None takes the one that `describe` returns.
+        description : the description to read by; None takes the one that `describe` returns, which
+        raises DataError if one is needed and none is saved.
         """
         from ..datasets import load_dataset
         from ..datasets.loading import count_files
@@ -588,15 +590,15 @@ def data_options(
 ) -> Option:
     """Return a decorator that adds `--data` and the options of how it is read.
 
-    They are handed on as one `DataChoice`, the verb's argument `source`.
+    They are handed on as one `DataChoice`, the subcommand's argument `source`.
 
     Parameters
     ----------
     default : str or None, default "insertion"
         None makes `--data` required.
     argument : bool, default False
-        The data set is the verb's argument DATA, required, instead of an option; `default` is not
-        used.
+        The data set is the subcommand's argument DATA, required, instead of an option; `default` is
+        not used.
     live : bool, default False
         Whether to add the options of live traces.
     """
@@ -732,7 +734,7 @@ force_option = click.option(
 def _out_option(kind: click.Path, text: str) -> Option:
     """Return a decorator that adds `--out` and `--force`.
 
-    They are handed on as one `Out`, the verb's argument `out`, which is None without `--out`.
+    They are handed on as one `Out`, the subcommand's argument `out`, which is None without `--out`.
     """
     options = {"out": click.option("--out", type=kind, help=text), "force": force_option}
     return bundle_options(

@@ -1,7 +1,7 @@
-"""What the verbs of `dengine` print and write: JSON or tables, files, progress bars.
+"""What the subcommands of `dengine` print and write: JSON or tables, files, progress bars.
 
-A verb calls `print_result` once: it prints one JSON document (`--json`), or tables and lines for
-people, and writes the files of `--out`. Besides: tables of records, values as people read them,
+A subcommand calls `print_result` once: it prints one JSON document (`--json`), or tables and lines
+for people, and writes the files of `--out`. Besides: tables of records, values as people read them,
 progress bars on stderr, and what Ctrl-C does.
 """
 
@@ -42,7 +42,7 @@ EXPLAIN = "--explain"
 def _context_flag(name: str, text: str) -> Callable[[Any], Any]:
     """Return a decorator that adds a flag whose value is kept in click's context under its name.
 
-    The verb does not receive it as an argument.
+    The subcommand does not receive it as an argument.
     """
 
     def keep(context: click.Context, option: click.Parameter, value: bool) -> None:
@@ -56,8 +56,8 @@ explain_option = _context_flag(EXPLAIN, "Explain the columns below the table.")
 
 
 def legend_or_hint(legend: str) -> str:
-    """Return the legend of a table if the running verb was given `--explain`, else a line that
-    names that flag.
+    """Return the legend of a table if the running subcommand was given `--explain`, else a line
+    that names that flag.
     """
     if click.get_current_context().meta.get(EXPLAIN):
         return legend
@@ -65,8 +65,8 @@ def legend_or_hint(legend: str) -> str:
 
 
 def as_json() -> bool:
-    """Return whether the running verb was given `--json`, and prints nothing but JSON; False
-    outside of a verb.
+    """Return whether the running subcommand was given `--json`, and prints nothing but JSON; False
+    if none runs.
     """
     context = click.get_current_context(silent=True)
     return context is not None and bool(context.meta.get(JSON))
@@ -74,12 +74,12 @@ def as_json() -> bool:
 
 @dataclass(frozen=True)
 class Out:
-    """Where a verb writes its files, as `--out` and `--force` say.
+    """Where a subcommand writes its files, as `--out` and `--force` say.
 
     Parameters
     ----------
     path : Path
-        A folder, or the file of the verb's only picture.
+        A folder, or the file of the subcommand's only picture.
     force : bool, default False
         Replace files that exist.
     """
@@ -132,13 +132,13 @@ def print_result(
     out: Out | None = None,
     make_files: Callable[[], Mapping[str, Any]] | None = None,
 ) -> None:
-    """Print a verb's result, after writing its files.
+    """Print a subcommand's result, after writing its files.
 
     Parameters
     ----------
     record : mapping
-        The JSON document, which `--json` prints alone. The verb's name and the paths of the files
-        are added to it, in a copy.
+        The JSON document, which `--json` prints alone. The subcommand's name, as "verb", and the
+        paths of the files are added to it, in a copy.
     *parts : str or rich.Table
         What is printed without `--json`. A line for each file that was written follows.
     out : Out or None
@@ -176,7 +176,7 @@ def print_result(
 def print_parts(*parts: Any) -> None:
     """Print tables and texts to stdout, with the passwords of database URLs masked.
 
-    They fit the terminal, or 80 columns where there is none. A text of one line is wrapped between
+    They fit the terminal, or 80 columns if there is none. A text of one line is wrapped between
     words, which keeps long paths whole. A text of several lines is printed as it is.
     """
     from rich.console import Console
@@ -447,8 +447,8 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
 
 
 def exit_interrupted(*lines: str) -> NoReturn:
-    """Print lines to stderr that say what was kept, and end the running verb, and so the process,
-    with exit code 130; passwords are masked.
+    """Print lines to stderr that say what was kept, and end the running subcommand, and so the
+    process, with exit code 130; passwords are masked.
     """
     for line in lines:
         click.echo(without_password(line), err=True)

@@ -1,4 +1,4 @@
-"""The verbs `dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
+"""The subcommands `dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
 
 All three take the options of `stream_options` for how streams are played. Ctrl-C keeps and shows
 the replays that were finished.
@@ -131,7 +131,7 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
-    """End the verb if an error or Ctrl-C interrupted its replays; do nothing if `error` is None.
+    """End the subcommand if an error or Ctrl-C interrupted its replays; nothing if `error` is None.
 
     `text` says which replays are shown. After Ctrl-C it is printed to stderr, and the exit code is
     130. Any other error is raised; before, `text` is printed to stderr if `is_shown`.
@@ -150,7 +150,7 @@ _SHUFFLES = "Number of shuffled replays of each recipe."
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
     """Return a decorator that adds the options of how streams are played.
 
-    The verb gets them as one `Stream`, its argument `stream`. `--repeats` together with
+    The subcommand gets them as one `Stream`, its argument `stream`. `--repeats` together with
     `--in-order` is a usage error.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The verb `dengine run`: an engine drives a cell, and continues where its store ended.
+"""The subcommand `dengine run`: an engine drives a cell, and continues where its store ended.
 
 `CELLS` has a function for each kind of cell: the parts of a recording, the simulated cell, or a
 Universal Robots controller.
@@ -59,7 +59,7 @@ class DrivenRun(NamedTuple):
     replay : Replay
         The finished cycles.
     safe_mode_changes : list of dict
-        `cycle` after which safe mode began or ended, and its `reason`, "" where it ended.
+        `cycle` after which safe mode began or ended, and its `reason`, "" if it ended.
     failure : CellError or None
         What ended the run, if the cell failed.
     """

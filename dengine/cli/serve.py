@@ -1,4 +1,4 @@
-"""The verb `dengine serve`: one engine behind HTTP, XML-RPC, OPC UA and a live page."""
+"""The subcommand `dengine serve`: one engine behind HTTP, XML-RPC, OPC UA and a live page."""
 
 from contextlib import ExitStack, nullcontext
 from functools import partial

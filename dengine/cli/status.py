@@ -1,4 +1,4 @@
-"""The verb `dengine status`: how an engine is doing, as far as its store tells."""
+"""The subcommand `dengine status`: how an engine is doing, as far as its store tells."""
 
 from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any

@@ -1,5 +1,5 @@
-"""The verbs that change, check or copy a store by hand: `report`, `correct`, `forget`, `rollback`,
-`release`, `policy`, `retrain`, `verify`, `backup`, `restore` and `import-labels`.
+"""The subcommands that change, check or copy a store by hand: `report`, `correct`, `forget`,
+`rollback`, `release`, `policy`, `retrain`, `verify`, `backup`, `restore` and `import-labels`.
 
 Those up to `retrain` change a store's engine, or show its policy; `verify` checks the store's
 history, `backup` copies it, `restore` puts a copy in place, and `import-labels` takes the labels of
@@ -56,7 +56,7 @@ author_option = click.option(
 
 
 def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add STORE, `--author` and `--allow-import`, which every verb that changes an engine has.
+    """Add STORE, `--author` and `--allow-import`, for a subcommand that changes an engine.
 
     Returns the command with these options; STORE reaches it as an address.
     """
@@ -70,8 +70,8 @@ def _change_and_print(
 
     `change` returns a `Changed`, whose text is printed after the engine was closed; it may say that
     nothing changed. The JSON document also has the policy and the certificate after the change. The
-    other arguments are those that `store_options` adds to a verb. Raises StoreError if an engine
-    runs on the cell, and whatever `change` raises.
+    other arguments are those that `store_options` adds to a subcommand. Raises StoreError if an
+    engine runs on the cell, and whatever `change` raises.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -101,8 +101,8 @@ def report(part: str, label: str, **changing: Any) -> None:
     confirmation. For a rejected part the label is that of an inspection, and the engine trains on
     it. An event records the report. The same label again changes nothing. Another label than the
     reported one is refused with exit code 1, unless it is a line stop; `dengine correct` puts a
-    wrong label right. The verb is refused while an engine runs on the cell. A store that names a
-    reducer or rule of your own, module:Class, needs --allow-import.
+    wrong label right. The subcommand is refused while an engine runs on the cell. A store that
+    names a reducer or rule of your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -136,8 +136,8 @@ def correct(part: str, label: str, **changing: Any) -> None:
     The part is named as for `dengine report`. From now on its decision counts with the corrected
     label. The label as it was reported stays in the store, and so does the decision; the correction
     is a later row. A correction makes a forgotten label count again. If this label counts already,
-    nothing changes. A decision without a label is refused. The verb is refused while an engine runs
-    on the cell.
+    nothing changes. A decision without a label is refused. The subcommand is refused while an
+    engine runs on the cell.
     """
     from ..history.explain import find_decision_id
 
@@ -158,8 +158,8 @@ def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
 
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings a label
     back. If one of the decisions is unknown or has no label, none is forgotten. A pinned version
-    that was trained with one of them is released. The verb is refused while an engine runs on the
-    cell.
+    that was trained with one of them is released. The subcommand is refused while an engine runs on
+    the cell.
     """
     _change_and_print(
         lambda engine, author: engine.forget(*decisions, author=author, reason=reason), **changing
@@ -175,7 +175,8 @@ def rollback(version: int, **changing: Any) -> None:
     Labels that came since are among its references, and corrections count. It is pinned: no
     automatic retrain replaces it, until `dengine release` or `dengine retrain`, or until a label
     that it was trained with is forgotten. A version that is not kept is refused; the message has
-    the numbers of the versions that are kept. The verb is refused while an engine runs on the cell.
+    the numbers of the versions that are kept. The subcommand is refused while an engine runs on the
+    cell.
     """
     _change_and_print(lambda engine, author: engine.rollback(version, author), **changing)
 
@@ -185,7 +186,7 @@ def rollback(version: int, **changing: Any) -> None:
 def release(**changing: Any) -> None:
     """Let retrains replace the version that `rollback` pinned.
 
-    If none is pinned, nothing changes. The verb is refused while an engine runs on the cell.
+    If none is pinned, nothing changes. The subcommand is refused while an engine runs on the cell.
     """
     _change_and_print(lambda engine, author: engine.release(author), **changing)
 
@@ -233,8 +234,8 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels with all corrections.
 
     An event records it. The new version replaces a pinned one, too. If the new version fails its
-    tests, it is dropped, the previous version stays in use, and the exit code is 1. The verb is
-    refused while an engine runs on the cell.
+    tests, it is dropped, the previous version stays in use, and the exit code is 1. The subcommand
+    is refused while an engine runs on the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -286,9 +287,9 @@ def verify(
     """Check that a store's history is what was written.
 
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
-    the rows, with its rows. The verb lists rows that were changed, that are missing or that are in
-    no entry, and data that was lost. If there are any, the exit code is 1. The verb writes only
-    with --acknowledge, and engines may run meanwhile.
+    the rows, with its rows. The subcommand lists rows that were changed, that are missing or that
+    are in no entry, and data that was lost. If there are any, the exit code is 1. The subcommand
+    writes only with --acknowledge, and engines may run meanwhile.
     """
     from ..store.sql import SqlStore
     from ..store.verification import verify_history
@@ -387,9 +388,10 @@ def restore(copy: str, store: Path) -> None:
     """Put a backup in the place of a store.
 
     COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if it is
-    not as it was written, or --store exists, it is refused with exit code 1. Beside the store each
-    cell gets a journal that names the newest entry of its ledger. A journal that is there already
-    stays, and the first engine takes from it what the copy lacks.
+    not as it was written, or --store exists, it is refused with exit code 1. Beside --store each
+    cell gets a journal. It names the newest entry of the cell's ledger, by which the next engine
+    sees that the store is complete. A journal that is there already stays, and that engine takes
+    from it what the copy lacks.
     """
     from ..store.backup import restore_store
 
@@ -417,8 +419,8 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
     imported. If a line was changed or is missing, the lines before it are imported, the others are
     not, and the exit code is 1. A file that is no journal, has a line that cannot be read, or
-    belongs to another model (unless --any-model) is refused as a whole. The verb is refused while
-    an engine runs on the cell.
+    belongs to another model (unless --any-model) is refused as a whole. The subcommand is refused
+    while an engine runs on the cell.
     """
     from ..export.cell_journal import import_journal
 

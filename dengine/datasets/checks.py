@@ -30,11 +30,11 @@ __all__ = [
 def check_description(description: Description) -> None:
     """Raise DataError unless recordings can be read by a description; no file is looked at.
 
-    The value of no key may be `?`. The time zone must be known, and the number of samples of a
-    trace stated. A rate that is stated must be between 1 Hz and 1 MHz. All channels must have the
-    same `limit`, the range of the sensor. If the recordings are ordered by time, the description
-    must name a column of times, and each such column needs a format. The form of the text files
-    must pass `check_text`.
+    No key may have the value `?`, except in `[ignored]` and `[[check]]`. The number of samples of a
+    trace must be stated. A time zone, if stated, must have a known name, and a rate must be between
+    1 Hz and 1 MHz. There must be a channel, and all channels must have the same `limit`, the range
+    of the sensor. Recordings that are ordered by time need a column of times, and there must be as
+    many formats as columns of times. The settings in `[text]` must pass `check_text`.
     """
     clock = description.time
     if open_keys := description.open_keys:
@@ -78,9 +78,9 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
     """Return the recordings without repeated traces, and a fault for each recording left out.
 
     The traces (C, T) all have one shape. Two traces are equal if they have the same `content_hash`,
-    which rounds samples to 1/65,536 of their unit. Of equal traces with one label the first is
-    kept; if their labels differ, none is kept. A trace whose finite samples are all the same is
-    always kept: a dead sensor gives it for any part.
+    which rounds samples to 1/65,536 of their unit, and counts lost samples as 0. Of equal traces
+    with one label the first is kept; if their labels differ, none is kept. A trace whose finite
+    samples are all the same is always kept: a dead sensor gives it for any part.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []

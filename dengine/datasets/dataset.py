@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError, TraceError, expect, instead, listed
-from ..records import TraceSpec
+from ..records import Ints, TraceSpec
 from ..traces import as_traces
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ class Dataset:
     channels: Names = ()
     source: Texts | None = None
     fit: str = "strict"
-    lengths: NDArray[np.int64] | None = None
+    lengths: Ints | None = None
     notes: Names = ()
     unlabelled: int = 0
     ordered: bool = True
@@ -150,9 +150,10 @@ class Dataset:
 
         Its columns are `label`, `part` and `cause` if known, and one for each sample of each
         channel: `FZ_0`, `FZ_1`, ... Without channel names they are `x_0`, `x_1`, ... or, if there
-        are several channels, `x0_0`, `x0_1`, ... Its metadata has the channels, the rate, the unit
-        and the fit, so that `load_dataset` reads what `data.to_frame().to_parquet("data.parquet")`
-        writes, without a description.
+        are several channels, `x0_0`, `x0_1`, ... Its metadata has the channels, the rate, the unit,
+        the limit and the fit, so that `load_dataset` reads what
+        `data.to_frame().to_parquet("data.parquet")` writes, without a description. All other fields
+        are lost.
         """
         import pandas as pd
 
@@ -167,9 +168,10 @@ class Dataset:
         return frame
 
     def select(self, channels: Names) -> "Dataset":
-        """Return a data set of some channels, in this order; DataError for unknown names.
+        """Return a data set of some channels, at least one, in this order.
 
-        Of one channel, X has the shape (n, T).
+        Of one channel, X has the shape (n, T). Raises DataError for unknown names, and if the
+        channels have no names.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = {*channels} <= {*self.channels}
@@ -187,8 +189,8 @@ class Dataset:
         """Return a data set with only the first `samples` samples of each trace, to decide earlier.
 
         If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result. Raises
-        DataError if the traces are shorter than `samples`, or if they were resampled and would
-        become shorter: their first samples are not those of the recordings.
+        DataError if `samples` is below 1, if the traces are shorter, or if `fit` is "resample" and
+        they would become shorter: their first samples are not those of the recordings.
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1
@@ -216,7 +218,7 @@ def make_dataset(
     y : array, shape (n,)
         1 for success, 0 for failure.
     rate_hz, channels, part, cause
-        As in `Dataset`; part numbers may be integers.
+        As in `Dataset`. Part numbers may be integers, and become texts. `cause` is kept as it is.
     **about
         Other fields of `Dataset`, which are not checked.
 
@@ -229,8 +231,10 @@ def make_dataset(
     Raises
     ------
     DataError
-        If the arrays do not fit together, there is no trace, a label is neither 1 nor 0, X has more
-        channels than samples, or the rate is not between 1 Hz and 1 MHz.
+        If X has no trace, another shape, more channels than samples, or values that are no real
+        numbers; if y, part, cause or the names of the channels do not fit X; if a label is neither
+        1 nor 0, or a part's number neither a text nor an integer; or if the rate is not between
+        1 Hz and 1 MHz. NaN and infinities pass.
     """
     try:
         cube = as_traces(X)

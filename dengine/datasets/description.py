@@ -301,8 +301,9 @@ class Description:
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
         """Return the description that nested dicts state, as a TOML file has them.
 
-        Every value may be `?`. Raises DataError for an unknown key (the message names the most
-        similar key), for a value of the wrong type, and for a description of a newer version.
+        The value of every key may be `?`, but no section; a channel `?` is left out. Raises
+        DataError for an unknown key (the message names the most similar key), for a value of the
+        wrong type, and for a description of a newer version.
 
         where : what the description is called in errors.
         """
@@ -475,8 +476,8 @@ KINDS: dict[Any, str] = {
 def _made(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file as the dataclass, tuple or other type that its key has.
 
-    A single value becomes a tuple where several are expected. Raises DataError for an unknown key
-    or choice, and for a value of another type.
+    A single value becomes a tuple if several are expected. Raises DataError for an unknown key or
+    choice, and for a value of another type.
     """
     origin = get_origin(kind)
     args = get_args(kind)

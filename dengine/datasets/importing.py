@@ -148,7 +148,7 @@ def import_labelled(
         For the engine of a new store; by default recipe conv and seed 0. A used store has its own
         recipe and seed; other values raise SettingError.
     on_traces : callable, optional
-        Called with the number of traces that were just imported.
+        Called after each chunk with its number of traces, known ones included.
     allow_import : bool
         Whether classes of the user that a used store names may be imported.
 
@@ -159,11 +159,14 @@ def import_labelled(
     Raises
     ------
     TraceError
-        If the traces do not agree with those of the store.
+        If the traces do not agree with those of the store, or a part's number is longer than 200
+        characters.
     DataError
         If the data set cannot be read, see `load_dataset`; then no store is created.
+    SettingError
+        If the recipe is wrong, or recipe or seed are not those of a used store.
     StoreError
-        If the store cannot be opened or written.
+        If the store cannot be opened or written; chunks before the error stay.
     """
     description = None
     if own_reader(dataset) is None:
@@ -200,7 +203,7 @@ def import_parts(
     decision, nothing is changed: the new label is counted as repeated or contradicted. A trace with
     a fault is stored but never trains, and its decision gets the fault as its reason. With
     `stops="some"` each label also stores the number of accepted parts without a report since the
-    label before.
+    label before; the label of a trace with a fault stores 0, and the next label counts these parts.
 
     Parameters
     ----------
@@ -214,7 +217,7 @@ def import_parts(
         The policy under which the decisions were made. Each stored decision gets its propensity
         from it; `Decision.propensity` is not read.
     on_traces : callable, optional
-        Called with the number of parts of each chunk.
+        Called with the number of parts of each chunk after it was stored.
 
     Returns
     -------

@@ -39,14 +39,14 @@ def load_dataset(
     ----------
     source : str, path, Dataset, DataFrame or pair (X, y), default "insertion"
         The name of a bundled set, or recordings that a description describes: a folder, a file or a
-        DataFrame. These need no description, and are read without one unless it is given or saved
-        beside the file: a `Dataset`; arrays X (n, T) or (n, C, T) and y (n,); an .npz file with X,
-        y, and perhaps scale, rate_hz, unit, cause (why a part failed), channels and part; a Parquet
-        file of a table that `Dataset.to_frame` made; the SQLite file of a store, of which the
-        labelled traces are read.
+        DataFrame. No description is needed for a `Dataset`; arrays X (n, T) or (n, C, T) and y
+        (n,); an .npz file with X, y, and perhaps scale, rate_hz, unit, cause (why a part failed),
+        channels and part; a table that `Dataset.to_frame` made, or its Parquet file; the SQLite
+        file of a store, of which the labelled traces are read. A file or table of these is read by
+        a description all the same if one is given, or saved beside the file.
     description : Description, dict or path, optional
-        How the recordings are written. None: the description that was saved, as `recordings.toml`
-        in the folder or `FILE.toml` beside the file.
+        How the recordings are written; not beside a `Dataset` or a pair. None: the description that
+        was saved, as `recordings.toml` in the folder or `FILE.toml` beside the file.
     channels : str or sequence of str, optional
         The channels to read, "FZ_Base" or "FZ_Base,FX_Base", among those that the description or
         the data set names. None: all channels.
@@ -72,6 +72,10 @@ def load_dataset(
         below 1, or if traces that were read without a description are shorter than `samples`.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
+    StoreError
+        If the store in a SQLite file cannot be opened.
+    OSError
+        If a file cannot be opened to see whether it is a store.
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))
@@ -118,6 +122,8 @@ def description_of(
     DataError
         If no description was saved (the message says what to type), none is given for a DataFrame,
         the source does not exist, or a description cannot be read or proposed.
+    SettingError
+        If none was saved, and a stated `windows.trigger` is malformed.
     """
     if isinstance(description, Description):
         return description
@@ -165,8 +171,10 @@ def missing_text(path: Path, proposal: Description) -> str:
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
     """Return a function that reads a source in a format of dengine; None if it needs a description.
 
-    A file beside which a description was saved needs it, whatever it holds. Raises DataError for a
-    source of an unknown type, and for a damaged .npz or Parquet file.
+    None is also returned for a folder, and for a path that does not exist. A file beside which a
+    description was saved needs it, whatever it holds. Raises DataError for a source of an unknown
+    type, for a damaged .npz or Parquet file, and for a Parquet file without pyarrow. An OSError of
+    opening the file passes.
     """
     if isinstance(source, Dataset):
         return lambda: source
@@ -273,7 +281,7 @@ def _read_store(path: Path) -> Dataset:
     Quarantined and forgotten traces are left out. If several traces are of one part, `part` is the
     hash by which the store counts them as one part; otherwise it is None. Raises DataError if the
     store has no labelled traces, or if its rows contradict its ledger, the chain of hashes over
-    them.
+    them, and StoreError if the store cannot be opened.
     """
     from ..store.opening import opening
 

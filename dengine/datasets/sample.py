@@ -26,7 +26,7 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     folder : path
         A new or an empty folder.
     n : int, default 200
-        Number of files.
+        Number of files, at most the 1503 insertions of the set.
 
     Raises
     ------

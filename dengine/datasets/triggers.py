@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingError, shortened
+from ..records import Floats
 
-Signals = Mapping[str, NDArray[np.float64]]  # (n,) each
+Signals = Mapping[str, Floats]  # (n,) each
 MAX_STEP = 1.5  # steps from one sample to the next if none is missing
 
 
@@ -51,7 +52,7 @@ class Trigger:
         return vector if self.kind == "motion" else (self.signal,)
 
     def active(self, signals: Signals) -> NDArray[np.bool_]:
-        """Return whether the condition is met at each of n samples; not where a signal is NaN.
+        """Return whether the condition is met at each sample, (n,) bool; False if a signal is NaN.
 
         signals : arrays of shape (n,) by the names of the signals.
         """
@@ -96,8 +97,9 @@ def as_trigger(value: Any) -> Trigger:
 
     "bit=0": digital output 0 is on. "register@NAME": the signal NAME is not zero. "contact=5": the
     force FZ_Base is 5 N or more, in either direction. "motion=0.002": the tool moves faster than
-    2 mm a second. Only bit and contact need a number. Without @SIGNAL each kind reads a signal of
-    its own. Raises SettingError for any other value.
+    2 mm a second. Only bit and contact need a number. A bit is 0 to 31, a force and a speed are
+    above 0. Without @SIGNAL each kind reads a signal of its own. Raises SettingError for any other
+    value.
     """
     if isinstance(value, Trigger):
         return value
@@ -184,7 +186,7 @@ class StartFinder:
 
 
 def place(
-    times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float
+    times: Sequence[float], values: Floats, start: float, samples: int, step: float
 ) -> Placed:
     """Put samples into a trace, each at the place nearest to its time.
 

@@ -259,7 +259,8 @@ class Policy:
         Raises
         ------
         SettingError
-            If the class cannot be imported, is no `DecisionRule`, or takes other arguments.
+            If the class cannot be imported, is no `DecisionRule`, or its constructor raises
+            TypeError, since it takes other arguments. What else the constructor raises passes.
         """
         from . import member_rules  # torch is imported where it is used
         from .rule import DecisionRule
@@ -321,7 +322,7 @@ class Policy:
     def action(self, lower: float, upper: float) -> Action:
         """Return the action that one bound allows by the paper's rule, whatever the guarantee is.
 
-        ACCEPT if lower >= LB, REJECT if upper <= 1 - LB, otherwise VERIFY.
+        ACCEPT if lower >= LB, otherwise REJECT if upper <= 1 - LB, otherwise VERIFY, also for NaN.
         """
         from .rule import action_of
 

@@ -120,7 +120,8 @@ class Corrections:
             For an unknown decision, for a decision without a label, and for a `success` that is no
             label.
         StoreError
-            If the store does not answer, or the engine is closed or was opened for reading.
+            If the store does not answer, the decision's trace is damaged, or the engine is closed
+            or was opened for reading. A change that was stored before the error stays stored.
         """
         label = as_success(success)
         (stored,) = self._find_labelled([decision_id])
@@ -164,7 +165,8 @@ class Corrections:
             For an unknown decision, for a decision without a label, and if no id is given; then no
             label is forgotten.
         StoreError
-            If the store does not answer, or the engine is closed or was opened for reading.
+            If the store does not answer, the trace of a decision is damaged, or the engine is
+            closed or was opened for reading. A change that was stored before the error stays.
         """
         if not decision_ids:
             raise ReportError(
@@ -369,7 +371,7 @@ class Corrections:
 
         They are in the order of the ids. `success` of a decision is None if its label was
         forgotten. Raises ReportError for an unknown id, and for a decision that never had a label,
-        and StoreError if the store does not answer.
+        and StoreError if the store does not answer or a trace is damaged.
         """
         self._bring_up_to_date()
         decisions = []
@@ -386,9 +388,9 @@ class Corrections:
         """Store a change of labels, and apply it to references, training window and rule.
 
         A model that cannot change its references is retrained, in this thread. If a safe mode
-        begins or ends by this, that is recorded and announced to the user's `on_safe_mode`. Returns
-        what was done, with the number of the change's event. Raises StoreError if the store does
-        not answer.
+        begins or ends by this, an event is recorded, and `on_safe_mode` is called. Returns what was
+        done. Raises StoreError if the store does not answer; a change that is stored by then is
+        applied with the next one, or when the store is opened again.
         """
         self._store.corrections.apply(change)
         for id_ in change.decisions:
@@ -399,12 +401,13 @@ class Corrections:
     def _finish_change(
         self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
     ) -> Changed:
-        """Announce a safe mode that a stored change began or ended, and return what the change did.
+        """Record an event and call `on_safe_mode` if a stored change began or ended a safe mode;
+        return what the change did.
 
-        `reason_ended` is recorded as the reason if a safe mode ended. The result names the newest
-        event of the store as the event of the change.
+        `reason_ended` is recorded as the reason if a safe mode ended.
         """
-        number = self._store.events.newest(1)[0].number
+        newest = self._store.events.newest(100)  # a refitted model is an event of its own
+        number = max(event.number for event in newest if event.kind == change.kind)
         self._feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._live.version)
 

@@ -70,8 +70,10 @@ class DecisionMaker:
         another cell of the product has set one, that one is taken in the same way; if it cannot be
         read, that is logged and `spec` is set.
 
-        The settings are saved in the store; if that fails, they are saved with a later trace.
-        Raises SettingError if the force limits do not fit the `TraceSpec`.
+        A change is saved in the store; if the store does not take it, it is saved with a later
+        trace. Raises SettingError if the force limits do not fit the `TraceSpec`; then nothing
+        changes. Saving raises it, too, if another cell of the product has a `TraceSpec` that
+        contradicts this one, which then stays in force here.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -90,14 +92,14 @@ class DecisionMaker:
     def convert(self, trace: ArrayLike) -> TraceArray:
         """Return a trace as float32 (channels, samples), converted as the `TraceSpec` demands.
 
-        If no `TraceSpec` is in force, the one that another cell of the product has set is taken, or
-        else the first trace without a fault sets it. Before the first training the first finite
-        trace also lets the model compile its code for such traces. Settings that could not be saved
-        before are saved.
+        If no `TraceSpec` is in force, a trace without a fault sets it; but if another cell of the
+        product has set one, that one is taken, and the trace must fit it. Before the first training
+        the first finite trace also lets the model compile its code for such traces; a failure of
+        this is logged. Settings that could not be saved before are saved now.
 
-        A trace with NaN, or another fault, is returned like any other. Raises TraceError for a
-        wrong shape, or too few samples of a first trace, and SettingError if the force limits do
-        not fit the `TraceSpec` that the trace sets.
+        A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`.
+        Raises TraceError for a wrong shape, or too few samples of a first trace, and SettingError
+        for the reasons of `set_trace_spec`.
         """
         settings = self._settings.now
         x = as_trace(trace, settings.trace)
@@ -117,9 +119,9 @@ class DecisionMaker:
     def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
         """Return the decision that the store already has for an id, or None for a new id.
 
-        The id comes from the caller. If the store does not answer, the decision returned is a
-        VERIFY for this `part` with `Reason.NO_STORE`: it is logged and not recorded, because the id
-        may have a decision already, and `trace` is not looked at. A report for this id then raises
+        The id comes from the caller. If it cannot be looked up, this is logged, and the decision
+        returned is a VERIFY for this `part` with `Reason.NO_STORE`. It is not recorded, because the
+        id may have a decision already; `trace` is not looked at. A report for this id then raises
         StoreError, until a later call can look the id up.
 
         Raises
@@ -151,7 +153,7 @@ class DecisionMaker:
     ) -> StoredDecision:
         """Decide on one trace and hand the decision to the outbox, without waiting for the disk.
 
-        Any thread may call it.
+        Any thread may call it, unless the store is in memory.
 
         Parameters
         ----------
@@ -168,7 +170,8 @@ class DecisionMaker:
         Returns
         -------
         StoredDecision
-            The record with its number, which is 0 if it could not be recorded. Before the first
+            The record with its number, which is 0 if it could not be recorded. If another thread
+            has recorded a decision for the id meanwhile, that one is returned. Before the first
             training the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault or is
             outside a force limit.
         """
@@ -199,10 +202,11 @@ class DecisionMaker:
         """Record VERIFY, `Reason.LATE`, while another thread may use the engine, and return it.
 
         Any thread may call it. It returns once the decision is on disk, or when the store's time
-        limit is over. If the id has a decision already, that decision is returned. If the store
-        cannot look the id up, the result is a VERIFY with `Reason.NO_STORE` that is not recorded.
-        With a store in memory, and before the first trace, the VERIFY is not recorded either: only
-        the thread that uses the engine may do that.
+        limit is over. A fault of the trace or the store is the reason instead of LATE. If the id
+        has a decision already, that decision is returned. If the id cannot be looked up, the result
+        is a VERIFY with `Reason.NO_STORE` that is not recorded. With a store in memory, and while
+        no `TraceSpec` is in force, the VERIFY is not recorded either, and the trace is not looked
+        at: only the thread that uses the engine may do that.
 
         Raises TraceError for an invalid part number, an id that belongs to another trace, and a
         trace that does not fit the `TraceSpec` in force, and ReportError for an invalid id.
@@ -230,11 +234,12 @@ class DecisionMaker:
     ) -> StoredDecision:
         """Decide on one trace by a model; return the decision as a record that is not stored yet.
 
-        Without a model, and with a `verify_reason`, the decision is VERIFY. With a `verify_reason`
-        the force limits are not checked, and only a fault of the trace replaces this reason. If the
-        trace has a fault, the record is quarantined: it is never trained on. If the model raises or
-        returns impossible bounds, that is logged, and the decision is VERIFY with
-        `Reason.MODEL_ERROR`, unless the trace has a fault or is outside a force limit.
+        A trace with a fault is verified for that reason, and its record is quarantined: it is never
+        trained on. Otherwise, with a `verify_reason` the decision is VERIFY for it, and the force
+        limits are not checked. Without it a trace outside a force limit is verified or rejected,
+        also without a model. Else, without a model the decision is VERIFY, `Reason.NO_MODEL`. If
+        the model raises or returns impossible bounds, that is logged, and it is VERIFY,
+        `Reason.MODEL_ERROR`.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         # Without a contract the trace has a fault, and is decided all the same.
@@ -282,7 +287,9 @@ class DecisionMaker:
 
 
 def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Verdict:
-    """Decide without a model: VERIFY for `reason`, unless a fault or a force limit decides."""
+    """Decide without a model: VERIFY for `reason`, unless a fault or a force limit decides; such a
+    limit may also reject.
+    """
     verdict: Verdict = decider_without_model(conditions, reason)(torch.from_numpy(x))
     return verdict
 

@@ -316,7 +316,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         The engine owns the cell until `close`, unless it only reads, and limits this thread to one
         torch thread. Without an executor, unless it only reads, the call also waits until a retrain
-        can begin at once. If it raises, a store that it opened is closed.
+        can begin at once. If it raises, a store that it opened is closed; an `SqlStore` that was
+        passed may be closed, too.
 
         Parameters
         ----------
@@ -325,9 +326,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             If the engine had an object of yours that the store cannot name: the same object again.
         trace : TraceSpec, optional
             The `TraceSpec` as the store has it, together with a rate, units or columns that were
-            unknown so far.
+            unknown so far; they are stored, unless `reading`. If the store has none yet, any.
         wait : float, optional
-            Seconds that a call waits for the database, as `SqlStore` takes it.
+            Seconds that a call waits for the database, like `wait` of `SqlStore`; not used for an
+            open store.
         allow_import : bool or collection of str
             Whether a `module:Class` that the store names is imported, or which of these classes
             are. A class that `reducer` names is allowed.
@@ -346,7 +348,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         StoreError
-            If the store does not exist or is not used, or another engine owns the cell.
+            If the store does not exist, is not used, is damaged or cannot be read, or if another
+            engine owns the cell.
         SettingError
             If an object of yours is missing or is another one than the engine had, if a `model` is
             given to an engine that has its own, or if `trace` contradicts the stored `TraceSpec`.
@@ -396,10 +399,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             name is imported in any case.
         **settings
             As `DataEngine` takes them. For a used store, the given settings must be the settings
-            in force, so that a running cell does not change unnoticed. `model` is as for `open`;
-            `executor`, `clock`, `replaying` and `on_safe_mode` are not stored, so any may be
-            given. A new cell of a product (cells that share labels and versions) takes the
-            settings that are not given from its peers, the other cells.
+            in force, so that a running cell does not change unnoticed; see
+            `EngineSettings.check_request` for what is not compared, like the shadow mode. `model`
+            is as for `open`; `executor`, `clock`, `replaying` and `on_safe_mode` are not stored, so
+            any may be given. A new cell of a product (cells that share labels and versions) takes
+            the seed, and the recipe if it is given neither recipe, reducer nor model, from the
+            first of its peers, the other cells.
 
         Returns
         -------
@@ -435,9 +440,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. A second call does nothing. Records that the disk
-        does not take are given up, and an error is logged; none of them was acknowledged. Raises
-        StoreError while another thread uses the engine.
+        A retrain that takes longer is dropped. A second call does nothing. Records that only the
+        database does not take stay in the journal. Records that the disk does not take are given
+        up, and an error is logged; none of them was acknowledged. Raises StoreError while another
+        thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -448,7 +454,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
         If a wrong confirmation has updated the rule, the rule is put right, too, if the store has
-        answered. Raises NotTakenError after `wait` seconds; None: the store's own limit.
+        answered. Raises NotTakenError if the disk takes longer than `wait` seconds; None: the
+        store's own limit. The store is waited for up to its own limit.
         """
         self._outbox.flush(wait)
         self._learner.catch_up()
@@ -465,6 +472,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Decision:
         """Decide on one trace, and record the decision.
 
+        Before that, a version that the executor has trained is taken one step further, and accepted
+        parts without a report are confirmed (`Policy(stops="all")`) or counted as unreported. If a
+        safe mode began or ended, an event is recorded, and `on_safe_mode` is called. For an id that
+        has a decision nothing of this is done, and that decision is returned.
+
         Parameters
         ----------
         trace : array, shape (samples,) or (channels, samples)
@@ -479,7 +491,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             as VERIFY with `Reason.LATE`, without asking the model. If the trace or the store has a
             fault, this fault is the reason instead. Any thread may make this call, also while
             another thread uses the engine; it waits for the disk, but not for that thread. With a
-            store in memory, and before the first trace, the VERIFY is not recorded.
+            store in memory, and while no `TraceSpec` is in force, the VERIFY is not recorded.
 
         Returns
         -------
@@ -493,7 +505,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             For a wrong shape, a first trace of less than 10 samples, an id that belongs to another
             trace, and an invalid part number.
         SettingError
-            For a first trace that the policy's force limits do not fit.
+            For a first trace that the policy's force limits do not fit, and, while settings are
+            saved, for a `TraceSpec` that contradicts that of another cell of the product.
         ReportError
             For an invalid id.
         StoreError
@@ -537,11 +550,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def report(self, decision_id: str, success: bool) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
 
-        After the label, safe mode may begin or end, and a retrain that is due runs in this thread
-        or begins in the executor. The label of a trace with a fault is stored, but no retrain
-        follows. If the next decision had confirmed the part as good already, the call also waits
-        for the store, so that the rule is corrected now; if the store does not answer, this happens
-        later.
+        Before that, a version that the executor has trained is taken one step further. After the
+        label, safe mode may begin or end (`on_safe_mode` is called), and a retrain that is due runs
+        in this thread or begins in the executor. The label of a trace with a fault is stored, but
+        no retrain follows. If the next decision had confirmed the part as good already, the call
+        also waits for the store, so that the rule is corrected now; if the store does not answer,
+        this happens later.
 
         Parameters
         ----------
@@ -555,16 +569,17 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         RetrainReport or None
-            The report of a retrain that ran in this thread because of the label, if any.
+            The report of a retrain that was due and ran in this thread, if any.
 
         Raises
         ------
         ReportError
             For an unknown id, a second report on the decision, or an invalid label.
         StoreError
-            If it is not certain that the label is on disk: it is learned all the same, and the same
-            report may come again. Also for an engine that is closed, was opened for reading, or is
-            in use by another thread.
+            If it is not certain that the label is on disk (NotTakenError): it is learned all the
+            same, and the same report may come again. If the id cannot be looked up: nothing is
+            learned. Also for an engine that is closed, was opened for reading, or is in use by
+            another thread.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -594,8 +609,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         go on or rejects it. A known outcome is reported, and retrains happen between cycles. When
         the iteration ends, also by an error of the cell, everything known is written. If the cell
         has a `TraceSpec` as its attribute `spec`, the engine takes from this spec what it does not
-        know about the traces yet. Python's garbage collector works between decisions, and only on
-        objects that are newer than the first cycle (`gc.freeze`).
+        know about the traces yet. The attribute `part`, if there is one, is each part's number.
+        Python's garbage collector works between decisions, and only on objects that are newer than
+        the first cycle (`gc.freeze`).
 
         Parameters
         ----------
@@ -614,6 +630,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         SettingError
             Before the first part, for a cell that lacks one of its four methods, or whose `spec`
             cannot hold the force limits.
+        TraceError
+            If `decide` does not take a trace of the cell.
         ReportError
             If `verify` returns no label, or `proceed` returns no Outcome.
         NotTakenError
@@ -697,11 +715,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Parameters
         ----------
         wait : bool, default True
-            False: begin to retrain in the executor, and return None, also if a retrain is under
-            way; `poll` brings it to its end. Without an executor it retrains in this thread. True:
-            a version that is already trained is first put in force or dropped, and a training that
-            is not done is discarded. In the first two seconds of an engine the call also waits for
-            the modules that a retrain imports.
+            True: a version that is already trained is first put in force or dropped, and a training
+            that is not done is discarded. In the first two seconds of an engine the call also waits
+            for the modules that a retrain imports. False: begin to retrain in the executor, and
+            return None. If a retrain is under way, nothing is begun; if the executor cannot begin
+            yet, `poll` or `report` begins it. `poll` brings it to its end. Without an executor it
+            runs in this thread, and its report is returned.
 
         Returns
         -------
@@ -720,11 +739,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             return self._learner.retrain(wait)
 
     def poll(self, brief: bool = False) -> RetrainReport | None:
-        """Do between two parts what is due: swap in a trained version, retrain, announce safe mode.
+        """Do between two parts what is due: put a trained version in force, retrain, tell of safe
+        mode.
 
-        `run` does so after each part. In a loop of your own, `decide` and `report` do the same. But
-        if the executor has trained a version, each of their calls takes it only one step further.
-        Without an executor a retrain that is due runs here, also with `brief`.
+        `run` calls it after each part. In a loop of your own `decide` and `report` together do the
+        same, but each takes a version that the executor has trained only one step further (the
+        steps are test, store, put in force). A training that is not done is not waited for. Without
+        an executor a retrain that is due runs here, also with `brief`. In a product, newer versions
+        and corrections of the other cells are put in force, which are looked for once a second. If
+        a safe mode began or ended, an event is recorded, and `on_safe_mode` is called.
 
         Parameters
         ----------
@@ -737,9 +760,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Returns
         -------
         RetrainReport or None
-            The newest report, of a retrain that was accepted or dropped, a rollback or a new
-            policy; None if this method has returned it before. `report` and `retrain` may have
-            returned it, too.
+            The newest report, of a retrain that was accepted or dropped, or of a version that a
+            rollback, a release or a new policy made. None if there is none, or if this method has
+            returned it before. `report` and `retrain` may have returned it, too.
 
         Raises
         ------
@@ -838,8 +861,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._outbox.find_decision(as_id(decision_id))
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Flush, and return how the engine is doing; arguments and errors as of
-        `history.status.status`.
+        """Flush, and return how the engine is doing; arguments and errors are those
+        of `history.status.status`.
 
         If the disk does not take everything, `store_fault` says why, and the counts lack the rest.
         """
@@ -850,7 +873,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def history(self, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
         """Yield the decisions so far, newest last.
 
-        Arguments and errors as of `history.status.history`.
+        Arguments and errors are those of `history.status.history`.
         """
         return history(self.store, last, **where)
 
@@ -881,9 +904,10 @@ def _new_settings(
 
     `given` holds the settings that the caller passed beside the recipe, by name; None is not given.
     For a handed-in `model` without a recipe, the other settings are those of the default recipe,
-    except `retrain_every`, which is the one for any reducer. Raises SettingError for settings that
-    are out of range, contradict each other or have no effect on the model, and if the training
-    window is smaller than the model's `min_traces`.
+    but `retrain_every` is that of `Reducer`, not of conv. Raises SettingError if `reducer`, or a
+    setting in `given`, has no effect on such a model; those in `recipe` are not refused. Raises it
+    also for settings that are out of range or contradict each other, and if the training window is
+    smaller than the model's `min_traces`.
     """
     if model is not None:
         check_model_settings(reducer, given)

@@ -104,8 +104,8 @@ class Feedback:
         The live model must be restored before. Overdue checks and checks from before the present
         rule are left out, as are accepted parts from before the present policy. With `stops="all"`
         the accepted parts are kept, so that the next trace confirms them. With "some" they are only
-        counted, as unreported since the last label. If the live model is in a safe mode, this is
-        not announced again. Raises StoreError if the store cannot be read.
+        counted, as unreported since the last label. For a safe mode that the live model is in,
+        `on_safe_mode` is not called again. Raises StoreError if the store cannot be read.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -297,11 +297,12 @@ class Feedback:
         self._n_unreported = 0
 
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
-        """Record, and tell `on_safe_mode`, if a safe mode began or ended since the last call.
+        """Record an event, then call `on_safe_mode`, if a safe mode began or ended since the last
+        call.
 
         A safe mode begins after an alarm of the rule. `reason_ended` is recorded if one ended. If
         recording the event or the user's function fails, that is logged and not tried again;
-        callers announce only after labels are stored, so that such a failure costs no label.
+        callers do this only after labels are stored, so that such a failure costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

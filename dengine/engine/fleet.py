@@ -56,8 +56,9 @@ class Peers:
     def look(self) -> tuple[int, int]:
         """Return the numbers of the product's newest version and of its newest correction.
 
-        The first is 0 if there is none that is newer than the version in force; one that could not
-        be put in force does not count. Raises StoreError if the store gives no answer in time.
+        The first is 0 if there is no version that is newer than the one in force; a version that
+        could not be put in force does not count. Raises StoreError if the store gives no answer in
+        time. In both cases no look is due for the next `LOOK_SECONDS`.
         """
         self._looked = self._clock()
         store = self._outbox.store
@@ -100,8 +101,8 @@ class Peers:
 
         It gets this cell's rule as it is: nothing is rebuilt, and the peer's rule is ignored. If
         the version is damaged or cannot be restored, that is logged, the present version stays in
-        force, and the other is not tried again. Returns whether it is in force. Raises StoreError
-        if the store cannot be read.
+        force, and `look` does not return this number again. Returns whether it is in force. Raises
+        StoreError if the store cannot be read.
         """
         store = self._outbox.store
         try:

@@ -59,7 +59,7 @@ class CellLabels:
     def assign_number(self, decision_id: str, number: int) -> None:
         """Give the reference of a label the number that the store gave the label.
 
-        Nothing happens for a label that was not added, as of a trace with a fault.
+        Nothing happens for a label that was not added, like that of a trace with a fault.
         """
         provisional = self._provisional.pop(decision_id, None)
         if provisional is not None and self._live.answering is not None:

@@ -243,8 +243,8 @@ class Learner:
         -------
         RetrainReport or None
             The report of a retrain that was done in this thread. None if there is no reason, if the
-            store is unavailable, if a training or its preparation is under way, or if the executor
-            now trains.
+            store or its journal has a fault, if a training or its preparation is under way, or if
+            the executor now trains.
         """
         peers = self._peers
         may_train = self.labels.is_due(retrain_every) and not self.live.pinned
@@ -272,12 +272,12 @@ class Learner:
 
     @property
     def is_swapping(self) -> bool:
-        """Whether a trained version is being swapped in, one step with each call of the engine."""
+        """Whether a trained version is being put in force, a step with each call of the engine."""
         return self._candidate is not None
 
     @property
     def is_at_work(self) -> bool:
-        """Whether a training is under way in the executor, or its version is being swapped in."""
+        """Whether a training is under way in the executor, or its version is not in force yet."""
         return self._retrainer.future is not None or self._candidate is not None
 
     @property
@@ -479,8 +479,8 @@ class Learner:
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
         """Drop a candidate that could not be stored, and keep a report of this in memory only.
 
-        It is logged, and the previous version stays in force. The labels count as new again, so
-        that the next retrain is soon.
+        It is logged, and the previous version stays in force. All labels of its training count as
+        new, so that the next retrain is soon.
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
@@ -589,8 +589,9 @@ class Learner:
 
         This can be so after a label was forgotten: the training then starts from an earlier version
         or from initial weights. A thread computes what that model needs of the traces in the
-        training window. Without an executor this call waits for the thread, so that the work does
-        not use up the time budget of the retrain. Without labels nothing is done.
+        training window, and keeps it in that model; a failure is logged. Without an executor this
+        call waits for the thread, since the time would count against the time budget of the retrain
+        otherwise. Without labels, and while an earlier thread still works, nothing is begun.
         """
         if self._choose_start() is self.live.newest:
             return
@@ -686,10 +687,10 @@ class Learner:
     def _store_and_swap_in(
         self, event: Change, model: EngineModel, trained_on: TrainedOn, reason: str, seconds: float
     ) -> None:
-        """Store a model as the next version, with the event of a person, and put it in force.
+        """Store a model as the next version, with the event of a person's change; put it in force.
 
-        Its report, accepted after `seconds` for this reason, becomes the newest. If the version
-        cannot be stored, StoreError is raised and nothing changes.
+        The newest report is then one of this version: accepted, with `reason` and `seconds`. If the
+        version cannot be stored, StoreError is raised and nothing changes.
         """
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)

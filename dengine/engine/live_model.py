@@ -111,7 +111,8 @@ class LiveModel:
         bit, with its reference points. Without a version, or if one of those traces is damaged or
         missing, the untrained template stays, and its rule is updated with the stored outcomes
         since it began. The outcomes that update the rule are checked against the store's ledger,
-        which may set the outbox's `integrity_error`.
+        which may set the outbox's `integrity_error`. `overdue`, `overdue_to` and `corrected_to` are
+        restored, too.
 
         Parameters
         ----------
@@ -272,7 +273,7 @@ class LiveModel:
 
         The ledger is the store's hash chain. A failed check sets the outbox's `integrity_error`,
         after which every part is verified; the outcomes are returned all the same. Overdue checks
-        are among them.
+        are among them. Raises StoreError if the store cannot be read.
         """
         self.outbox.check_integrity(after)
         return self.outbox.store.labels.outcomes_since(after, self.evidence.since, self.overdue_to)

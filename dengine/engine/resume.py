@@ -29,10 +29,10 @@ def restore_model(
 ) -> EngineModel | None:
     """Return a new model, made from the untrained template, in the state of a stored version.
 
-    A model that is stored by its traces is trained on them again. Returns None if one of these
-    traces is damaged or missing. The new model and the template share one rule, so the template
-    gets the stored rule, too. Raises StoreError for a state that this dengine cannot restore, for a
-    damaged label, and if the store cannot be read.
+    A model that is stored by its traces is trained on them again (`refit`). Returns None if one of
+    these traces is damaged or missing. The new model and the template share one rule, so the
+    template gets the stored rule, too. Raises StoreError for a state that this dengine cannot
+    restore, for a label that is neither 0 nor 1, and if the store cannot be read.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -43,10 +43,13 @@ def restore_model(
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
-    Labels are first checked against the ledger, the store's hash chain, which may set the outbox's
-    `integrity_error`; the model is trained nevertheless. Returns False, with the model untrained,
-    if a trace is damaged or missing. A label that was forgotten by then is left out, and is not
-    missing. Raises StoreError for a damaged label, or if the store does not answer.
+    The labels are first compared with the ledger, the store's hash chain. A difference sets the
+    outbox's `integrity_error`, and the model is trained nevertheless. A trace whose label was
+    forgotten by then is left out, and does not count as missing.
+
+    Returns False, with the model untrained, if a trace is missing or damaged; an event is written
+    to the store for each damaged trace. Raises StoreError if a label is neither 0 nor 1, if the
+    traces have different shapes, or if the store does not answer.
     """
     store = outbox.store
     first = int(trained_on.seq[0])
@@ -130,11 +133,12 @@ def add_labels_since(
     They are the labels of all cells of the product up to number `shared_to`, and after it only this
     cell's own. None stands for the newest label that the version was trained on, or that it got
     with a rollback, so that an engine that opens a store counts what it counted before. At most the
-    `capacity` newest of both kinds are added. Corrections that came since the version was stored
-    are applied between the labels, where they came, so that the model is the same bit for bit. A
-    baseline (a model that the user handed in), which cannot be corrected, gets the labels as they
-    count now. A label that the model cannot take is logged and skipped. Returns the number of the
-    newest correction in the store. Raises StoreError if the store cannot be read.
+    `capacity` newest of each of the two kinds are added. Corrections that came since the version
+    was stored are applied between the labels, in the order in which they came, so that the model is
+    the same bit for bit. A baseline (a model that the user handed in), which cannot be corrected,
+    gets the labels as they count now. A label that the model cannot take is logged and skipped; one
+    whose trace is damaged is skipped, and an event is written to the store. Returns the number of
+    the newest correction in the store. Raises StoreError if the store cannot be read.
     """
     corrected_to = int(version.state.get("corrected_to", 0))
     # A baseline cannot be corrected afterwards, so it gets each label as it counts now; another

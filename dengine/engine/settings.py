@@ -153,10 +153,11 @@ class EngineSettings:
         Raises
         ------
         StoreError
-            For an unused store, a damaged number, and a recipe that lacks settings.
+            For an unused store, a damaged number or `TraceSpec`, and a recipe that lacks settings.
         SettingError
             If the stored text is no recipe, if an object is missing or differs from the one that
-            the engine was made with, or if a `model` is passed to an engine that has its own.
+            the engine was made with, or if a `model` is passed to an engine that has its own. Also
+            for a stored seed that is too large, and force limits that do not fit the `TraceSpec`.
         ImportRefusedError
             If the recipe names a class that may not be imported.
         """
@@ -194,10 +195,11 @@ class EngineSettings:
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """Return the settings in force and an untrained model: the recipe's, or `model` if given.
 
-        If an object was handed in, the settings are a copy that describes it. For a `model`,
-        settings of the recipe that have no effect on it are replaced by the model's own. Without a
-        `model` the recipe's reducer is made, for which a class of the user's is imported. Raises
-        SettingError if that fails, and for a `model` that lacks a method of `Model`.
+        If an object was handed in, the settings are a copy that describes it. A `ModelPrediction`
+        as `model` also replaces the settings of the recipe that it has itself, like the radius; for
+        a baseline the recipe stays, though not all of it has an effect. Without a `model` the
+        recipe's reducer is made, for which a class of the user's is imported. Raises SettingError
+        if that fails, and for a `model` that lacks a method of `Model`.
         """
         if model is None:
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
@@ -219,13 +221,13 @@ class EngineSettings:
 
         `request` holds settings by name, as `DataEngine` takes them; None is a setting that was not
         given. All settings of a recipe in it are compared. An unknown name is an error, too. For a
-        baseline, a model that was handed in, only `LOOP_SETTINGS`, which have an effect on any
-        model, are compared.
+        model that was handed in only `LOOP_SETTINGS`, which have an effect on any model, are
+        compared.
 
         Not compared are the shadow mode, and force limits that the program leaves out, because an
         operator sets both while the cell runs. Nor is a reducer that is an object, with its
-        parameters. A `trace` is compared only if a `TraceSpec` is in force, and only in what both
-        state.
+        parameters. A `trace` is compared only if a `TraceSpec` is in force; a rate, units and
+        columns that it leaves out are not compared.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -271,9 +273,10 @@ def _with_objects(
     """Return a stored recipe, with the reducer object put into it if the recipe cannot name it.
 
     `texts` are the store's settings, and `name` is the name of the store for messages. An object
-    equal to the reducer that the recipe names is accepted and not used, as is any reducer beside a
-    model. Raises SettingError if an object is missing or differs from the one that the store was
-    made with, or if a `model` is passed to an engine that has its own.
+    equal to the reducer that the recipe names is accepted and not used; so is a name, which is not
+    compared here, and any reducer beside a model. Raises SettingError if an object is missing or
+    differs from the one that the store was made with, or if a `model` is passed to an engine that
+    has its own.
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -344,8 +347,9 @@ def named_classes(
 ) -> list[str]:
     """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them.
 
-    A name may stand in reducer, recipe (whose file is read) or policy; other settings are ignored.
-    Nothing is imported. Raises SettingError if no recipe can be read from one of these.
+    A name may stand in reducer, recipe (whose file is read) or policy; the class of a reducer
+    object counts, too. Other settings, and classes of dengine, are ignored. Nothing is imported.
+    Raises SettingError if no recipe can be read from one of these.
     """
     recipes = [Recipe.load(source) for source in (reducer, recipe) if source is not None]
     recipes.append(Recipe(policy=policy or Policy()))
@@ -416,9 +420,9 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
     """Raise SettingError for settings that have no effect beside a model that is handed in.
 
     `reducer` is the setting of that name, and `given` holds the other settings by name; None is a
-    setting that was not given. Without effect are reducer, radius, folds, and a policy that differs
-    from the default in more than `BASELINE_SETTINGS`: audit_rate, stops, label_within, force_limits
-    and shadow.
+    setting that was not given. Reducer, radius and folds have no effect. Of a policy only
+    `BASELINE_SETTINGS` have one (audit_rate, stops, label_within, force_limits and shadow): any
+    other field must be at its default. Settings of other names pass.
     """
     idle = [name for name in ("radius", "folds") if given.get(name) is not None]
     if reducer is not None:
@@ -438,7 +442,7 @@ def check_model_settings(reducer: Any, given: Settings) -> None:
 def flat_settings(recipe: Recipe) -> dict[str, Any]:
     """Return every setting of a recipe by its name, those of its policy among them.
 
-    The reducer's class is imported if it gives one of them, as `default_radius`.
+    The reducer's class is imported if the recipe leaves `radius` or `retrain_every` to it.
     """
     settings = {field.name: getattr(recipe, field.name) for field in fields(recipe)}
     del settings["policy"]
@@ -480,8 +484,9 @@ class SettingsInForce:
     def save(self) -> None:
         """Write the settings to the store, within its time limit.
 
-        If that fails, the error is logged and `is_unsaved` is set, which a later success clears;
-        nothing is raised.
+        If the store does not take them, the error is logged and `is_unsaved` is set, which a later
+        success clears. Raises SettingError if another cell of the product has settings that
+        contradict these; then nothing is written.
         """
         texts = self.now.to_store()
         try:

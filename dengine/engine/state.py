@@ -30,12 +30,12 @@ class EngineState:
 
     @property
     def is_retraining(self) -> bool:
-        """Whether a retrain is under way in the executor, or its version waits to be swapped in."""
+        """Whether a retrain is under way in the executor, or its version is not in force yet."""
         return self._learner.is_busy
 
     @property
     def is_swapping(self) -> bool:
-        """Whether a trained version is being swapped in, one step with each call of the engine."""
+        """Whether a trained version is being put in force, a step with each call of the engine."""
         return self._learner.is_swapping
 
     @property

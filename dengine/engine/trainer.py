@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..decision.scripting import reason_of
 from ..errors import DengineError, SettingError, log
 from ..model.base import EngineModel
-from ..records import TRAINED, TraceArray
+from ..records import TRAINED, Ints, TraceArray
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
 
@@ -70,8 +70,8 @@ class TrainingWindow:
     def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
-        `label` is 1 or 0, `hash_` the hash of part or content, and `seq` the label's number. It
-        must be larger than any before, which is not checked.
+        `label` is 1 or 0, `hash_` the hash of part or content, and `seq` the label's number, which
+        must be larger than any before; this is not checked.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
@@ -82,10 +82,10 @@ class TrainingWindow:
         self._first = max(self._first, self._end - self.capacity)
 
     def _enlarge(self, trace_shape: tuple[int, ...]) -> None:
-        """Copy the window to the front of a new block that has room for half as many rows again.
+        """Copy the window to the front of a new block, which has room for half as many rows more.
 
-        There is room for at least 64 more rows. `trace_shape` is the shape of one trace, which an
-        empty window does not know. The old block is not changed.
+        At least 64 rows more fit. `trace_shape` is the shape of one trace, which an empty window
+        does not know. The old block is not changed.
         """
         n = len(self)
         columns = [column[self._first :] for column in self._block]
@@ -148,7 +148,7 @@ class TrainedOn:
         retrain replaces; 0: the version is not pinned.
     """
 
-    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     corrected_to: int = 0
     counts_from: int = 0
     pinned: int = 0
@@ -238,7 +238,7 @@ class Trained:
     seconds: float = 0.0
     last_seconds: float = 0.0
     begin: float = 0.0
-    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 @runtime_checkable
@@ -383,7 +383,7 @@ class Retrainer:
         `wait` seconds, and a training that is not done then is given up. So is, whatever `wait` is,
         a training that hangs, or whose executor died. The outcome of a training that was given up
         or failed has no model and says why. An executor that died or hangs is started again if it
-        can be, or not used.
+        can be, or not used. `begin` of the outcome is now minus the duration of the training.
         """
         future = self.future
         left = self._count_seconds_left()

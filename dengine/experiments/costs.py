@@ -1,5 +1,5 @@
 """From three prices to a policy: what a part costs under each that may pay, in replays of the
-user's own recordings. The verb `costs` prints it.
+user's own recordings. The subcommand `dengine costs` prints it.
 
     curve = cost_curve("insertion", check=5, escape=600, false_reject=30, recipe="pca", n_jobs=2)
     print(curve.sentence)
@@ -37,9 +37,10 @@ from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import AUDIT_RATE, RULES, Policy
 from ..errors import SettingError, amount, expect, percent
 from ..files import FilePath
+from ..records import Floats
 from .grid import Task, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
-from .replay import Contender, Floats, Replay, replay_policy
+from .replay import Contender, Replay, replay_policy
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -186,7 +187,7 @@ class CostCurve:
     def missing(self) -> Missing | None:
         """How many more parts would turn "may pay" into "pays".
 
-        None if the verdict is another, or if `MOST_MORE` times as many recordings are too few.
+        None if the verdict is another, or if 10,000 times as many recordings are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -303,7 +304,8 @@ class CostCurve:
 def policy_name(policy: Policy) -> str:
     """Return a policy's name for people, like "alpha 0.1, LB 95 %" or "pooled, LB 95 %".
 
-    Under the guarantee "cost" it is only "the cost guarantee".
+    Under the guarantee "cost" it is only "the cost guarantee". A user's own rule is named by its
+    `module:Class`.
     """
     if policy.guarantee == "cost":
         return "the cost guarantee"
@@ -434,8 +436,8 @@ class PolicySearch:
         """Halve the candidates in rounds, and let the last two play fresh shuffles.
 
         While more than two remain, they play two shuffles, and the dearer half is removed from
-        `remaining`. The replays are kept, and `curve` computes the result from them. Call this
-        once.
+        `remaining`; candidates that verified every part count as the dearest. The replays are kept,
+        and `curve` computes the result from them. Call this once.
 
         Parameters
         ----------
@@ -505,7 +507,7 @@ class PolicySearch:
 def candidates(
     contender: Contender, costs: Costs, alphas: Sequence[float], lower_bounds: Sequence[float]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the settings of each policy that is to be tried, as keyword arguments.
+    """Yield the settings of each policy that is to be tried, as keyword arguments of `Policy`.
 
     First come all pairs of an alpha and a lower bound LB (the success probability that accepted
     parts must have) for the guarantee "local", or for the user's own rule if the contender has one.
@@ -513,8 +515,9 @@ def candidates(
     If stops="some" and no audits are set, these two get an audit rate of 5 %, because they need
     outcomes of accepted parts.
 
-    If `alphas` is empty, it is `ALPHA` alone. If `lower_bounds` is empty, LBs are taken around
-    break-even, where 1 - LB is check / escape.
+    If `alphas` is empty, it is 0.1 alone. "pooled" has the given `lower_bounds`, too. If these
+    are empty, LBs are taken around break-even, at which 1 - LB is check / escape, but none below
+    80 %.
     """
     policy = contender.recipe.policy
 
@@ -593,7 +596,7 @@ def cost_curve(
     keep : path or None, default None
         Folder of finished replays: those in it are not played again, others are added.
     **settings
-        alphas, lower_bounds : sequences of float to try; by default `ALPHA`, and levels around
+        alphas, lower_bounds : sequences of float to try; by default 0.1, and levels around
         1 - check / escape that the number of recordings allows. repeats : fresh shuffles that the
         last policies play, 4, at least 2. seed : of the first shuffle, 0. cycles : parts of each
         shuffle, by default all.
@@ -609,6 +612,8 @@ def cost_curve(
         As `PolicySearch`; with `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
+    OutputError
+        With `keep`, a replay that cannot be written.
     """
     data = load_dataset(dataset)
     search = PolicySearch(data, recipe, Costs(check, escape, false_reject), **settings)

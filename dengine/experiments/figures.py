@@ -23,10 +23,10 @@ from ..datasets import Dataset
 from ..errors import OutputError, amount, counted, instead
 from ..files import write_output
 from ..history.explain import Explanation
-from ..records import Action, TraceSpec
+from ..records import Action, Floats, TraceSpec
 from ..reducers import has_own_unit
 from .costs import CostCurve, policy_name
-from .replay import Floats, Replay
+from .replay import Replay
 from .survey import channel_means
 
 if TYPE_CHECKING:
@@ -226,8 +226,11 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     replays : sequence of Replay
         All equally long.
     window : int, default 300
+        Cycles in a window. At the first cycles, before there are so many, a window has all cycles
+        so far.
     fewest : int, default 1
-        Shares of fewer decisions are NaN.
+        precision, false_positive and false_negative are NaN if the windows of all replays together
+        have fewer decisions of their kind, or none.
 
     Returns
     -------
@@ -272,14 +275,13 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the policy's
     lower bound LB; bad parts among the accepted parts (solid), good parts among the rejected parts
-    (dashed), and the tolerance 100 - LB. The legend below has the counts. Shares of fewer than
-    `FEWEST` parts are not drawn. The window is `WINDOW` cycles, or a third of the longest replay if
-    that is less.
+    (dashed), and the tolerance 100 - LB. The legend below has the counts. Shares of fewer than 20
+    parts are not drawn. The window is 300 cycles, or a third of the longest replay if that is less.
 
     Parameters
     ----------
     by_recipe : mapping of str to sequence of Replay
-        The replays of one recipe are equally long.
+        At least one replay; those of one recipe are equally long.
     title : str, default ""
 
     Returns
@@ -336,12 +338,13 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
 
 
 def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
-    """Draw what a part costs under each policy, the cheapest at the top.
+    """Draw what a part costs under each policy, with 95 % intervals.
 
-    A line marks the cost of checking everything, and a ring the chosen policy, if one pays or may
-    pay. Policies that were left behind are hollow, because their costs are of other shuffles. An
-    interval that leaves the axes ends in an arrow with its value. The right panel shows the share
-    of parts that were decided without a check.
+    On top are the policies that played the reported shuffles, the cheapest first. Below them,
+    hollow, are those that were left behind: their costs are of earlier shuffles, and cannot be
+    compared with the others. A line marks the cost of checking everything, and a ring the chosen
+    policy, if one pays or may pay. An interval that leaves the axes ends in an arrow with its
+    value. The right panel shows the share of parts that were decided without a check.
 
     Parameters
     ----------
@@ -406,8 +409,8 @@ def explained_picture(explanation: Explanation) -> Figure:
 
     It has a panel for each channel, of at most four, those that leave the envelope most. The
     envelope is the band in which 95 % of the successes lie at each sample. Stretches in which the
-    trace leaves the envelope by a tenth of its width or more are shaded. Without an envelope only
-    the traces are drawn.
+    trace leaves the envelope by more than a tenth of its width are shaded. Without an envelope only
+    the traces are drawn, of the first four channels.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -496,8 +499,8 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: str) -> None:
     """Draw the share of good parts in a sliding tenth of the set, and each finite trace's mean.
 
-    The mean is taken over the samples of the first channel; `label` names the channel and its unit.
-    `figure` is a Figure or SubFigure.
+    The share begins at the end of the first tenth. The mean is taken over the samples of the first
+    channel; `label` names the channel and its unit. `figure` is a Figure or SubFigure.
     """
     import pandas as pd
 

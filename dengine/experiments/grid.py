@@ -1,5 +1,5 @@
 """Grids of replays over recipes, intervals, alphas and lower bounds, on one machine or a cluster.
-`run_grid` plays one and returns a table; the verb `compare` and `costs` play theirs by
+`run_grid` plays one and returns a table; `dengine compare` and `dengine costs` play theirs by
 `grid_tasks` and `iterate_replays`.
 
 >>> run_grid("insertion", ["conv", "umap"], alphas=[0.1], lower_bounds=[0.9], repeats=3, keep="out")
@@ -284,9 +284,12 @@ def iterate_replays(
     ------
     SettingError
         A baseline's library is missing: this is raised after the kept replays were yielded, and
-        before anything is played. With `keep` also for a reducer that cannot be hashed.
+        before anything is played. A replay that cannot be played, see `replay`. With `keep` also
+        for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
+    OutputError
+        With `keep`, a replay that cannot be written.
     """
     from joblib import Parallel, delayed
 

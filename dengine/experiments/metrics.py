@@ -10,12 +10,11 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..decision.intervals import wilson_interval
 from ..decision.policy import PRICES
 from ..errors import expect
-from ..records import is_number
+from ..records import Floats, is_number
 
 # What was decided -> the field of `Replay` that marks the wrong ones among them.
 SIDES = {"accepted": "false_positive", "rejected": "false_negative"}
@@ -56,13 +55,13 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     samples. The unit is therefore the trace: the variance of the share is estimated from the
     differences between traces, by linearisation. The interval is Wilson's, for the number of
     independent decisions that would have this variance. If the variance is 0, for example because
-    no decision was wrong, it is Wilson's for the number of different traces. The interval holds for
-    other parts of the same kind, not for another cell.
+    no decision was wrong, it is Wilson's for the number of different traces among these decisions.
+    The interval holds for other parts of the same kind, not for another cell.
 
     Parameters
     ----------
     replays : sequence of Replay
-        All of one data set, none of a live run.
+        All of one data set. None of a live run, which does not record which traces it had.
     side : {"accepted", "rejected"}, default "accepted"
         Which decisions are judged.
     alpha : float, default 0.05
@@ -71,6 +70,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     Returns
     -------
     error_rate : ErrorRate
+        Without decisions of that side the rate is NaN and its interval (0, 1).
 
     Raises
     ------
@@ -101,7 +101,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     return ErrorRate(n_decided, n_wrong, n_traces, rate, float(lower), float(upper))
 
 
-def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> NDArray[np.float64]:
+def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> Floats:
     """Return for each trace in how many cycles of all replays a field was True, shape (size,).
 
     `name` is a field of `Replay` with a bool for each cycle; `index` of the replay says which trace
@@ -176,8 +176,9 @@ class Costs:
         return checks - self.escape * false_positive - self.false_reject * false_negative
 
     def of_part(self, accepted: float, rejected: float, bad: float, good: float) -> float:
-        """Return the mean cost of a part where so many are accepted, and rejected, by the model.
+        """Return the mean cost of a part if the model accepts and rejects these shares of parts.
 
-        All are shares: `bad` of the accepted parts, and `good` of the rejected ones, are wrong.
+        `bad` is the share of bad parts among the accepted ones, `good` that of good parts among the
+        rejected ones. All other parts are checked.
         """
         return self.check - self.saved(accepted + rejected, accepted * bad, rejected * good)

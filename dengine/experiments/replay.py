@@ -1,5 +1,5 @@
 """One stream of parts through one engine: `replay` plays recordings, `watch` drives any cell.
-`grid` plays by `replay`, the verb `run` by `observe_cycles` and `to_replay`.
+`grid` plays by `replay`, `dengine run` by `observe_cycles` and `to_replay`.
 
 Both return a `Replay`, the record of each cycle. `replay` uses a fresh engine, as the paper's
 prototype online environment does. A `Contender` says who plays: a recipe or a baseline.
@@ -27,7 +27,18 @@ from ..decision.policy import Policy
 from ..engine.engine import DataEngine
 from ..errors import SettingError, expect
 from ..recipe import RECIPES, Recipe
-from ..records import ACTIONS, Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec
+from ..records import (
+    ACTIONS,
+    Action,
+    Cycle,
+    Decision,
+    Floats,
+    Ints,
+    Outcome,
+    Reason,
+    RetrainReport,
+    TraceSpec,
+)
 from ..reducers import has_own_unit
 from ..reducers.base import Reducer
 from .baselines import BASELINES, make_baseline
@@ -36,7 +47,6 @@ from .metrics import VERIFY_SECONDS, Costs
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Row = dict[str, Any]  # of a table, by column
 # Fields of a decision that a replay keeps -> their type in its arrays.
@@ -146,7 +156,7 @@ class Replay:
     n_success, n_failure : array of int, shape (n,)
         Labels that were counted.
     position : array of float, shape (n, d)
-        Scaled embedding, the mean over the spaces; NaN where no model embedded the trace.
+        Scaled embedding, the mean over the spaces; NaN if no model embedded the trace.
     decide_seconds : array of float, shape (n,)
         Wall time of each decision.
     stopped : array of bool, shape (n,)
@@ -180,19 +190,19 @@ class Replay:
     truth: NDArray[Any]
     lower: Floats
     upper: Floats
-    n_success: NDArray[np.int64]
-    n_failure: NDArray[np.int64]
+    n_success: Ints
+    n_failure: Ints
     position: Floats
     decide_seconds: Floats
     stopped: Bools
     reason: NDArray[np.str_]
-    version: NDArray[np.int64]
+    version: Ints
     safe_mode: Bools
     clock_s: Floats | None = None
     retrains: tuple[RetrainReport, ...] = ()
     recipe: Recipe = field(default_factory=Recipe)
     name: str = ""
-    index: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    index: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     dataset: str = ""
     seed: int = 0
     confirm: bool = False
@@ -299,6 +309,7 @@ class Replay:
             of cycles: verified, accepted, rejected (by the model), false_positive, false_negative,
             novel, safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts
             passed on per hour: None if the cell has no clock, no time passed, or there is no cycle.
+            The time of the first cycle of the run begins at 0 of the cell's clock.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -393,7 +404,7 @@ class ObservedCycle(NamedTuple):
     ----------
     cycle : Cycle
     truth : float
-        1.0 good, 0.0 bad, NaN where the cell does not tell.
+        1.0 good, 0.0 bad, NaN if the cell does not tell.
     clock : float or None
         Seconds of production; None for a cell without a clock.
     """
@@ -536,8 +547,9 @@ def replay(
     Raises
     ------
     SettingError
-        A number of cycles that the data set does not have, alpha or lower_bound beside an engine,
-        or a policy with force limits in seconds for a data set of an unknown rate.
+        A number of cycles that the data set does not have, anything that is no recipe, a baseline
+        whose library is missing, alpha or lower_bound beside an engine, or a policy with force
+        limits in seconds for a data set of an unknown rate.
     DataError
         A data set that cannot be read.
     """

@@ -1,5 +1,5 @@
-"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift. The
-verb `data` prints it.
+"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift.
+`dengine data` prints it.
 
     survey_dataset(load_dataset("cell_3/"))
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, trace_hash
 from ..model.neighbours import NEWEST, near_repeats
-from ..records import TraceArray
+from ..records import Floats, TraceArray
 from ..traces import LARGEST, as_traces
 
 
@@ -40,7 +40,7 @@ class Drift:
         Spearman's rank correlation with the position, and its p-value for this quantity alone. NaN
         if the quantity never changes.
     tenths : tuple of float
-        Its mean in each tenth of the stream, NaN where there is none.
+        Its mean in each tenth of the stream, NaN if there is none.
 
     References
     ----------
@@ -63,12 +63,12 @@ class Survey:
     traces, channels, samples : int
         The shape of the traces.
     names : tuple of str
-        Of the channels, where they have any.
+        Of the channels, if they have any.
     seconds, rate_hz : float or None
-        Duration of a trace, and samples per second; None where not known.
+        Duration of a trace, and samples per second; None if not known.
     unit, fit : str
     lengths : Spread or None
-        Samples of the recordings; None where not known.
+        Samples of the recordings; None if not known.
     good, bad : int
         Labels.
     unlabelled : int
@@ -85,9 +85,9 @@ class Survey:
         Among the newest `looked_at` usable traces: those that are much nearer to another part's
         trace than parts are to each other.
     parts : int or None
-        Different parts, where their numbers are known.
+        Different parts; None if their numbers are not known.
     drift : tuple of Drift
-        Of the share of good labels, and of each channel's mean. Empty where the order of the
+        Of the share of good labels, and of each channel's mean. Empty if the order of the
         recordings is not known.
     """
 
@@ -167,7 +167,7 @@ def survey_dataset(data: Dataset) -> Survey:
     )
 
 
-def channel_means(X: TraceArray) -> NDArray[np.float64]:
+def channel_means(X: TraceArray) -> Floats:
     """Return each channel's mean over the trace, (n, C), of traces (n, C, T)."""
     return np.asarray(X.mean(axis=2, dtype=np.float64))
 
@@ -189,7 +189,7 @@ def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Dr
     return tuple(_drift(*pair) for pair in zip(("good", *data.spec.names), quantities, strict=True))
 
 
-def _drift(name: str, values: NDArray[np.float64]) -> Drift:
+def _drift(name: str, values: Floats) -> Drift:
     """Return the drift of values (n,) in recorded order, leaving out those that are NaN.
 
     The correlation and its p-value are NaN if there are fewer than three values, or all are equal.

@@ -1,5 +1,5 @@
 """Replays as tables: a row for each replay in the CSV, a pooled row for each recipe and policy on
-the screen, and sentences about them. The verbs `replay` and `compare` print them.
+the screen, and sentences about them. `dengine replay` and `dengine compare` print them.
 
     frame = frame_of(replays)
     rows = pool(frame, replays)
@@ -91,8 +91,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
           mean, as `AGGREGATED` says.
         - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
           parts; NaN also if none was accepted.
-        - promise_kept : whether the pooled precision is at least LB; None if fewer than `ENOUGH`
-          parts were accepted.
+        - promise_kept : whether the pooled precision is at least LB; None if fewer than 200 parts
+          were accepted.
         - retrains_dropped : number of retrains whose version was not put in force.
     """
     rows = []
@@ -217,7 +217,7 @@ def _whole(value: float) -> str:
 
 
 def _with_sd(row: Row, name: str) -> str:
-    """Return a mean ± its standard deviation, the mean alone where there is one replay."""
+    """Return a mean ± its standard deviation, the mean alone if there is one replay."""
     deviation = row[f"{name}_sd"]
     return f"{row[name]:.1f}" if math.isnan(deviation) else f"{row[name]:.0f}±{deviation:.0f}"
 

@@ -127,6 +127,8 @@ def prepare_export(
         TorchScript cannot compile or run; if the compiled decision and the reducer map a trace to
         different points; if the rule is stale, because an update of it failed; and if the store was
         changed from outside.
+    SettingError
+        If the engine's force limits do not fit `trace`.
     OutputError
         If one of the files (`path`, its checksum, its signature) must not be written; this is
         checked first.
@@ -158,7 +160,7 @@ def prepare_export(
     try:
         decider = model.build_decider(conditions)
         defect = next(filter(None, compare_points(decider, examples, points)), "")
-    except (RuntimeError, torch.jit.Error) as error:
+    except (RuntimeError, torch.jit.Error, torch.jit.frontend.FrontendError) as error:
         defect = f"it does not run as TorchScript, {reason_of(error)}"
     if defect:
         raise ExportError(f"{model.name} cannot be exported: {defect}.")

@@ -1,5 +1,5 @@
 """Journals of exported cells: `read_journal` reads and checks what a cell program wrote, and
-`import_journal` imports it into the engine's store, each part once, however often. The verb
+`import_journal` imports it into the engine's store, each part once, however often. The subcommand
 `dengine import-labels` calls it.
 
     journal = read_journal("cell.csv", TraceSpec(1000))
@@ -89,21 +89,22 @@ class CellJournal:
 
 
 def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
-    """Read and check the journal of a cell program.
+    """Read and check the journal that the program of an exported model wrote in a cell.
 
-    Parts without a label are left out unless they were accepted. An accepted part whose label came
-    after the next part was decided has two lines: one without a label, and later one with it.
+    Parts without a label are left out unless they were accepted. If the label of an accepted part
+    came after the next part was decided, the result has two lines for it: one without a label, and
+    later one with it (`late`). A last line that was not finished is left out, see `cut`.
 
     The first line whose checksum does not fit, and all lines after it, are set aside without an
-    error, and `set_aside` of the result says so. Otherwise FILE.head, which holds the number of
-    lines and the last checksum, is compared: `set_aside` then says if lines are missing at the end.
-    If FILE.head is missing or cannot be read, a warning is logged.
+    error, and `set_aside` of the result says so. If all lines fit, they are compared with
+    FILE.head, which holds the number of lines and the last checksum: `set_aside` then says if lines
+    are missing at the end. If FILE.head is missing or cannot be read, a warning is logged.
 
     Parameters
     ----------
     path : path-like
     spec : TraceSpec
-        What the traces must be.
+        What the traces must be; other lengths are fitted as `spec.fit` says.
 
     Returns
     -------
@@ -256,6 +257,7 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
         that cannot be read, and for a journal of another model. Nothing is stored then.
     StoreError
         If there is no store, an engine runs on the cell, or the store has no `TraceSpec` or recipe.
+        Also if the store fails; chunks of 500 parts that were stored before stay.
     OSError
         If the journal cannot be read.
     """

@@ -271,7 +271,7 @@ class DecisionModule(nn.Module):
     def predicted(self) -> int:
         """Return what the model alone would have done with the trace decided last.
 
-        It differs from the action in an audit, and where a force limit rejects.
+        It differs from the action in an audit, and if a force limit rejects.
         """
         return self.pending_predicted
 

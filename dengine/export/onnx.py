@@ -99,7 +99,7 @@ def export_onnx(
         the key cannot be read; if a package is missing; and if onnxruntime does not decide like the
         model.
     OutputError
-        If `path` cannot be written.
+        If a file exists, without `force`, or cannot be written.
     """
     onnx = _import_package("onnx")
     source, _ = prepare_export(engine_or_model, trace, path, force)

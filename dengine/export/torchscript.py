@@ -8,7 +8,7 @@ that run it.
 
 An untrusted `.ts` file is a program: loading it runs what is in it, which can read and write files.
 Load only what you made yourself, or what was signed with a key of yours. The C and C++ sources that
-run an exported file depend on no model, so they come by a verb of their own:
+run an exported file depend on no model, so they are written by an option of their own:
 
     dengine export --cpp cell_cpp
     torch_cmake="$(python -c 'import torch; print(torch.utils.cmake_prefix_path)')"
@@ -101,7 +101,7 @@ def export_torchscript(
     Parameters
     ----------
     engine_or_model : DataEngine or ModelPrediction
-        A model, which must be fitted, exports without audits.
+        A model, which must be fitted, exports without audits and force limits.
     path : path-like
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
@@ -123,8 +123,10 @@ def export_torchscript(
         If nothing was trained yet, for a baseline, if the reducer, the interval or the rule cannot
         be compiled, if the rule is stale, because an update of it failed, if the store was changed
         from outside, and if the key cannot be read.
+    SettingError
+        If the engine's force limits do not fit `trace`.
     OutputError
-        If `path` cannot be written; a file that was there is then unchanged.
+        If a file exists, without `force`, or cannot be written.
     """
     source, module = prepare_export(engine_or_model, trace, path, force)
     with instead(ExportError, "The decision does not compile to TorchScript", RuntimeError):

@@ -20,12 +20,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
-from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
+from ..records import Action, Floats, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
 from ..store.records import POLICY_KINDS, SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from .envelope import Envelope, envelope_of
@@ -113,7 +112,7 @@ class Explanation:
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:
-    """Return the id of the only decision on a part that was no reject, or of its only reject.
+    """Return the id of the only decision on a part that is no reject, else of its only reject.
 
     A rejected part may come again, so rejects count only if there is no other decision. Only the
     newest 20 decisions of this cell on the part are looked at.
@@ -122,7 +121,8 @@ def find_decision_id(store: SqlStore, part: str) -> str:
     ----------
     store : SqlStore
     part : str
-        The part's number; or a decision's id, which is returned if no part has this number.
+        The part's number, which `decide` got; or a decision's id, which is returned if no decision
+        is on a part of this number.
 
     Returns
     -------
@@ -228,7 +228,7 @@ def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
     """Return the policy that was in force at a time, in seconds since 1970.
 
     It is the policy that the first change of policy after this time replaced. If there was no
-    change since, it is `present`, the policy in force now.
+    change since, or no event holds the old policy, it is `present`, the policy in force now.
     """
     for event in store.events.newest():
         if event.kind in POLICY_KINDS and event.time > time and event.data is not None:
@@ -252,9 +252,7 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     return next(began, "")
 
 
-def _measure_distances(
-    item: StoredDecision, version: PastVersion | None
-) -> NDArray[np.float64] | None:
+def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Floats | None:
     """Return the distances from a decision's embedding to the references of a version, shape (n,).
 
     Each is measured in the embedding space of the reference, and they are in the order of the
@@ -266,14 +264,14 @@ def _measure_distances(
         return None
     query = torch.tensor(embedding, dtype=torch.float32)
     squared = version.index.squared_distances(query, item.content_hash)
-    distances: NDArray[np.float64] = np.sqrt(squared.double().numpy())
+    distances: Floats = np.sqrt(squared.double().numpy())
     return distances
 
 
 def _find_neighbours(
     store: SqlStore,
     version: PastVersion | None,
-    distances: NDArray[np.float64] | None,
+    distances: Floats | None,
     radius: float,
     n: int,
 ) -> Iterator[Neighbour]:

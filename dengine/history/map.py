@@ -77,6 +77,8 @@ class PartMap:
 def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     """Read the map of the parts for a model version from the store.
 
+    A damaged label is left out, and an event is written to the store.
+
     Parameters
     ----------
     store : SqlStore

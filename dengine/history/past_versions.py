@@ -199,8 +199,8 @@ def _restore_thresholds(
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
 
-    If a label was corrected or a check is overdue, the stored rule cannot be continued, and the
-    rule is rebuilt from all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
+    If a label was corrected or a check is overdue, the stored rule cannot be continued, and a fresh
+    one is updated with all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
     may begin or end a safe mode of the returned rule. Nothing is written to the store, except an
     event if the arrays of a version are damaged; then the version before it is taken.
 
@@ -212,9 +212,11 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     Returns
     -------
     DecisionRule or None
-        None before the first version, and if the rule of the newest version cannot be restored:
-        another cell of the product made the version, the rule was stored while it was stale (it had
-        missed an update), its state does not fit the policy, or its class is not imported.
+        None before the first version, and if a user's class of rule is not imported. Also None if
+        the newest version has no state that fits the rule: another cell of the product made it, it
+        was made under another policy, or the rule was stale (it had missed an update). A rule that
+        learns nothing, like that of "local" with stops="some", has no state: another cell's version
+        will do for it, and it is never stale.
     """
     stored = store.versions.newest()
     settings = store.settings.read()

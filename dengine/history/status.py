@@ -423,7 +423,8 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
 def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
     """Return the number of the version that a rollback put in force; 0: none is pinned.
 
-    `accepted` holds the reports of all versions that were put in force, oldest first.
+    `accepted` holds the reports of all versions that were put in force, oldest first. If the newest
+    of them was trained, nothing is pinned, and no arrays are read.
     """
     if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
         return 0
@@ -436,11 +437,11 @@ COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
 def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> Span:
-    """Return the counts over the decisions of a tally, and over the retrains since the first one.
+    """Return the counts over a tally's decisions, and over the retrains since the first decision.
 
-    A `Tally` holds how many decisions have each combination of properties, like action and reason.
-    The intervals of `would_accept` and `would_reject` (how often the model would have been wrong)
-    are at 95 %, whatever the policy's alpha.
+    Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
+    properties, like action and reason. The intervals of `would_accept` and `would_reject` (how
+    often the model would have been wrong) are at 95 %, whatever the policy's alpha.
     """
     outcomes = tally.outcomes
     first = tally.first
@@ -523,13 +524,15 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 
 
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
-    """Estimate the share of bad parts among those that the model accepted, with or without audit.
+    """Estimate the share of bad parts among those that the model found acceptable.
 
-    If the outcomes of all accepted parts are known, the estimate rests on them. Under `stops="all"`
-    (every bad part stops the line) one known outcome is enough; unreported accepted parts are then
-    left out. Otherwise the estimate rests on the audits, because the audit draw does not depend on
-    the outcome. Line stops then move the interval: its lower end is at least the one that follows
-    if all other accepted parts were good, and its upper end at least the share of line stops.
+    These are the accepted parts, and the audited ones that would have been accepted; `n` counts
+    both. If the outcomes of all accepted parts are known, the estimate rests on these outcomes.
+    Under `stops="all"` (every bad part stops the line) one known outcome is enough; accepted parts
+    without a report are then left out. Otherwise the estimate rests on the audits, because the
+    audit draw does not depend on the outcome. Line stops then move the interval: its lower end is
+    at least the one that follows if all other accepted parts were good, and its upper end at least
+    the share of line stops among the accepted parts.
 
     Parameters
     ----------
@@ -539,8 +542,8 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     Returns
     -------
     ErrorEstimate
-        At the policy's alpha. If no part was accepted, like in shadow mode, its `n` is 0; see
-        `Span.would_accept` then.
+        At the policy's alpha. If no part was accepted, like in shadow mode, its `n` is 0, even if
+        parts were audited; see `Span.would_accept` then.
     """
     tolerance = policy.tolerances[0]
     if not outcomes.accepted:
@@ -613,7 +616,7 @@ class Course:
     modes : list of Event
         Those that began or ended safe mode, oldest first.
     tolerance : float
-        1 - LB for accepted parts.
+        Share of accepted parts that may be bad (`Policy.tolerances`).
     last : int
         Number of newest decisions that are marked.
     """
@@ -647,7 +650,7 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     Returns
     -------
     Course
-        With the newest 120 stretches at most. Its retrains and safe modes are all of the store.
+        With the newest 120 stretches at most. Its retrains and safe modes are all of the cell.
     """
     modes = [event for event in store.events.newest() if event.kind in MODES]
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
@@ -676,6 +679,8 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     ------
     SettingError
         For a value that a field cannot have, and for a `last` below 1 or from 10 ** 9 on.
+    TypeError
+        For a name that is no field.
     """
     is_valid = last is None or 1 <= last < MAX_LAST
     expect(
@@ -707,7 +712,8 @@ def iterate_decisions(
     page_size : int, default 500
         Decisions read at a time.
     start_after : str or None
-        Id of a decision: the iteration starts with the one after it in its direction.
+        Id of a decision: the iteration starts with the next decision in its direction. For an id
+        that the cell does not have nothing is yielded.
     newest_first : bool, default True
         False: oldest first.
 

@@ -60,7 +60,8 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
     """Return the dict of tensors that `torch.save` wrote to a file, without running code of it.
 
-    Raises SettingError if the file cannot be read, or holds anything but a dict of dense tensors.
+    Raises SettingError if the file cannot be read, or holds anything but a dict of dense tensors of
+    types that NumPy has.
     """
     with instead(SettingError, f"The checkpoint {path} cannot be read", OSError):
         content = Path(path).read_bytes()

@@ -192,8 +192,9 @@ class HttpApi:
 
         The same report twice is no error; a report that contradicts an earlier one is 409. But
         `false` for an accepted part that was confirmed as good before is a late line stop, and
-        corrects the label. An unknown id or part is 404. If the request has an author or the token
-        has a name, a new label is also recorded as an event.
+        corrects the label. An unknown id or part is 404; a part with several decisions that are no
+        rejects is 409. If the request has an author or the token has a name, a new label is also
+        recorded as an event.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -204,7 +205,9 @@ class HttpApi:
         """Return the id of a decision, given by its id or by its part's number.
 
         Raises Refusal 422 for both or neither, UnknownDecisionError for a part without a decision,
-        and ReportConflictError for a part with several. An id is not looked up.
+        and ReportConflictError for a part with several (rejects count only if there is nothing
+        else). For a part it waits in the queue and raises what `CellService.read` does. An id is
+        not looked up.
         """
         if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
@@ -220,8 +223,8 @@ class HttpApi:
         """Correct a label, from the next decision on, and return what changed.
 
         The label as it was reported stays on record. A forgotten label counts again. If the part
-        already counts with this label, nothing changes. 404: an unknown id or part; 422: a decision
-        without a label.
+        already counts with this label, nothing changes. 404: an unknown id or part; 409: a part
+        with several decisions that are no rejects; 422: a decision without a label.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -338,7 +341,8 @@ class HttpApi:
         takes for the next page, null if none are left. An unknown `before` is 404.
 
         since and until are times in seconds since 1970; the first is included, the last is not.
-        predicted is what the model alone would have done. part is a part's number.
+        predicted is what the model alone would have done. part is a part's number. With open, label
+        and action are ignored.
         """
         selection = HistoryFilter(label=label, **where)
         before_id = (await self._find(before)).decision.id if before else None
@@ -380,8 +384,8 @@ class HttpApi:
     async def embedding(self) -> Json:
         """Return where parts lie in the model's embedding, in two dimensions.
 
-        The parts are the newest 250 references, and those of the newest 10 decisions that the
-        version in force made. There are none before the first version.
+        The parts are the newest 250 references with a label of this cell and, of its newest 10
+        decisions, those that the version in force made. There are none before the first version.
         """
         engine = self.service.engine
         parts = await self.service.read(
@@ -426,8 +430,9 @@ class HttpApi:
     async def healthz(self) -> Response:
         """Return whether the engine answers: ok or degraded (200), down (503). It needs no token.
 
-        Degraded: the store cannot be written, or the last three or more retrains were dropped.
-        Down: the engine's thread has ended, or was busy with one thing for a minute.
+        Degraded: the store or its journal cannot be written, the store differs from its ledger, or
+        the last three or more retrains were dropped. Down: the engine's thread has ended, or was
+        busy with one thing for a minute. The texts of the faults come with it.
         """
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
@@ -567,7 +572,7 @@ def create_app(
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         """Enter what `beside` returns, and leave it when the application ends.
 
-        Where that fails, the error is kept in `app.state.failure` and raised.
+        If that fails, the error is kept in `app.state.failure` and raised.
         """
         async with AsyncExitStack() as stack:
             try:

@@ -129,7 +129,7 @@ async def opcua_server(
     ----------
     service : CellService
     port : int
-        0: any free port, which is then `server.bserver.port` of the yielded server.
+        0: any free port; `server.bserver.port` of the yielded server then says which.
     host : str
     tokens : collection of str, optional
         Passwords of the user `dengine`; None: everybody may read and call.
@@ -238,14 +238,16 @@ class AddressSpace:
         self._events.event.SourceName = "Cell"
 
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
-        """Decide on a flat trace, channel after channel.
+        """Decide on a flat trace: all samples of the first channel, then those of the next.
 
         Returns a list of action (0 verify, 1 accept, 2 reject), id, reason, lower, upper, version.
+        A `request` "" gets a new id, a `part` "" means none.
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
-        empty id. Raises SettingError if the trace is empty, if its length is not a multiple of
-        `channels`, or if `channels` is not from 1 to `MAX_CHANNELS`. Raises TraceError for a trace,
-        and ReportError for a request id, that the engine does not take.
+        empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises SettingError if the
+        trace is empty, if its length is not a multiple of `channels`, or if `channels` is not from
+        1 to `MAX_CHANNELS`. Raises TraceError for a trace, and ReportError for a request id, that
+        the engine does not take.
         """
         if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
             raise SettingError(
@@ -269,8 +271,8 @@ class AddressSpace:
     async def follow_changes(self) -> None:
         """Refresh the variables after each change, and at least every `MAX_REFRESH` seconds.
 
-        It refreshes at most once in `MIN_REFRESH` seconds, and ends when the service ends
-        listening.
+        It refreshes at most once in `MIN_REFRESH` seconds, and ends when the service's
+        `end_listening` is called.
         """
         async for _ in self._service.changes(MAX_REFRESH):
             await self.refresh()
@@ -295,8 +297,9 @@ class AddressSpace:
     async def write_status(self, status: Mapping[str, Any]) -> None:
         """Write a status, as `RobotCalls.status` returns it, into the variables.
 
-        If the text of the alarm differs from that of the last call, an event with the new text is
-        sent. If the new text is empty, the event says that the alarm has ended.
+        If the text of the alarm differs from that of the last call (before the first call: ""), an
+        event with the new text is sent. If the new text is empty, the event says that the alarm has
+        ended.
         """
         for name, key in STATUS_NAMES.items():
             value = status[key]

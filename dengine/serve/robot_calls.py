@@ -86,12 +86,12 @@ class RobotCalls:
         return {name: getattr(self, name) for name in CALLS}
 
     async def begin(self, request: Any = "") -> str:
-        """Begin a new part: forget the pieces that `add` took for it, and have the recorder wait
-        for its insertion.
+        """Begin a new part, and have the recorder wait for its insertion.
 
-        Pieces are kept for the newest `MAX_PARTS` parts; an older part must begin again. The
-        recorder records the newest part alone: the recording of an earlier part that was not
-        decided on is dropped. If the recorder fails, that is logged, and `decide_recorded` then
+        The pieces of its trace that `add` took before are forgotten. Pieces are kept for the newest
+        `MAX_PARTS` parts; for an older part call this again. The recorder, which records the force
+        of one insertion, works for the newest part alone: the recording of an earlier part that was
+        not decided on is dropped. If the recorder fails, that is logged, and `decide_recorded` then
         verifies the part. Without a recorder the part can only be sent by `add`.
 
         Parameters
@@ -199,10 +199,10 @@ class RobotCalls:
         returns.
 
         If the request already has a decision, it is returned again, and the pieces are ignored. A
-        new decision drops the pieces. If it could not be recorded, for instance because the queue
-        is full, the result is VERIFY with an empty id, and the pieces stay, so that the call can be
-        repeated. Raises TraceError if there are no pieces or the engine does not take the trace,
-        and ReportError for an invalid id.
+        new decision drops the pieces, even if the store did not record it (reason "no_store"). If
+        the queue is full, or the service or its engine is closed, the result is VERIFY with an
+        empty id, and the pieces stay, so that the call can be repeated. Raises TraceError if there
+        are no pieces or the engine does not take the trace, and ReportError for an invalid id.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -323,8 +323,10 @@ class RobotCalls:
         return True
 
     async def status(self) -> Struct:
-        """Return how the cell is doing, in plain numbers and texts. No decision waits for the
-        reading of the store.
+        """Return how the cell is doing, in plain numbers and texts.
+
+        It waits in the queue. No decision waits for the reading of the store, unless that is in
+        memory.
 
         Returns
         -------

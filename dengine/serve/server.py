@@ -140,8 +140,8 @@ def serve(
     SettingError
         For a port in use, files that cannot be used, and an address that other machines can reach
         without a token.
-    DengineError
-        What `make` or `recorder` raises.
+    Exception
+        What `make`, `recorder`, or a start of one of `beside` raises.
     """
     if token_file is None and not is_loopback(host):
         raise SettingError(

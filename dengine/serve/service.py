@@ -218,6 +218,8 @@ class CellService:
         TraceError
             For a wrong shape, a first trace of less than 10 samples, an invalid part number, or an
             id that belongs to another trace.
+        SettingError
+            For the reasons of `DataEngine.decide`.
         ReportError
             For an invalid id.
         StoreError
@@ -270,7 +272,8 @@ class CellService:
             For an unknown id, for a value that is no label, and for another label than the reported
             one; but a line stop after a confirmation is no error and corrects the label.
         StoreError
-            If the label is not known to be on disk: report it again.
+            If the label is not known to be on disk, or the id cannot be looked up: report it again.
+            Also if only the event cannot be stored; it is then missing for good.
         BusyError
             If the queue is full or the service is closing.
         """
@@ -311,7 +314,7 @@ class CellService:
         """Return a decision with its trace and label, after waiting for the engine's thread.
 
         None for an unknown id. Raises BusyError if the queue is full or the service is closing,
-        StoreError where the id cannot be looked up, and ReportError for what is no id.
+        StoreError if the id cannot be looked up, and ReportError for an invalid id.
         """
         return await self.call(lambda engine: engine.find(decision_id), read_only=True)
 
@@ -333,13 +336,14 @@ class CellService:
         return self._enqueue(lambda engine, late: work(engine), read_only)
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
-        """Call a function with a store that has every decision so far, and return its result.
+        """Call a function with a store and return its result; the engine first writes its decisions
+        to it.
 
-        The engine first writes its decisions to the store, so this call waits in the queue;
-        decisions that the disk or the store does not take in time are missing, without an error.
-        The function must only read. It runs in another thread over the second connection, or in the
-        engine's thread if the store is in memory. Raises BusyError if the queue is full or the
-        service is closing, and whatever the function raises.
+        For that this call waits in the queue. Decisions that the disk or the store does not take in
+        time are missing, without an error. The function must only read. It runs in another thread
+        over a second connection to the store (`read_store`), or in the engine's thread if the store
+        is in memory. Raises BusyError if the queue is full or the service is closing, and whatever
+        the function raises.
         """
         with suppress(NotTakenError):
             await self.call(lambda engine: engine.flush(), read_only=True)
@@ -348,8 +352,10 @@ class CellService:
         return await asyncio.to_thread(work, self.read_store)
 
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Return the status that `DataEngine.status` returns, without its work in the engine's
-        thread, which only flushes. Raises BusyError and StoreError like `read`.
+        """Return the status that `DataEngine.status` returns, but read the store like `read`.
+
+        Raises BusyError if the queue is full or the service is closing, and StoreError if the store
+        cannot be read.
         """
         stored = await self.read(lambda store: status(store, last, watching))
         return self.engine.state.complete(stored)
@@ -436,7 +442,8 @@ class CellService:
 
     def _notify_observers(self, response: T) -> T:
         """Pass a response or a retrain to all observers, log a retrain, and return the argument.
-        What an observer raises is raised.
+
+        What an observer raises is raised; the observers after it are not called then.
         """
         # Decisions and reports are in the store: only a retrain needs a line of the log.
         if isinstance(response, RetrainReport):
@@ -473,10 +480,10 @@ class CellService:
     def _next_job(self, engine: DataEngine) -> Job | None:
         """Wait for the next job in the queue and return it; None means that the service ends.
 
-        While the queue is empty, the engine does its other work: it begins a retrain that is due,
-        swaps in a new version step by step, and announces a safe mode. The report of a finished
-        retrain is passed to all `observers`, and every iteration over `changes` is woken. An error
-        in this work is logged and not raised.
+        While the queue is empty, the engine does its other work (`DataEngine.poll`): it retrains if
+        that is due, puts a trained version in force step by step, and calls `on_safe_mode` if a
+        safe mode began or ended. The report of a finished retrain is passed to all `observers`, and
+        every iteration over `changes` is woken. An error in this work is logged and not raised.
         """
         # The time right after a response is best for other work: the next part is farthest away.
         timeout = SHORT_WAIT

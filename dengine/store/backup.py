@@ -54,7 +54,9 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
     Engines may run meanwhile: everything that they had acknowledged when this was called is in the
-    copy. The copy is written in full or not at all. The store and the journals are only read.
+    copy. Damaged records of a journal are left out, and a record that contradicts the copy becomes
+    an event of kind "dead letter" there. The copy is written in full or not at all. The store and
+    the journals are only read.
 
     Parameters
     ----------
@@ -74,7 +76,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
         cannot be read. If a journal holds records, and the ledger of its cell was begun with
         another key than the one in the file that DENGINE_LEDGER_KEY names.
     OutputError
-        If `out` exists, or cannot be written.
+        If `out` exists, or cannot be written, for example on a full disk.
     """
     with reading(os.fspath(url)) as connection:
         dialect = connection.dialect.name
@@ -89,7 +91,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
         paths = {cell: journal_path(connection.engine.url, cell) for cell in cells}
     # Journals first: a record that leaves its journal meanwhile is in the store by then.
     waiting = {cell: read_undrained(path)[0] for cell, path in paths.items() if path.exists()}
-    with output_file(out) as partial:
+    with output_file(out) as partial, reading(os.fspath(url)) as connection:
         try:
             with instead(
                 OutputError,
@@ -97,7 +99,7 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
                 sqlite3.Error,
                 do="choose a folder that has room",
             ):
-                _copy(os.fspath(url), partial)
+                _copy(connection, partial)
                 for cell, records in waiting.items():
                     _add_records(partial, cell, records)
                 decisions, labels = _fold_wal_and_count(partial)
@@ -113,7 +115,8 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
 
     Each cell gets a journal that names its newest ledger entry, so that the engine that opens the
     cell next can tell that nothing is missing. A journal that is already beside `store` is not
-    changed: the engine of its cell later takes from it the records that the copy lacks.
+    changed: the next engine of its cell takes the records from it that the copy lacks. If the
+    journal names a ledger entry that the copy lacks, this engine also records an alarm.
 
     Parameters
     ----------
@@ -131,9 +134,9 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     StoreError
         If `copy` is no store, if its history is not as it was written, and if a ledger was begun
         with another key than the one in the file that DENGINE_LEDGER_KEY names. If a journal
-        cannot be made; the store has been copied by then, and stays.
+        cannot be made: the store has been copied by then, and stays.
     OutputError
-        If `store` exists, or cannot be written.
+        If `store` exists, or cannot be written, for example on a full disk.
     """
     report = verify_history(os.fspath(copy))
     if not report.ok:
@@ -151,21 +154,21 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     return report.cells
 
 
-def _copy(url: str, target: Path) -> None:
+def _copy(connection: sa.Connection, target: Path) -> None:
     """Copy an SQLite store into the file `target` by SQLite's own online backup.
 
-    The copy replaces what `target` held.
+    The copy replaces what `target` held. Raise sqlite3.Error if either file fails.
     """
-    with reading(url) as connection, closing(sqlite3.connect(target)) as copy:
+    with closing(sqlite3.connect(target)) as copy:
         source: Any = connection.connection.driver_connection
         source.backup(copy)
 
 
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
-    """Commit a cell's journal records to the copy.
+    """Commit a cell's journal records to the copy; without records it is not opened.
 
     Records that the copy already has change nothing. A record that contradicts the copy is stored
-    there as an event of kind "dead letter".
+    there as an event of kind "dead letter". Raise StoreError if the cell's ledger has another key.
     """
     if not records:
         return

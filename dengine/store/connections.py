@@ -62,8 +62,9 @@ def make_engine(url: str | None) -> sa.Engine:
     Raises
     ------
     StoreError
-        For any other database, for a URL that cannot be read, for an SQLite URL in memory, and if
-        the driver of PostgreSQL is not installed. The message has no password.
+        For any other database, for a URL that cannot be read, has a NUL or is not UTF-8, for an
+        SQLite URL in memory, and if the driver of PostgreSQL is not installed. The message has no
+        password.
     """
     if url is None:
         options = {"poolclass": sa.pool.StaticPool, "connect_args": {"check_same_thread": False}}
@@ -132,12 +133,13 @@ class CopyConnection(sqlite3.Connection):
 def _connect_sqlite(
     dialect: Any, record: Any, arguments: Sequence[Any], options: Mapping[str, Any]
 ) -> Any:
-    """Return a new SQLite connection; it only reads if the file cannot be written.
+    """Return a new SQLite connection; it only reads if the file or its folder cannot be written.
 
     SQLAlchemy calls it with the dialect and the driver's arguments. A file that cannot be written
-    and has no `-wal` beside it is opened as immutable. If it has a `-wal` without a `-shm`, which
-    SQLite must create to read it, both files are copied to a temporary folder, which is deleted
-    with the connection, and the copy is opened for reading.
+    and has no `-wal` beside it is opened as immutable. If it has a `-wal`, but no `-shm` and SQLite
+    cannot create that, both files are copied to a temporary folder, which is deleted with the
+    connection, and the copy is opened for reading. A new file and a `file:` URI are opened in the
+    driver's own way. A damaged file raises nothing here, but when the connection is used.
     """
     name = str(arguments[0])
     file = Path(name)
@@ -177,9 +179,10 @@ def _is_unwritable(error: Exception) -> bool:
 def _set_pragmas(connection: Any, record: Any) -> None:
     """Set a new SQLite connection to synchronous=FULL, so that a commit survives a power failure.
 
-    The file of a store, or an empty one, is set to WAL mode; another program's file is not changed,
-    and a file that cannot be written keeps its mode. The driver then begins no transactions by
-    itself. Raise sqlite3.DatabaseError for a file that is damaged or no database.
+    The file of a store, or an empty one, is set to WAL mode, and an empty one to pages of 16 KiB.
+    Another program's file is not changed, and a file that cannot be written keeps its mode. The
+    driver begins no transactions by itself any more. Raise sqlite3.DatabaseError for a file that is
+    damaged or no database.
     """
     connection.isolation_level = None  # `_begin_transaction` starts transactions, not the driver
     try:
@@ -201,7 +204,8 @@ def _set_pragmas(connection: Any, record: Any) -> None:
 def _begin_transaction(connection: sa.Connection) -> None:
     """Begin an SQLite transaction; with the option `dengine_write` it takes the write lock at once.
 
-    It then waits for other writers, which a read transaction that becomes a write would not do.
+    It then waits for other writers, at most BUSY_SECONDS, which a read transaction that becomes a
+    write would not do.
     """
     write = connection.get_execution_options().get("dengine_write", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
@@ -259,8 +263,9 @@ def reading(url: str) -> Iterator[sa.Connection]:
     Raises
     ------
     StoreError
-        If there is no file, if it is no store of the present schema, if the database fails, and for
-        a ValueError, TypeError or OSError of the block that is not dengine's own.
+        If there is no file, if it is no store of the present schema, for a URL that `make_engine`
+        refuses, and if the database fails. Also in place of a ValueError, TypeError, OverflowError
+        or OSError that the block raises, unless it is dengine's own.
     """
     engine = make_engine(url)
     name = engine.url.render_as_string(hide_password=True)
@@ -288,8 +293,8 @@ def reading(url: str) -> Iterator[sa.Connection]:
 def run_integrity_check(connection: sa.Connection, table: str = "") -> list[str]:
     """Run SQLite's integrity check on the whole file, or on one table.
 
-    Return its findings as texts, [] if all is well. A database error is a finding, too, and not
-    raised.
+    Return its findings as texts, at most 100, [] if all is well. A database error is a finding,
+    too, and not raised.
     """
     try:
         lines = connection.execute(
@@ -375,7 +380,7 @@ class Database:
         A new cell gets its product, and its ledger begins with the key that DENGINE_LEDGER_KEY
         names. Return the cell with its product. Raise StoreError, and disconnect, if the database
         cannot be opened or is no store of this schema, if the ledger of the cell was begun with
-        another key, and if the cell has another product.
+        another key, and if `join_product` refuses the product.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -395,8 +400,8 @@ class Database:
         """Context manager that opens a read transaction and gives its connection.
 
         `before_use` is called first, so that waiting records are seen. Raise StoreError if the
-        database fails or is closed, and for a ValueError, TypeError or OSError of the block that is
-        not dengine's own.
+        database fails or is closed, and in place of a ValueError, TypeError, OverflowError or
+        OSError that the block raises, unless it is dengine's own.
         """
         self.check_open()
         self.before_use()
@@ -480,7 +485,8 @@ class Database:
         Parameters
         ----------
         window : int
-            Number of newest labels that are checked.
+            Number of newest labels that are checked, at least, without those of quarantined traces.
+            In a product the number is an estimate (`Scope.first_label`).
         since : int or None
             If given, the labels after this number are checked instead of the newest `window`.
 
@@ -583,8 +589,9 @@ class Database:
     def write(self, add_rows: Callable[[sa.Connection], T]) -> T:
         """Call `add_rows` in a write transaction, commit it, and return what `add_rows` returned.
 
-        This waits until another thread's transaction has ended. The commit includes a ledger entry
-        for the rows that were added.
+        `before_use` is called first, so that waiting records are written before these rows. This
+        waits until another transaction has ended. If rows were added or settings changed, the
+        commit includes a ledger entry for them.
 
         Parameters
         ----------
@@ -594,10 +601,11 @@ class Database:
         Raises
         ------
         StoreError
-            If the database fails or is closed, and for a ValueError, TypeError or OSError of
-            `add_rows` that is not dengine's own. Other errors pass unchanged. After an error
-            nothing is written; only if the SQLite file was replaced meanwhile, the old file may
-            have the rows.
+            If the database fails or is closed, and in place of a ValueError, TypeError,
+            OverflowError or OSError that `add_rows` raised; dengine's own errors and all others
+            pass unchanged. After an error nothing is written, with two exceptions: if the SQLite
+            file was replaced meanwhile, the old file may have the rows; and if the connection to a
+            server broke during the commit, the server may have them.
         """
         self.check_open()
         self.before_use()  # before the lock is taken: it may write
@@ -640,8 +648,9 @@ class Database:
     ) -> list[int]:
         """Insert rows of this cell into a table, each with a number; return these numbers.
 
-        Each row gets the number that follows the one before it. A row that already has a larger
-        number keeps it.
+        The first row gets the next free number, and each further row the one after it. A row that
+        brings a larger number for that column keeps it, and the rows behind it go on from there. A
+        smaller number is replaced.
 
         Parameters
         ----------

@@ -46,7 +46,8 @@ class CorrectionTable(CellTable):
         """Commit a person's change and its event in one transaction; return the event's number.
 
         The change may correct labels, or have them forgotten (they count nowhere any more), store a
-        version, and replace the settings. If one part fails, nothing is written.
+        version, for which `VersionTable.insert` deletes states of older ones, and replace the
+        settings. If one part fails, nothing is written.
 
         Raises
         ------
@@ -56,8 +57,8 @@ class CorrectionTable(CellTable):
             If the settings of another cell of the product contradict the new ones.
         StoreError
             For data that JSON does not have, for a setting that only the store itself may write
-            (`schema.RESERVED`), for a version without arrays, if another cell of the product stored
-            a version meanwhile, and if the database fails.
+            (`schema.RESERVED`), for an accepted version without arrays, if another cell of the
+            product stored a version meanwhile, and if the database fails.
         """
         now = float(self._database.clock())
         event = new_event(change.kind, change.text, now, change.data, change.author)
@@ -131,12 +132,16 @@ class CorrectionTable(CellTable):
         success: bool | None,
         labels: Mapping[str, bool | None],
     ) -> int:
-        """Insert an event and the corrections that it records, in a write transaction.
+        """Insert an event, and a correction for each of `labels`; nothing is committed.
+
+        The labels themselves stay as they were reported. Without labels only the event is inserted.
 
         Parameters
         ----------
         connection : sqlalchemy.Connection
+            In a write transaction.
         event : Event
+            What happened; the corrections have its author and time, too.
         success : bool or None
             The new label of all decisions; None: forgotten.
         labels : mapping of str to bool or None

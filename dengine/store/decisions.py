@@ -45,12 +45,12 @@ class DecisionTable(CellTable):
         Returns
         -------
         StoredDecision or None
-            None for an unknown id.
+            None for an unknown id, also for the id of another cell's decision.
 
         Raises
         ------
         StoreError
-            If the trace is not as it was stored.
+            If the trace is missing, or not as it was stored; it is checked only if it is read.
         """
         query = past_query(self._database.cell_id).where(DECISION.c.id == decision_id)
         rows = self._read(
@@ -274,7 +274,7 @@ class DecisionTable(CellTable):
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
         """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
 
-        The newest stretch may be shorter.
+        The newest stretch may be shorter. A period of time without decisions has no stretch.
 
         Parameters
         ----------
@@ -305,7 +305,7 @@ class DecisionTable(CellTable):
             decisions, labels: numbers; quarantined: number of decisions whose trace is kept out of
             training; corrected, forgotten: numbers of decisions whose label was corrected or
             forgotten; actions, reasons, sources: dicts of numbers by value, 0 included. Forgotten
-            labels are not among labels and sources.
+            labels are not among labels, sources and corrected.
         """
         tally = tally or self.tally()
         actions = tally.by("action")

@@ -89,8 +89,9 @@ class Drainer:
     def fault(self) -> str:
         """Why the store cannot be written or read at present; "" if it can.
 
-        This is a fault of the journal, the last error of the database, or that a record has waited
-        for the database longer than both `limit` and LAG_SECONDS.
+        The reason is a fault of the journal, or the last error of the database, until a later
+        attempt succeeds, or a record that has waited for the database longer than both the `limit`
+        of this drainer and LAG_SECONDS.
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
@@ -99,7 +100,7 @@ class Drainer:
         return f"no answer from the store for {lag:.1f} s."
 
     def request(self) -> None:
-        """Ask that everything recorded so far be synced and copied to the database at once.
+        """Ask that all records so far be written to the journal's disk and the database at once.
 
         It does not wait, and says nothing of the result.
         """
@@ -147,8 +148,8 @@ class Drainer:
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """Have the thread make a call, and return without waiting for it.
 
-        Before the call, the thread copies the synced records to the database. If this fails, the
-        call is made nevertheless.
+        Before the call, the thread copies the records that are on the journal's disk to the
+        database. If this fails, the call is made nevertheless.
 
         Returns
         -------
@@ -203,8 +204,8 @@ class Drainer:
     def stop(self, seconds: float) -> bool:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
-        Before it ends, the thread copies the synced records to the database, unless the database
-        fails, and makes the calls that wait.
+        Before it ends, the thread copies the records that are on the journal's disk to the
+        database, unless the database fails, and makes the calls that were submitted.
         """
         with self._changed:
             self._stopped = True
@@ -223,12 +224,12 @@ class Drainer:
                 self.drain()
 
     def _run(self) -> None:
-        """Copy synced records to the database and make submitted calls, until stopped.
+        """Copy the records on the journal's disk to the database, and make calls, until stopped.
 
-        Before a call all synced records are copied; if this fails, the call is made nevertheless.
+        Before a call all of these records are copied; if this fails, the call is made nevertheless.
         An error of the database is logged once and kept for `fault`; a second later the database is
-        tried again. Once stopped, it ends when all waiting calls are made, and the synced records
-        are copied or the database has failed.
+        tried again. Once stopped, it ends when all submitted calls are made, and the records are
+        copied or the database has failed.
         """
         while True:
             call = self._wait_for_work()
@@ -277,10 +278,12 @@ class Drainer:
             self._changed.notify_all()
 
     def _drain_synced(self) -> None:
-        """Copy all records that are synced by now to the database; then clear its last error.
+        """Copy all records that are on the journal's disk by now to the database.
 
-        Records that are synced meanwhile wait for the next call, so that they share a transaction.
-        Raise StoreError if the database fails.
+        They go in chunks of at most DRAIN_CHUNK. Later records go with them only if they still fit
+        into the last chunk. The journal's head is synced first. At the end the drainer's last
+        error, which `fault` shows, is cleared. Raise StoreError if the database fails: chunks that
+        were committed stay, and the last error is kept.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:
@@ -290,13 +293,14 @@ class Drainer:
         self._error = ""
 
     def drain_chunk(self) -> None:
-        """Commit the oldest synced records, at most DRAIN_CHUNK, in one transaction.
+        """Commit the oldest records that are on the journal's disk, at most DRAIN_CHUNK.
 
-        A decision is left out if a later record with the same id replaces it. Records that are
-        damaged on disk are taken from memory and reported by an event. If a decision is not in
-        memory either, it is lost, and the kind of that event is DATA_LOST, an alarm. Journal,
-        counters and index are updated. Raise StoreError if the database fails; nothing is updated
-        then, and the next call commits the same records again.
+        There must be one. A decision is left out if a later record with the same id replaces it.
+        Records that are damaged on disk are taken from memory and reported by an event. If a
+        decision is not in memory either, it is lost, and the kind of that event is DATA_LOST, an
+        alarm. Journal, counters and index are then updated. Raise StoreError if the database fails;
+        nothing is updated then, and the next call commits the same records again, of which some may
+        be stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))

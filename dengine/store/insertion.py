@@ -71,7 +71,8 @@ class RecordInsertion:
         A record that is stored already changes nothing. A record that contradicts the store becomes
         a dead letter, an event that says what was in it. If the database refuses a value, the
         records are halved, each half in a transaction of its own, until the refused record is
-        alone; it becomes a dead letter, too. Raise StoreError if the database fails in another way.
+        alone; it becomes a dead letter, too. A dead letter has no label number. Raise StoreError if
+        the database fails in another way; halves that were committed before stay.
         """
         try:
             return self._database.write(lambda connection: self._insert(connection, records))
@@ -89,9 +90,10 @@ class RecordInsertion:
         """Insert the records that are not stored yet; nothing is committed.
 
         A record that contradicts the store becomes an event, "dead letter". A line stop of a part
-        that had counted as good (`_is_late_stop`) corrects the label of that part. Return (decision
-        id, number) of each label among the records, also of one that was stored before, but not of
-        a dead letter.
+        that had counted as good (`_is_late_stop`) corrects the label of that part. Return one pair
+        (decision id, number) for each decision of which a label is among the records: the number of
+        its first label, whether that is new, was stored before, or is corrected by a late stop. A
+        dead letter has no pair.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]

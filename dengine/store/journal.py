@@ -84,7 +84,10 @@ def encode_record(record: Record) -> bytes:
 
 
 def decode_record(blob: bytes) -> Record:
-    """Return the record that `encode_record` wrote; raise StoreError for other bytes."""
+    """Return the record that `encode_record` wrote; raise StoreError for bytes that have no record.
+
+    A changed number or sample is not noticed here; `Journal.read` checks for that.
+    """
     errors = (struct.error, ValueError, KeyError, TypeError, AttributeError)
     with instead(
         StoreError,
@@ -197,8 +200,9 @@ class Journal:
     def append(self, records: Sequence[bytes], time: float) -> list[int]:
         """Append encoded records behind the last one, and return when they are synced to the disk.
 
-        The head then names the newest of them. After an error the journal's end is where it was
-        before, and the same records can be appended again.
+        The head then names the newest of them; it is not synced, and if it cannot be written, that
+        is ignored. After an error the journal's end is where it was before, and the same records
+        can be appended again.
 
         Parameters
         ----------
@@ -254,9 +258,11 @@ class Journal:
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
 
-        Raise StoreError if no intact record begins there.
+        Raise StoreError if no intact record begins there, or if the disk cannot be read.
         """
-        if (record := self._read_record(offset)) is None:
+        with _os_errors(self.path):
+            record = self._read_record(offset)
+        if record is None:
             raise StoreError(
                 f"Expected the record that was written to {self.path} at byte {offset}, found "
                 "another."
@@ -283,7 +289,7 @@ class Journal:
             begin += 1 + (mark if mark >= 0 else len(block) - len(MARK))
 
     def save_newest_entry(self, newest: EntryName | None) -> None:
-        """Write the newest ledger entry and `drained_to` to the header and to the head.
+        """Write to header and head the newest ledger entry, and which records the store holds.
 
         Nothing is synced: an older header is harmless, since the store ignores a record that it is
         given twice. Raise StoreError if the header cannot be written; a failure of the head is
@@ -331,7 +337,8 @@ class Journal:
         """Create a new file at the path of a journal that was deleted, moved or replaced.
 
         The records that are not drained are copied from the lost file to the same offsets. Raise
-        StoreError if the new file cannot be written; the journal then still uses the lost one.
+        StoreError if the new file cannot be written, or another engine has locked it; the journal
+        then still uses the lost one.
         """
         lost = self._file
         self._file = _open_file(self.path)
@@ -495,13 +502,15 @@ def journal_path(url: Any, cell_id: str) -> Path:
     url : sqlalchemy.URL
         The store.
     cell_id : str
-        Characters that a file name cannot have are escaped.
+        Characters that a file name cannot have are escaped, and also capital letters if the
+        system's file names ignore case.
 
     Returns
     -------
     Path
-        Beside an SQLite file, STORE.CELL.journal; for a server in the folder dengine of the user's
-        state folder (`XDG_STATE_HOME`, or ~/.local/state).
+        Beside an SQLite file, STORE.CELL.journal. For a server CELL.DIGEST.journal in the folder
+        dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with the first 60
+        characters of the cell and a digest of the server, the database and the cell.
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal
@@ -536,9 +545,9 @@ def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
     The records are oldest first. If several decisions have one id, only the last is returned.
-    Damaged records are left out. Nothing is locked or changed, so an engine may be using the
-    journal. Raise StoreError if the file cannot be read or is no journal, and for a record that
-    another release of dengine wrote.
+    Damaged records are left out; `loss` of the journal says so. Nothing is locked or changed, so an
+    engine may be using the journal. Raise StoreError if the file cannot be read or is no journal,
+    and for a record that another release of dengine wrote.
     """
     journal = Journal(path, owning=False)
     try:
@@ -589,7 +598,10 @@ def _unpack_fields(content: bytes) -> dict[str, Any]:
 
 
 def forked_error(pid: int, name: str) -> StoreError:
-    """Return the StoreError for a forked process that uses what its parent `pid` opened."""
+    """Return the StoreError for a process that uses what another process opened before a fork.
+
+    `pid` is the process that opened it, and `name` says what it is, for the message.
+    """
     return StoreError(
         f"Expected the process that opened {name}, {pid}, got its fork {os.getpid()}; open it "
         "after the fork, in the process that uses it."

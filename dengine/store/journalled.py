@@ -54,7 +54,7 @@ class JournalledStore(Outbox):
     Raises
     ------
     StoreError
-        Where another engine owns the cell, or the database cannot take what the journal holds.
+        If another engine owns the cell, or the database cannot take what the journal holds.
     """
 
     def __init__(self, store: SqlStore, window: int, patient: bool = False) -> None:
@@ -87,8 +87,8 @@ class JournalledStore(Outbox):
         If one is missing, the store was cut off or restored from an older copy: an event DATA_LOST
         (an alarm) is stored, and all records of the journal count as undrained, so that they are
         copied to the database again. An event that is no alarm is stored if the journal or its head
-        is new though the store is not. Raise StoreError only if the database cannot be read or
-        written.
+        is new or damaged though the store is not new. Raise StoreError only if the database cannot
+        be read or written.
         """
         journal = self._journal
         database = self.store.database
@@ -112,9 +112,10 @@ class JournalledStore(Outbox):
         """Copy to the database what an earlier process left in the journal, and clear the journal.
 
         If records are damaged or missing in the journal, an event DATA_LOST says so, which is an
-        alarm until a person acknowledges it. If a process was killed as it wrote a record, this
-        unfinished record is cut off, and an event that is no alarm says so. Raise StoreError if the
-        database fails; the records then stay in the journal.
+        alarm until a person acknowledges it. Otherwise, if a killed process left an unfinished
+        record, which was cut off, an event that is no alarm says so. Raise StoreError if the
+        database fails, or another release wrote a record; the records that were not copied then
+        stay in the journal.
         """
         newest = self.store.decisions.select(HistoryFilter(), limit=1)
         since = "".join(
@@ -195,7 +196,8 @@ class JournalledStore(Outbox):
 
         The new decision keeps time, trace and number of the earlier one. If the earlier one is on
         disk by now, nothing is recorded, and the earlier one is returned. Raise KeyError for an id
-        that is neither in memory nor in the journal.
+        that is neither in memory nor in the journal, and StoreError if the journal is damaged where
+        the earlier decision stands.
         """
         id_ = item.decision.id
         with self._changed:
@@ -243,9 +245,9 @@ class JournalledStore(Outbox):
         """Return a decision with its label from memory, journal or database, or None if unknown.
 
         A label that is not on disk yet is returned only with `unsynced`. Raise StoreError if the
-        database is needed and does not answer within `limit` seconds. Raise it also for an id
-        whose last decision was VERIFY and was not recorded, because the id could not be looked up
-        or the disk hung.
+        database is needed and does not answer within `limit` seconds, or if the stored trace is
+        damaged. Raise it also for an id whose last decision was VERIFY and was not recorded,
+        because the id could not be looked up or the disk hung.
         """
         with self._changed:
             if decision_id in self._unrecorded:
@@ -322,7 +324,8 @@ class JournalledStore(Outbox):
 
         Records that the database does not take stay in the journal, and the next engine drains
         them. Records that the disk does not take are given up, and an error is logged; no report of
-        them was acknowledged. A second call does nothing, nor does one in a forked process.
+        them was acknowledged. If the disk hangs, store and journal stay open, and the cell is owned
+        until the process ends. A second call does nothing, nor does one in a forked process.
         """
         if not self.is_usable:
             return

@@ -185,9 +185,9 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
 
 
 def rows_digest(sums: Mapping[str, Iterable[bytes]]) -> bytes:
-    """Return the SHA-256 (32 bytes) over the sums of rows, given by table.
+    """Return the SHA-256 (32 bytes) over the checksums of rows (`row_sum`), given by table.
 
-    The order of tables and of rows does not matter.
+    Neither the order of the tables nor that of the rows matters.
     """
     digest = hashlib.sha256()
     for table in sorted(sums):
@@ -218,15 +218,16 @@ def entry_digest(previous: bytes, head: Row, key: bytes = b"") -> bytes:
 
 
 def _extend_chain(chained: str, sums: Iterable[bytes]) -> str:
-    """Return a table's chain extended by the sums of the next entry's rows: SHA-256, hexadecimal.
+    """Return a table's chain, a digest over all its rows so far, extended by the next entry's rows.
 
-    The order of the sums does not matter; the first entry of a table extends "".
+    `sums` are the checksums of these rows; their order does not matter. Both chains are SHA-256,
+    hexadecimal; the first entry of a table extends "".
     """
     return hashlib.sha256(chained.encode() + b"".join(sorted(sums))).hexdigest()
 
 
 def _settings_chain(settings: Mapping[str, str]) -> str:
-    """Return the chain value of a cell's settings, SHA-256 in hexadecimal; in whatever order."""
+    """Return a SHA-256 over a cell's settings, hexadecimal; their order does not matter."""
     return _extend_chain("", [json.dumps(settings, sort_keys=True).encode()])
 
 
@@ -269,10 +270,10 @@ class LedgerEntry:
         self.settings = False
 
     def add_rows(self, table: str, rows: Sequence[Row]) -> list[Row]:
-        """Add the sums of rows, which are about to be inserted into a table, to this entry.
+        """Add the checksums of rows, which are about to be inserted into a table, to this entry.
 
         Return copies of the rows with two more columns: `entry`, the number of this entry, and
-        `sum`.
+        `sum`, the checksum (`row_sum`).
         """
         chained = [{**row, "entry": self._number} for row in rows]
         for row in chained:
@@ -333,7 +334,8 @@ def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, s
     """Compare a cell's settings with the newest copy of them in the ledger.
 
     Return a text for each key that differs: "is not chained" if only the store has it, "is missing"
-    if only the ledger has it, else "was changed". {} if all are equal.
+    if only the ledger has it, else "was changed". {} if all are equal. A damaged copy counts as
+    empty.
     """
     stored = read_settings(connection, cell_id)
     chained: dict[str, str] = {}

@@ -53,7 +53,7 @@ class MemoryStore(Outbox):
         """Write the versions and records that wait in memory to the database.
 
         It is called before each use of the store, and when 40 versions wait. Raise StoreError if
-        the database cannot be written; what waited is then dropped.
+        the database cannot be written; what was not written by then is lost.
         """
         versions = self._versions
         records = self._unwritten

@@ -56,8 +56,8 @@ def open_store(
     Raises
     ------
     StoreError
-        For an argument of another type, a database that cannot be used or is another program's, and
-        a cell of another product.
+        For an argument of another type, a database that cannot be used or is another program's, a
+        ledger with another key, a cell of another product, and a time limit that is not above 0.
     """
     from .peers import check_cell_exists  # SQLAlchemy is imported where it is used
     from .sql import SqlStore
@@ -103,7 +103,8 @@ def open_outbox(
 
     A `JournalledStore` claims the cell, drains what an earlier process left in the journal, and
     starts its threads. Either outbox checks the store; what is not as it was written becomes its
-    `integrity_error`, and is not raised. Closing the outbox closes the store.
+    `integrity_error`, and is not raised. Closing the outbox closes the store, unless that is in
+    memory.
 
     Parameters
     ----------
@@ -124,7 +125,7 @@ def open_outbox(
     Raises
     ------
     StoreError
-        Where another engine owns the cell, and where the store cannot be read or written.
+        If another engine owns the cell, and if the store cannot be read or written.
     """
     if reading or store.database.is_in_memory:
         return MemoryStore(store, window, reading)

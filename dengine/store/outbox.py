@@ -268,7 +268,7 @@ class Outbox(ABC):
     def request_label_drain(self) -> bool:
         """If the database lacks a label, ask that all records be copied there now; do not wait.
 
-        Return whether it lacks one; in memory never.
+        Return whether it lacks a label; False for a store in memory.
         """
         return False
 

@@ -68,7 +68,7 @@ def check_peer_settings(
     Raises
     ------
     SettingError
-        If a setting of the embedding differs.
+        If one of the compared settings differs, and for a stored recipe that cannot be read.
     """
     if "recipe" not in settings or "recipe" not in peer_settings:
         return
@@ -94,7 +94,7 @@ def check_peer_settings(
 def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
     """Return the settings on which an embedding depends, by name, of a cell's stored settings.
 
-    Those that are not stored are None.
+    Those that are not stored are None; the recipe must be.
     """
     recipe = Recipe.from_toml(settings["recipe"])
     of_recipe = {key: getattr(recipe, key) for key in EMBEDDING}

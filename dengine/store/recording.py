@@ -152,16 +152,16 @@ class Recorder:
         return entry
 
     def request_sync(self) -> None:
-        """Ask that everything recorded so far be synced at once; do not wait."""
+        """Ask that everything recorded so far be written to the disk at once; do not wait."""
         with self.changed:
             self._wanted = self.n_recorded
             self.changed.notify_all()
 
     def sync(self, seconds: float | None = None) -> None:
-        """Wait until everything recorded so far is synced, at most `seconds`, or the limit if None.
+        """Wait until everything recorded so far is on the disk, at most `seconds`.
 
-        Raise NotTakenError if that takes longer, or a write fails meanwhile. The records are not
-        dropped: the thread tries to write them again.
+        None: the limit of this recorder. Raise NotTakenError if that takes longer, or a write fails
+        meanwhile. The records are not lost then: the thread tries to write them again.
         """
         limit = self._limit if seconds is None else seconds
         with self.changed:
@@ -206,7 +206,7 @@ class Recorder:
         """Write and sync new records in batches until stopped.
 
         After an error, which is kept for `fault`, it wakes those who wait in `sync`, and tries the
-        same records again a second later.
+        same records again a second later, unless it was stopped: they then stay unwritten.
         """
         while True:
             with self.changed:

@@ -32,7 +32,7 @@ from ..errors import (
     shortened,
 )
 from ..files import FilePath, read_archive
-from ..records import Action, Arrays, Decision, RetrainReport, Source, State, TraceArray
+from ..records import Action, Arrays, Decision, Ints, RetrainReport, Source, State, TraceArray
 
 # Kinds of events.
 SAFE_MODE_BEGAN = "safe mode"
@@ -119,8 +119,8 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data as JSON gives it back, in a new dict; None for None.
 
-    A tuple becomes a list. Raise StoreError for values that JSON does not have, NaN and infinity
-    included.
+    A tuple becomes a list, and a key that is a number a text. Raise StoreError for values that JSON
+    does not have, NaN and infinity included.
     """
     with instead(
         StoreError,
@@ -245,7 +245,7 @@ class StoredDecision:
         return "good" if self.success else "bad"
 
     def with_label(self, label: NewLabel) -> Self:
-        """Return a copy that has the success and the source of a label."""
+        """Return a copy that has the success and the source of a label, not its number and time."""
         return replace(self, success=label.success, source=label.source)
 
 
@@ -265,10 +265,10 @@ class LabelledTraces:
         Content hash of each, as in `StoredDecision`.
     """
 
-    seq: NDArray[np.int64]
+    seq: Ints
     traces: TraceArray
     labels: NDArray[np.int8]
-    hashes: NDArray[np.int64]
+    hashes: Ints
 
     def rows(self) -> Iterator[tuple[int, TraceArray, int, int]]:
         """Return the labelled traces one by one: number, trace, label and hash."""
@@ -612,7 +612,10 @@ def decision_row(item: StoredDecision) -> Row:
 
 
 def trace_row(item: StoredDecision) -> Row:
-    """Return the row of the table `trace` for a decision's trace, packed as float32."""
+    """Return the row of the table `trace` for a decision, without `cell_id`.
+
+    It has the decision's id, the shape of its trace, and the samples as bytes of float32.
+    """
     channels, samples = item.trace.shape
     return {
         "decision_id": item.decision.id,
@@ -625,8 +628,8 @@ def trace_row(item: StoredDecision) -> Row:
 def read_decision(row: Any) -> StoredDecision:
     """Return the decision of a row of the table `decision`, with its label and trace if selected.
 
-    Without the trace's columns its trace is NO_TRACE, of shape (0, 0). Raise StoreError for a row
-    that cannot be read.
+    Without the trace's columns its trace is NO_TRACE, of shape (0, 0). Raise StoreError for a field
+    that cannot be read. The trace must be intact (`is_intact`); another error is raised otherwise.
     """
     values = row._mapping
     trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in values else NO_TRACE

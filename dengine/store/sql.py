@@ -131,7 +131,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def flush(self) -> None:
         """Wait until the outbox's records are in the database, but not beyond its time limit.
 
-        Nothing is raised if the database does not answer; StoreError only if the store is closed.
+        Without an outbox nothing happens. Raise StoreError if the store is closed; if the database
+        of a running cell does not answer, nothing is raised.
         """
         self.database.check_open()
         self.database.before_use()
@@ -174,13 +175,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Returns
         -------
         list of (str, int)
-            Decision id and number of each label, also of one that was stored before, but not of a
-            dead letter.
+            A pair (decision id, number of its first label) for each decision with a label among the
+            records, also with one that was stored before. A dead letter has no pair.
 
         Raises
         ------
         StoreError
-            If the database fails.
+            If the database fails; records that were committed before stay.
         """
         return self._insertion.commit(records)
 

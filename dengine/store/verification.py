@@ -141,10 +141,11 @@ def verify_history(
 ) -> HistoryReport:
     """Check every row of a store's history; nothing is written, and engines may run meanwhile.
 
-    What is wrong is returned as faults, not raised: a row that was changed, added or removed, a
-    damaged SQLite file or journal, a ledger entry that a cell's journal names and the store lacks,
-    lost data that nobody has acknowledged, and an `expect` that no entry has. Takes about 80 bytes
-    of memory per row.
+    What is wrong is returned as faults, not raised: a row or setting that was changed, added or
+    removed, a damaged SQLite file, damaged or missing records of a journal, a ledger entry that a
+    cell's journal names and the store lacks, lost data that nobody has acknowledged, and an
+    `expect` that no entry has. A journal that is missing or cannot be read is no fault: `waiting`
+    of the cell is None then. Takes about 80 bytes of memory per row.
 
     Parameters
     ----------
@@ -165,7 +166,8 @@ def verify_history(
     ------
     StoreError
         For what is no store of the present schema, for an unknown cell, for an `expect` that is no
-        digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names.
+        digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names, or if
+        the key's file cannot be read.
     """
     expected = "" if expect is None else expect.strip().lower()
     if expect is not None and not re.fullmatch("[0-9a-f]{8,64}", expected):

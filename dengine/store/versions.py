@@ -54,7 +54,9 @@ class VersionTable(CellTable):
         state: Arrays | None,
         time: float | None = None,
     ) -> int:
-        """Commit a retrain, and delete the states of older versions that are no longer kept.
+        """Commit a retrain; if it is accepted, delete the states that are no longer kept.
+
+        These are the arrays of older versions, by `keeps_state`.
 
         Parameters
         ----------
@@ -144,7 +146,7 @@ class VersionTable(CellTable):
         """Return the newest version that was put in force in the cell or its product.
 
         It comes with its arrays. If they are damaged, an event is written to the store, and the
-        next older version that still has its arrays is returned.
+        next older version whose arrays are kept and intact is returned.
 
         Returns
         -------

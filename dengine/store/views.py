@@ -180,8 +180,9 @@ class Tally:
     def outcomes(self) -> Outcomes:
         """Counts of accepted, rejected and audited parts by label, for the certificate.
 
-        An audited part counts as accepted or rejected by what the model alone would have done.
-        Parts that an operator's limits rejected (`Reason.OUTSIDE`) are not counted as rejected.
+        An audited part is counted by what the model alone would have done, in the fields of audits
+        alone and not among the accepted and rejected parts. Nor are parts counted as rejected that
+        an operator's limits rejected (`Reason.OUTSIDE`).
         """
         by_action = Counter[tuple[Action, str]]()
         audited = Counter[tuple[Action, str]]()  # by what the model alone would have done

@@ -5,6 +5,8 @@ is not taken for one.
 import itertools
 import shutil
 import sqlite3
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -181,6 +183,25 @@ def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
     assert result.exit_code == 1
     assert words in result.output
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of a file there")
+def test_a_backup_that_has_no_room_names_the_copy_and_leaves_nothing_behind(
+    tmp_path: Path, in_use: DataEngine
+) -> None:
+    program = """
+import resource, signal, sys
+from dengine.cli import main
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))  # a disk that becomes full
+main()
+"""
+    words = [sys.executable, "-c", program, "backup", "engine.db", "--out", "copy.db"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "Cannot write copy.db" in done.stderr
+    assert "choose a folder that has room" in " ".join(done.stderr.split())
+    assert list(tmp_path.glob("*copy*")) == []
 
 
 def test_every_cell_of_a_file_is_in_its_backup(tmp_path: Path, data: Dataset) -> None:

@@ -305,6 +305,9 @@ def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_
     assert engine.model.y.tolist() == labels_now()
     engine.rollback(1)
     assert engine.model.y.tolist() == labels_now()
+    change = engine.correct(cycles[2].decision.id, cycles[2].success)  # its refit is an event, too
+    kinds = {event.number: event.kind for event in engine.store.events.newest()}
+    assert kinds[change.event] == change.kind == "correct"
     assert again(engine, model=Remembering()).model.y.tolist() == labels_now()
     with pytest.raises(SettingError, match="alpha would have no effect"):
         engine.set_policy(replace(engine.policy, alpha=0.2))

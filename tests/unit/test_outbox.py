@@ -2,6 +2,7 @@
 becomes of records that are damaged in the journal.
 """
 
+import errno
 import threading
 import time
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from dengine.store.journalled import JournalledStore
 from dengine.store.memory import MemoryStore
 from dengine.store.opening import open_outbox
 from dengine.store.outbox import Outbox
+from dengine.store.owned_file import OwnedFile
 from tests.support.stores import decision, label, report, trace
 
 
@@ -113,6 +115,24 @@ def test_a_damaged_decision_that_is_not_in_memory_any_more_is_named_in_an_event(
     assert text.endswith("decisions that are lost: part 1.")
     (letter,) = events(box, "dead letter")
     assert "a label, success from verification, on 'part 1'" in letter
+
+
+def test_a_journal_that_the_disk_does_not_give_back_is_a_fault_of_the_store(
+    box: Outbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lookup, "N_RECENT", 1)
+    for name in ("part 1", "part 2"):
+        box.record_decision(stored(name))
+    box.sync()
+
+    def fail(self: OwnedFile, size: int, offset: int) -> bytes:
+        raise OSError(errno.EIO, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(OwnedFile, "read", fail)
+        with pytest.raises(StoreError, match=r"Could not use the journal .*Input/output error"):
+            box.find_decision("part 1")
+    assert box.find_decision("part 1").decision.id == "part 1"
 
 
 def test_a_journal_that_was_damaged_while_its_engine_ran_is_no_fault_at_the_next_start(

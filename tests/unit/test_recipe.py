@@ -16,9 +16,11 @@ from dengine.experiments.replay import Contender
 from dengine.model.neighbours import ModelPrediction
 from dengine.recipe import RECIPES
 
-values = st.one_of(
+scalars = st.one_of(
     st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), st.text()
 )
+numpys = st.floats(allow_nan=False, width=32).map(np.float32)
+values = st.one_of(scalars, numpys)
 
 
 @st.composite

@@ -12,11 +12,10 @@ take.
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ...errors import DengineError, expect
-from ...records import Outcome, TraceArray, TraceSpec
+from ...records import Floats, Outcome, TraceArray, TraceSpec
 from .conditions import (
     RATE_HZ,
     SAMPLES,
@@ -49,7 +48,7 @@ class SensorFaults:
 
 
 def read_sensor(
-    force: NDArray[np.float64],
+    force: Floats,
     faults: SensorFaults,
     parameters: CellParameters,
     rng: np.random.Generator,
@@ -57,7 +56,8 @@ def read_sensor(
     """Return what the sensor reports of a true force.
 
     The force passes a low-pass filter, gets the sensor's faults, and is quantised. Then samples are
-    lost: a lost sample repeats the last sample that was not lost. `rng` is advanced.
+    lost: a lost sample repeats the last sample that was not lost. The first is never lost. `rng` is
+    advanced.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def read_sensor(
     """
     keep = float(np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ))
     # The sensor has a low-pass filter of first order.
-    true: NDArray[np.float64] = lfilter([1 - keep], [1, -keep], force)
+    true: Floats = lfilter([1 - keep], [1, -keep], force)
     samples = len(true)
     time_s = np.arange(samples) / RATE_HZ
     # Six of each are drawn and one is used, so that the bundled traces can be made again.
@@ -254,7 +254,8 @@ class SimulatedCell:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
         The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and the clock goes on
-        by `cycle_s`. Raise DengineError if the last part still waits for verify, proceed or reject.
+        by `cycle_s`. Raise DengineError if the last part still waits for verify, proceed or reject,
+        or if MuJoCo is not installed, and the other errors of `insert_once`; nothing changes then.
         """
         if self._waiting:
             raise DengineError(

@@ -259,9 +259,11 @@ def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
 
 
 def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return the parameters: unchanged in the first half of the cycles, then for another part.
+    """Return the parameters: unchanged in the first half of the cycles, then those of another part.
 
-    This variant of the part is 2.5 times as heavy, with a tighter fit and a smaller chamfer.
+    That part is 2.5 times as heavy. Its clearance and chamfer are fixed ranges, 0.04 to 0.16 mm and
+    0.5 to 1.0 mm: tighter and smaller than the default ones. An odd number of cycles has the
+    smaller half first.
     """
     if cycle < cycles // 2:
         return parameters
@@ -275,7 +277,10 @@ def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
 
 
 def bias_jump(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return the parameters, from half way on with 8 N more offset of the force sensor."""
+    """Return the parameters, from half way on with 8 N more offset of the force sensor.
+
+    An odd number of cycles has the smaller half first.
+    """
     if cycle < cycles // 2:
         return parameters
     return replace(parameters, bias_offset_n=parameters.bias_offset_n + 8.0)

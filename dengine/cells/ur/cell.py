@@ -250,7 +250,8 @@ class UrCell(AbstractContextManager["UrCell"]):
         this order.
 
         Packages that arrive meanwhile are discarded. Raise CellError after `start_timeout` seconds;
-        its message says whether the program does not run, or has not answered.
+        its message says whether the robot sent nothing, its program does not run, or it has not
+        answered.
         """
         problem = ""
         for row in self.recorder.rows(self.start_timeout):

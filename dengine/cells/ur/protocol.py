@@ -127,7 +127,8 @@ class RtdeRecipe:
 
         Columns that are left out are 0, and names that are no columns are ignored. A number for an
         integer field loses its fraction. Raise struct.error for a number that its field cannot
-        hold, for example one that is too large.
+        hold, for example one that is too large; in an integer field ValueError for NaN, and
+        OverflowError for an infinity.
         """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))

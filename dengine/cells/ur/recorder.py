@@ -174,10 +174,10 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         )
 
     def rows(self, seconds: float) -> Iterator[Row]:
-        """Yield packages as they arrive, for this many seconds, and remove them from the buffer.
+        """Yield the packages of the robot, each removed from the buffer, for this many seconds.
 
-        The time runs from the first package that is asked for. If the stream is closed, the
-        iteration ends early.
+        Packages that are buffered already come first. The time runs from the first call of `next`.
+        If the stream is closed, the iteration ends when the buffer is empty or the time is over.
         """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:

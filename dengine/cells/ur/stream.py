@@ -109,7 +109,8 @@ class RtdeClient:
     def rows(self) -> Iterator[Values]:
         """Yield the values of every data package by column, as they arrive, without an end.
 
-        Raise CellError if the connection is lost or silent for `timeout` seconds.
+        Raise CellError if the connection is lost or silent for `timeout` seconds, or for bytes that
+        are no RTDE or no package with these columns.
         """
         for package in self._incoming:
             if package.type is PackageType.DATA:
@@ -154,10 +155,10 @@ class RtdeClient:
             self._socket.sendall(data)
 
     def _receive_packages(self) -> Iterator[Package]:
-        """Yield packages as they arrive, without an end, except the controller's text messages.
+        """Yield packages as they arrive, without an end; the controller's texts are left out.
 
         The newest text is kept for error messages. Raise CellError if the connection is lost or
-        silent for `timeout` seconds (the message quotes the text), or for bytes that are no RTDE.
+        silent for `timeout` seconds (its message quotes the text), or for bytes that are no RTDE.
         """
         packages = PackageReader()
         while True:
@@ -317,8 +318,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         and names that are no columns are ignored.
 
         If the connection is lost, the newest inputs are written again on the next connection,
-        unless they are `REPEAT_S` old by then or the controller was restarted. Raises struct.error
-        for a number that its field cannot hold.
+        unless they are 10 s old by then or the controller was restarted. Raises struct.error for a
+        number that its field cannot hold.
 
         Parameters
         ----------
@@ -373,8 +374,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         `take`.
 
         If the buffer is full, its oldest package is dropped. At the first package of a new
-        connection the newest inputs are written again, if they are less than `REPEAT_S` old. But if
-        the package shows that the controller was restarted, the inputs are forgotten.
+        connection the newest inputs are written again, if they are less than 10 s old. But if the
+        package shows that the controller was restarted, the inputs are forgotten.
         """
         with self._news:
             if self._newest is not None:

@@ -67,13 +67,18 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     -------
     Description
         A key has the value `?` if no rule proves a value. `open_keys` lists these keys, and
-        `notes` has the evidence and the possible values by key.
+        `notes` has the evidence and the possible values by key. While `files`, `layout` or
+        `part.column` is `?`, the keys that depend on it are not proposed.
 
     Raises
     ------
     DataError
-        If there is no file, or no file that holds samples, or if a stated column, source of
-        labels or text form does not exist.
+        If there is no file, or none that holds samples (a table of results does not). Also if a
+        stated value is wrong: an unknown key, a column of times or a channel that does not exist, a
+        source of labels that has no words, a malformed pattern of files, or settings in `[text]`
+        that no file can be read with.
+    SettingError
+        If a stated `windows.trigger`, which cuts long recordings, is malformed.
     """
     p = Proposal(stated or {}, Description().with_values(stated or {}))
     check_text(p.description.text)
@@ -95,8 +100,9 @@ def choose_files(p: Proposal, root: Path) -> bool:
     If the user stated `files`, they are these. Otherwise they are the files with the only suffix
     that several files have; the suffix of a bag, `.mcap`, counts even for one file. If no suffix
     qualifies, all suffixes do. If several suffixes qualify, `files` is set to `?` with a note that
-    lists the suffixes, the format is not set, and the result is False. Raises DataError if there
-    is no file of recordings.
+    lists the suffixes, the format is not set, and the result is False. The format is that of the
+    first file's suffix, `text` for an unknown one. Raises DataError if there is no file of
+    recordings.
     """
     stated = p.description.files
     every = names_in(root, ())
@@ -120,7 +126,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
 
 
 def likely_suffixes(names: Names) -> Names:
-    """Return the suffixes that several files have, and `.mcap`; if there is none, all suffixes."""
+    """Return the suffixes that several files have, and `.mcap` if one file has it; or else all."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 
@@ -170,7 +176,8 @@ def read_tables(p: Proposal) -> list[Table]:
     """Return one table for each file that is looked at, if it has the most frequent columns.
 
     For text files the keys of `[text]` are set in `p` first, and files of another form move from
-    `p.names` to `p.others`. Damaged files are left out. Raises DataError if all are damaged.
+    `p.names` to `p.others`. Damaged files are left out, also those with a line that has a wrong
+    number of cells. Raises DataError if all are damaged, or if no text file is a text.
     """
     contents = contents_of(p)
     if p.description.format == "text":
@@ -193,7 +200,7 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
     is stated, if it is the only file and its arrays hold curves. Of a text or jsonl file of more
     than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is
-    damaged.
+    damaged, or if a line of a text file has a wrong number of cells.
     """
     kind = p.description.format
     if kind == "npz":
@@ -215,8 +222,8 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     At most the first 50,000 rows of each file are used; `p.is_cut` is set if a file has more.
     `p.tables` becomes the tables of the parts, and `p.names` is emptied unless each file is one
     part. If the layout or `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names`
-    stay, and a note on `channels` says why. Raises DataError if there is no table, no part, or no
-    samples.
+    stay, and a note on `channels` says why. Raises DataError if there is no table, no part, or only
+    a table of results, and the errors of `propose_roles`.
     """
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")

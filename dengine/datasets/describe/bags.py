@@ -30,7 +30,9 @@ def propose_bag(p: Proposal) -> None:
     It looks at the first 50,000 messages of the first file. `traces.samples` is set to `?` unless
     it is stated; so is `windows.trigger` unless it or `windows.listing` is stated, and
     `label.topic` unless anything of the label is stated. The notes on the last two list the topics
-    and their words. Raises DataError if no message can be read.
+    and their words. The words of a stated topic of labels are sorted into good and bad. Raises
+    DataError if the file is no bag or is damaged before its first message, or if the package that
+    reads bags is missing; a later damage only ends the reading.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()
@@ -70,7 +72,7 @@ def _fields(message: Any, path: str) -> Iterator[tuple[str, str]]:
     """Yield (TOPIC.FIELD, unit) for each number in a message, also in nested fields.
 
     The unit is N or Nm if the number stands in a field named `force` or `torque`, else "". The
-    header is left out.
+    header and numbers in arrays are left out.
     """
     for name in getattr(message, "__slots__", ()):
         value = getattr(message, name)

@@ -6,13 +6,14 @@ from contextlib import suppress
 import numpy as np
 
 from ...errors import listed
+from ...records import Floats
 from ..checks import LEAST_RATE_HZ, MOST_RATE_HZ
 from ..dataset import Fault
 from ..description import UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
-from .columns import Column, Floats, Proposal, Tables
+from .columns import Column, Proposal, Tables
 
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
@@ -101,10 +102,12 @@ def is_rising(column: Column) -> bool:
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     """Return the unit or the form of a column of times; `?` if several fit or none is proved.
 
-    A note on `time.format` in `p` says why it is `?`, or which size of numbers proves the unit. If
-    day and month can be confused, the form is `?` for a column that alone tells the time or that
-    changes within a recording. Beside a column of times, dates of one day get the first form: the
-    order of day and month does not change the steps between samples.
+    The form of dates or times of day comes first, then the unit that the file states, the one in
+    the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
+    why it is `?`, or which size proves the unit. If day and month can be confused, the form is `?`
+    for a column that alone tells the time or that changes within a recording. Beside a column of
+    times, dates of one day get the first form: the order of day and month does not change the steps
+    between samples.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -130,7 +133,8 @@ def _unit_in(name: str) -> str:
 def _unit_by_size(column: Column) -> tuple[str, str]:
     """Return the unit of time that the size and the steps of numbers prove, and a note on it.
 
-    The unit is `?` if nothing proves it; the note then lists the possible units.
+    The unit is `?` if nothing proves it; the note then lists the possible units. It is `?`, too, if
+    the column has no numbers that rise; the note then asks for the form of its cells.
     """
     rising = column.steps[column.steps > 0]
     if not len(rising):
@@ -160,7 +164,8 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then no gaps are looked for. If
     more than 10 % of the recordings plus one would be faults because of their times, `time.gap` is
     set to `?`, with a note on the first. If all recordings start after the year 2000, `order` is
-    set to `time`. Recordings whose times cannot be read are skipped.
+    set to `time`. Recordings whose times cannot be read are skipped. Raises DataError if a stated
+    format is no form or unit of times.
     """
     clocks = list[tuple[Table, Floats]]()
     starts, means = list[float](), list[float]()

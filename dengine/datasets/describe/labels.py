@@ -169,8 +169,9 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
     """Return the word of each recording that has one in a source.
 
-    If the source is the stated one, raises DataError if no recording has a word or its listing
-    cannot be read. Any other source then gives an empty mapping.
+    If a listing has several rows for a recording, it is the word of the first. For the stated
+    source, DataError is raised if no recording has a word, its listing cannot be read, or its
+    `path` is no regular expression with one group. Any other source then gives an empty mapping.
     """
     words = dict[str, str]()
     is_stated = source == p.description.label
@@ -224,11 +225,12 @@ def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
 def propose_label(p: Proposal) -> None:
     """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
-    Certain are the sources whose words all have a known meaning. If two certain sources disagree,
-    `label.column` is `?`, with a note that lists all sources; so too if none is certain, unless it
-    is the only source, which then is the label with `?` for its words. Otherwise the first certain
-    source is the label. The other certain ones that have a word for each of its recordings become
-    checks, unless checks are stated. Raises DataError if a stated source has no words.
+    A source is certain if all its words have a known meaning. If a certain source contradicts the
+    first certain one, `label.column` is `?`, with a note that lists all sources. So too if no
+    source is certain; but if there is only one source, it becomes the label, with `?` for its
+    words. Otherwise the first certain source is the label. The other certain ones that have a word
+    for each of its recordings become checks, unless checks are stated. Raises DataError if a stated
+    source has no words.
     """
     counted = count_sources(p)
     certain = [source for source, words in counted.items() if sides_of(source, words)]

@@ -26,11 +26,12 @@ MOST_PARTS = 240
 def layout_of(p: Proposal, files: Tables) -> str:
     """Return how the files hold parts, as `Description.layout` names it; `?` if it cannot be told.
 
-    It is `long` if a column may tell the parts apart, or if the stated `part.column` has several
-    words; `part.column` is then set in `p` to the only such column with a name like a part's, or to
-    `?` with a note. It is `?` for a single table without lists, numbered columns or such a column;
-    a note says what to state. Raises DataError for a table of results: one row for each part, with
-    its label, and no samples.
+    These rules come one after another. Several files with one object each are `files`. Lists or
+    numbered columns in the first table make it `wide`, or `npz`. It is `long` if a column may tell
+    the parts apart, or if the stated `part.column` has several words; `part.column` is then set in
+    `p` to the only such column with a name like a part's, or to `?` with a note. Several tables are
+    `files`. A single one gives `?`, with a note on what to state, or DataError if it is a table of
+    results: one row for each part, with its label, and no samples.
     """
     kind = p.description.format
     first = files[0]
@@ -83,8 +84,8 @@ def has_lists(table: Table) -> bool:
 def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table of results: a row for each part, with its label, but no samples.
 
-    A column shows this if all its words are known, both for good and for bad, and a word stands in
-    fewer than 8 rows between two others.
+    A column shows this if it has known words for good and for bad, maybe among others, and a word
+    stands in fewer than 8 rows between two others.
     """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
@@ -102,8 +103,8 @@ def parts_of(p: Proposal, files: Tables) -> list[Table]:
 
     The layout of a description says how files hold parts; in `long` one file holds several parts,
     one below the other. If a file was read only in part, the last of several parts of each file is
-    left out in this layout, since it may be cut. Raises DataError if the files do not split as the
-    layout says.
+    left out in this layout, since it may be cut. In `columns` a column that is named like a clock
+    is no part. Raises DataError if the files do not split as the layout says.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])

@@ -41,8 +41,9 @@ def propose_roles(p: Proposal) -> None:
 
     In this order: columns that tell which rows are samples, clock, part, label, channels. A key is
     `?` if no rule proves a value. If it is open which rows are samples, `traces.samples` is `?` and
-    no rate is set. Raises DataError if a stated column of times or channel does not exist, or a
-    stated source of labels has no words.
+    no rate is set; a clock that is open gives no rate either. Raises DataError if a stated column
+    of times or channel does not exist, a stated `time.format` is none, or a stated source of labels
+    has no words, and SettingError for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -67,7 +68,7 @@ def propose_roles(p: Proposal) -> None:
 def samples_only(p: Proposal, table: Table) -> Table:
     """Return the rows of a table that are samples, by the columns of `[rows]` with known words.
 
-    If a cell of these columns has a word without a meaning, all rows are returned.
+    If one of these columns is missing, or has a word without a meaning, all rows are returned.
     """
     rows = {name: rows for name, rows in p.description.rows.items() if UNKNOWN not in rows.keep}
     with suppress(DataError):
@@ -90,7 +91,8 @@ def qualify_rows(p: Proposal) -> None:
 
     Such a column has few words, and they change within a recording. If it has several, its `keep`
     is `?`, with a note that counts them; if it has one, that word is kept. If the user stated some
-    words of a column, its other words are added to `keep`, or to `drop` if `keep` is stated.
+    words of a column, its other words are added to `keep`, or to `drop` if `keep` is stated: by
+    `*` if they are more than 12, and not if `*` is stated.
     """
     rows = dict(p.description.rows)
     unused = p.unused
@@ -117,7 +119,8 @@ def qualifies(column: Column) -> bool:
 
     It must have at most 12 words, and each recording several rows. A column that is named like a
     status (`Status`, `valid`) may have numbers, and also just one word. Any other must have texts
-    that change within a recording. A column that holds labels with known words is none.
+    that change within a recording, and no name like a clock. A column of labels with a known word
+    is none.
     """
     name = column.name
     words = column.counts
@@ -174,7 +177,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 def _units(p: Proposal) -> dict[str, str]:
     """Return the unused columns that may be channels, with their units; "" for no unit.
 
-    Such a column has at least two different numbers, at most 10 % of its cells are no numbers, and
+    Such a column has at least two different numbers. At most 90 % of its cells are no numbers, and
     no text, except one for a lost sample, is in more than 1 % of them. Times, counters of rows and
     columns that are constant in each recording are left out.
     """
@@ -193,10 +196,12 @@ def _units(p: Proposal) -> dict[str, str]:
 
 
 def find_lost(p: Proposal) -> None:
-    """Set `text.missing` in `p` to the words that stand for lost samples in the channels.
+    """Set `text.missing` in `p` to the words that stand for lost samples (cells without a value).
 
-    If more than 10 % of the cells of a channel are empty, empty cells are not lost samples: such
-    rows belong to another signal, and `[rows]` drops them.
+    They are those already there, and the words of `LOST`, in any case of letters, that a channel
+    has; "" is an empty cell. If more than 10 % of the cells of a channel are empty, "" is not added
+    for it: these rows belong to another signal. `[rows]` then drops them, with a note, unless it
+    has words of this channel already. A stated `text.missing` stays.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
@@ -215,8 +220,8 @@ def find_lost(p: Proposal) -> None:
 def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p` to the median length of the recordings.
 
-    If some have other lengths and `traces.lengths` is `strict`, a note counts them; if these are
-    more than 10 %, `traces.lengths` becomes `pad`.
+    It is 0 without a channel. If some have other lengths and `traces.lengths` is `strict`, but not
+    stated, a note counts them; if these are more than 10 %, `traces.lengths` becomes `pad`.
     """
     words = [p.columns[name].words for name in p.description.channels if name in p.columns]
     lengths = [n for n in map(len, words[0] if words else ()) if n]

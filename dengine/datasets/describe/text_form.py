@@ -122,6 +122,9 @@ def _first_row(rows: Rows, width: int) -> int:
 def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
+    The header is the last line with at least `width` cells. But if that holds only units, and an
+    earlier line is as wide, it is the line of the units, and the earlier one is the header.
+
     rows : the cells of the lines above the samples.
     """
     heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(map(str.strip, row))]
@@ -137,8 +140,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     """Set `[text]` in `p` for the form that most files have, and set aside files of another form.
 
     Those have another delimiter, number of columns or header, and move from `p.names` to
-    `p.others`. If two or more of them have samples, `exclude` is set to `?`, with a note that asks
-    whether they are recordings. Raises DataError if no file is a text.
+    `p.others`. If two or more of them have samples, at least 8 rows, `exclude` is set to `?`, with
+    a note that asks whether they are recordings. Raises DataError if no file is a text.
 
     contents : the contents of the files that are looked at, by name.
     """

@@ -68,7 +68,8 @@ def read_bag(
 
     Other topics that the description names are columns too. If a topic is a label, each of its
     messages stands in the last row before it, other rows have None; of several messages after one
-    row, the first stands there. Any other topic has its newest message in each row.
+    row, the first stands there. Any other topic has its newest message in each row, None before the
+    first.
 
     Parameters
     ----------
@@ -78,13 +79,16 @@ def read_bag(
         The bag's name in error messages.
     description : Description
     faults : list
-        Gets a fault for each damaged file; its messages before the damage are read.
+        Gets a fault for each file that is damaged, or has a message without a field that is read;
+        its messages before that are read.
 
     Raises
     ------
     DataError
         If the channels are of several topics, if their topic has no messages, or if a trigger cuts
-        the bag and a file other than the last is damaged.
+        the bag and there is a fault before its last file.
+    SettingError
+        If the trigger is malformed.
     """
     columns = [*description.channels]
     topics = {column.partition(".")[0] for column in columns}
@@ -109,11 +113,13 @@ def _rows_of(
     events: Events,
     faults: list[Fault],
 ) -> list[Any]:
-    """Return (time, header time, values) of each message with the channels, both times in ns.
+    """Return a row (time, header time, *values) of each message with the channels, times in ns.
 
-    Messages of other topics are appended to `events`. A file that is damaged, or with a message
-    that lacks a field, adds a fault. Raises DataError if no message has the channels, or if a
-    trigger cuts the bag and a file before the last has a fault.
+    The header time is 0 without a header. `topics` holds the topic of the channels. Messages of
+    topics that are keys of `events` are appended there as (time, data); others are not read. A file
+    that is damaged, or has a message that lacks a field, adds a fault, and what came before stays.
+    Raises DataError if no message has the channels, or if a trigger cuts the bag and there is a
+    fault before its last file.
     """
     fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []

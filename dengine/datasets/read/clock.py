@@ -7,8 +7,9 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from ...errors import DataError, instead
+from ...records import Floats
 from ..description import Clock, TextForm
-from ..table import Cells, Floats, Table, UnreadableError
+from ..table import Cells, Table, UnreadableError
 
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -49,7 +50,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     ----------
     table : Table
     clock : Clock
-        The times in its columns are added up. Without columns there is one time, 0.
+        The times in its columns are added up; a column of one cell holds for all rows. Without
+        columns there is one time, 0.
     form : TextForm
         How numbers are written.
 
@@ -134,8 +136,8 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
     No step may be longer than `clock.gap` steps of the rate; if the rate is 0, than `clock.gap`
-    mean steps. With `clock.gap` 0 steps may have any length, also 0; otherwise equal times are
-    refused.
+    mean steps. With `clock.gap` 0 steps may have any length, and some may be 0; otherwise equal
+    times are refused. A single time passes.
     """
     steps = np.diff(seconds)
     rate = clock.rate_hz

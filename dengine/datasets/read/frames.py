@@ -26,9 +26,10 @@ Columns = dict[str, Cells]
 def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> Table:
     """Return the table of a JSON file, with a row for each object.
 
-    The file may hold one object, a list of objects, or (with `has_lines`) these in each line. A
-    cell may be a list; it is None if the object lacks the key. Raises UnreadableError if the text
-    is no JSON, or holds anything but objects, or nothing.
+    The file may hold one object, a list of objects, or (with `has_lines`) these in each line. Keys
+    of nested objects are joined by dots. A cell may be a list; it is None if the object lacks the
+    key. Raises UnreadableError if the file is not in its encoding, or the text is no JSON, or holds
+    anything but objects, or nothing.
     """
     text = to_utf8(content, form.encoding).decode()
     rows: list[Mapping[str, Any]] = []
@@ -68,9 +69,9 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 def columns_of(prefix: str, value: Any) -> Columns:
     """Return a value of JSON or NumPy as columns; a scalar becomes a column with one cell.
 
-    An object has a column for each key, and a list of objects too. An array (C, n), or (n, C) with
-    C < n, has a column for each channel. Raises UnreadableError if the items of a list are not all
-    alike.
+    An object has a column for each key, and a list of objects for each key of the first of them. An
+    array (C, n), or (n, C) with C < n, has a column for each channel. Raises UnreadableError if the
+    items of a list are not all alike.
 
     prefix : the name of the value; a dot and the key, or the channel from 0, are appended.
     """
@@ -88,8 +89,8 @@ def columns_of(prefix: str, value: Any) -> Columns:
 def _turned(items: Any) -> Mapping[Any, Any]:
     """Return a list of objects as a list for each key, or a list of lists as one for each channel.
 
-    The dict is empty if the first item is neither. Raises one of `DAMAGES` if the items are not all
-    like the first.
+    The dict is empty if the first item is neither. Keys that the first object lacks are left out.
+    Raises one of `DAMAGES` if an item lacks a key of the first, or is of another form or length.
     """
     first = items[0] if len(items) else None
     if isinstance(first, Mapping):

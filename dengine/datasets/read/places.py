@@ -62,9 +62,10 @@ def words_of(
 ) -> list[str]:
     """Return what a source of the label or the part number says for a recording.
 
-    A path or a line gives one word; otherwise each of `columns` gives one. Raises UnreadableError
-    if a word is missing or changes within the recording (see `LabelSource.at`), and DataError if
-    the path is no regular expression with one group.
+    A path or a line gives one word; otherwise each of `columns` gives one, "" for an empty cell.
+    Raises UnreadableError if a column, the line or a match is missing, or if a word changes within
+    the recording (see `LabelSource.at`), and DataError if the path is no regular expression with
+    one group.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -166,7 +167,8 @@ class LabelReader:
     def meaning(self, word: str, line: int = 0) -> int | None:
         """Return what a word means: 1 good, 0 bad, None not checked.
 
-        Raises UnreadableError for a word whose meaning is not stated.
+        A word that is stated as several of these has the first of these meanings. Raises
+        UnreadableError for a word whose meaning is not stated.
         """
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)

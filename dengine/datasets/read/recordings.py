@@ -15,12 +15,12 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError, instead, listed
-from ...records import FITS
+from ...records import FITS, Floats
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, lost_note, without_repeats
 from ..dataset import Dataset, Fault, make_dataset
 from ..description import ANY, Channel, Description, RowWords, TextForm
-from ..table import Cells, Floats, Recording, Table, UnreadableError
+from ..table import Cells, Recording, Table, UnreadableError
 from ..units import conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
@@ -39,6 +39,8 @@ def recording_of(
     table: Table, description: Description, labels: Sequence[LabelReader]
 ) -> Recording | None:
     """Return the recording of a part; None if the part was not checked, whatever its length is.
+
+    The times and samples of a part that was not checked must be readable, too.
 
     Parameters
     ----------
@@ -88,7 +90,7 @@ def recording_of(
 
 
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
-    """Return the rows of a table that are samples, and for each row whether its samples are lost.
+    """Return the rows of a table that are samples, and which of these are lost, (rows,) bool.
 
     Raises UnreadableError for a word whose meaning is not stated, or a column that is missing.
 
@@ -133,7 +135,8 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
     """Return the label of a part, 1 or 0; None if it was not checked.
 
-    Raises UnreadableError if a source has no label for it, or if the sources do not agree.
+    Raises UnreadableError if a source has no label for it, or if the sources do not agree, also if
+    only one of them says that it was not checked.
     """
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
@@ -165,7 +168,8 @@ def read_recordings(
     Raises
     ------
     DataError
-        If a key is still open, no file is found, a listing cannot be read, or no recording is left.
+        If the description does not pass `check_description`, no file is found, a listing of labels
+        cannot be read, or no recording is left.
     SettingError
         If `windows.trigger` is malformed.
     """
@@ -229,7 +233,8 @@ def parts_of(
     """Yield the tables of the parts in a file or a table.
 
     Each table that `split` yields is one part, or is cut into parts if `[windows]` is stated.
-    Raises UnreadableError if the file cannot be read, and DataError if it cannot be split or cut.
+    Raises UnreadableError if the file cannot be read, DataError if it cannot be split or cut, and
+    SettingError if `windows.trigger` is malformed.
     """
     table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
     for part in split(table, description):
@@ -243,7 +248,8 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     """Return the data set of recordings, in the given order.
 
     `ordered` is False if the label changes exactly once. `fit` is "strict" if the recordings were
-    resampled at the rate of their clock, since live traces then come at this rate.
+    resampled at the rate of their clock, since live traces then come at this rate. Raises DataError
+    if `make_dataset` refuses the traces.
     """
     labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])

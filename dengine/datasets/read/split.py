@@ -173,7 +173,8 @@ def _numbered(key: str, table: Table) -> list[str]:
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     """Yield each column that matches the first channel as a part.
 
-    The columns of times and of `[rows]` stay beside it; a channel cannot be one of them.
+    The columns of times and of `[rows]` stay beside it; a channel cannot be one of them. Rows below
+    the last cell of the part that is not empty are left out.
     """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}

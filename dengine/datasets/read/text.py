@@ -46,8 +46,8 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
     Raises
     ------
     UnreadableError
-        If the file is empty, has another encoding, lacks the header, or if all rows have a wrong
-        number of cells.
+        If the file has no rows of samples, has another encoding, or lacks the header, or if all
+        rows have a wrong number of cells.
     """
     content = to_utf8(content, form.encoding)
     header = _header_line(content, form.header)
@@ -130,6 +130,7 @@ def _header_line(content: bytes, header: int | str) -> int:
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: those of `text.names`, otherwise the cells of the header.
 
+    A last name `x*` becomes `x0`, `x1`, ..., as many as the first row of samples has cells left.
     Raises UnreadableError if there are neither names nor a header.
 
     top : the lines from the first to the first row of samples.

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
+from ...records import Floats
 from ..description import Clock, Description
-from ..table import Floats, Table, UnreadableError
+from ..table import Table, UnreadableError
 from ..triggers import StartFinder, as_trigger
 from .clock import column_times, times_of
 from .frames import as_cells
@@ -24,10 +25,11 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the table of each part of a long recording.
 
     A part has `damage` if it begins in a gap of the times, or if its window has no samples,
-    overlaps an earlier one, or goes beyond the recording. The column of a topic of labels has one
-    cell: the first label between the start of the part and the start of the next. Raises DataError
-    if `time.column` is not stated, if a trigger cuts and the rate is not stated, if no part is
-    found, or if the times or the listing cannot be read.
+    overlaps an earlier one, or goes beyond the recording. The column of a topic of labels has at
+    most one cell: the first label between the start of the part and the start of the next. Raises
+    DataError if `time.column` is not stated, if a trigger cuts and the rate is not stated, if no
+    part is found, or if times, signals or the listing cannot be read, and SettingError for a
+    malformed trigger.
     """
     name = table.source
     if not description.time.column:
@@ -53,7 +55,8 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
 
     The numbers count from 1. Each part has `traces.samples` rows; those of the last may go beyond
     the table, which is not noted here. It has a fault if it begins in a gap. A start within the
-    previous part is ignored. Raises DataError if the rate is not stated.
+    previous part is ignored. Raises DataError if the rate is not stated or a signal cannot be read,
+    and SettingError for a malformed trigger.
     """
     samples = description.traces.samples
     rate = description.time.rate_hz
