@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from .errors import ReportError, SettingError, StoreError, expect, instead, shortened
 
 PartNumber = str | int | None  # as a caller gives it
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 TraceArray = NDArray[np.float32]  # the samples of a trace, (channels, samples), or of n of them
 State = dict[str, NDArray[Any]]  # arrays of a version of the model, by name
 Arrays = Mapping[str, NDArray[Any]]  # the same, only read
@@ -72,7 +74,7 @@ class Reason(StrEnum):
     SATURATED = "saturated"  # the trace touches the sensor's range, `TraceSpec.limit`
     MODEL_ERROR = "model_error"  # the model raised an exception
     NOVEL = "novel"  # the trace is unlike every trace that the model learned from
-    SAFE_MODE = "safe_mode"  # all is verified: too many false accepts, or too many novel traces
+    SAFE_MODE = "safe_mode"  # a drift detector raised an alarm, and outcomes must show recovery
     NO_STORE = "no_store"  # the journal cannot be written, or the id cannot be looked up
     LATE = "late"  # the caller timed out and verifies already
     OUTSIDE = "outside"  # the trace leaves the operator's `ForceLimits`
@@ -337,7 +339,7 @@ class Cycle:
     retrain : RetrainReport or None
         Retrain that this cycle started or saw finish.
     safe_mode : str, default ""
-        Why everything is verified after this cycle; "" if it is not.
+        Why the engine is in safe mode after this cycle; "" if it is not.
     """
 
     index: int

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from .errors import DataError, SettingError, TraceError, expect, listed
 from .folds import CLAMP, QUANTUM, hash_weights
 from .limits import ForceLimits
-from .records import FITS, REASONS, ActionCode, Reason, TraceArray, TraceSpec
+from .records import FITS, REASONS, ActionCode, Ints, Reason, TraceArray, TraceSpec
 
 NOT_FINITE = REASONS.index(Reason.NOT_FINITE)
 CONSTANT = REASONS.index(Reason.CONSTANT)
@@ -100,7 +100,7 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     return np.ascontiguousarray(x)
 
 
-def as_labels(y: ArrayLike) -> NDArray[np.int64]:
+def as_labels(y: ArrayLike) -> Ints:
     """Convert labels, shape (n,), to int64: 1 for success, 0 for failure; booleans are accepted.
 
     Raises DataError if there is any other value.

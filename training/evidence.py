@@ -83,7 +83,7 @@ class DishonestRocket(RocketReducer):
 
 
 class DishonestReducer(ConvReducer):
-    """conv with members that all learn from the labels of every fold, which are then counted.
+    """conv with copies that all learn from the labels of every fold, which are then counted.
 
     For comparison only: it shows what honest counting costs.
     """
@@ -96,7 +96,7 @@ class DishonestReducer(ConvReducer):
     def fit_loop(
         self, x: torch.Tensor, y: torch.Tensor, folds: np.ndarray, stop: StopRule, steps: int
     ) -> None:
-        """Train every member on all labels, by hiding from it which fold they are in."""
+        """Train every copy on all labels, by hiding from it which fold they are in."""
         super().fit_loop(x, y, np.full_like(folds, -1), stop, steps)
 
 

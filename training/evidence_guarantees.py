@@ -11,7 +11,7 @@ rejected by the best two thresholds of a score. This is
 - for "hindsight, scores of each moment" the score that each part had when it was decided, by the
   replay of the guarantee "cost";
 - for "hindsight, final scores" that of a `conv` that was trained beforehand on all labels of the
-  set. It is cross-fitted: no part is scored by a member that saw its label.
+  set. It is cross-fitted: no part is scored by a copy that saw its label.
 
 Finished replays are kept in --keep, so that an interrupted run continues. Without --screw the set
 `screw driving` is left out.

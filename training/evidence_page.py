@@ -30,7 +30,6 @@ from matplotlib.figure import Figure
 from paper import INTERVALS, findings, paper_table
 from scipy.stats import t as student_t
 
-from dengine.errors import counted
 from dengine.experiments.baselines import BASELINES
 from dengine.experiments.figures import LIMIT, RECIPES, blank, finish, save
 from dengine.experiments.metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS
@@ -68,8 +67,12 @@ VARIANTS = {
         "then counted in its space; it shows what honest counting costs, and must not be used"
     ),
     "conv, pooled": 'with `guarantee="pooled"` and `stops="all"`',
-    "conv, pooled, 2 % audits": "as before, and 2 % of the parts are checked at random",
-    "conv, pooled, 10 % audits": "as before, and 10 % of the parts are checked at random",
+    "conv, pooled, 2 % audits": (
+        "as before, and 2 % of the parts that the model is certain of are checked all the same"
+    ),
+    "conv, pooled, 10 % audits": (
+        "as before, and 10 % of the parts that the model is certain of are checked all the same"
+    ),
 }
 
 
@@ -333,12 +336,13 @@ def introduction_lines() -> list[str]:
         "",
         "**The methods.** " + ", ".join(f"`{method}`" for method in REDUCERS) + " are reducers of "
         f"dengine. The others are published methods in the same loop: {baselines}. The published "
-        "methods have rules of their own. `knn` has no bound at all: alpha and LB do not change "
-        "its decisions.",
+        "methods have rules of their own. SGR (selection with guaranteed risk) chooses a threshold "
+        "of the predicted probability. `knn` decides if all k nearest labelled parts have the same "
+        "label. It has no bound at all: alpha and LB do not change its decisions.",
         "",
         "**The policies.** alpha is the error level of the interval around the success rate of "
-        "similar parts. LB is the success rate that its lower end must reach before a part is "
-        "accepted.",
+        "similar parts. LB is the success rate that the lower end of this interval must reach "
+        "before a part is accepted.",
         "",
         "**An entry** is a mean over the replays. Below the mean is its difference from "
         f"`{REFERENCE}` on the same parts in the same order (the same seed). In brackets is the "
@@ -455,9 +459,9 @@ def figure_lines() -> list[str]:
         "",
         "![Learning curves of each method on each set](curves.png)",
         "",
-        f"Each point is the share of the parts that were decided without a check, at {policy}, "
-        f"while the engine got its next {LABELS_PER_POINT} labels. If a curve ends further left, "
-        "the method needed fewer labels for all parts of the set.",
+        f"Each point covers the parts during which the engine got {LABELS_PER_POINT} labels, at "
+        f"{policy}. It shows the share of these parts that were decided without a check. If a "
+        "curve ends further left, the method needed fewer labels for all parts of the set.",
         "",
         f"### Net seconds beside {REFERENCE}",
         "",
@@ -513,8 +517,8 @@ def paper_lines(replays: pd.DataFrame) -> list[str]:
             lines += [f"**{reducer}, {interval} interval**", ""]
             lines += [paper_table(played, reducer, interval), ""]
     lines += [
-        "The replays check the paper's findings. In this list, a *cell* is a cell of the tables, "
-        "that is a combination of alpha and LB.",
+        "Each line names a finding of the paper, and says whether these replays confirm it. In "
+        "this list, a *cell* is a cell of the tables, that is a combination of alpha and LB.",
         "",
     ]
     return [*lines, *(f"- {line}" for line in findings(rows)), ""]
@@ -555,19 +559,23 @@ def guarantee_lines(played: pd.DataFrame) -> list[str]:
         cells = [guarantee_cell(means.loc[name]) for name in names]
         table.append([set_name, f"{group['cycles'].max():.0f}", *cells])
     commits = ", ".join(sorted(played["commit"].unique()))
+    n_shuffles = played["seed"].nunique()
+    origin = f"The numbers are means over {n_shuffles} shuffles."
+    if n_shuffles == 1:
+        origin = "The numbers come from one shuffle, so differences between them may be chance."
     return [
         "## What each guarantee saves",
         "",
         "The table shows `conv` if every bad accepted part stops the line and is known "
         '(`stops="all"`). `python training/evidence_guarantees.py` played its replays at commit '
-        f"{commits}. The numbers are means over "
-        f"{counted(played['seed'].nunique(), 'shuffle')}. An entry is: **net seconds** / certain "
-        "decisions / share of the accepted parts that were bad. The two columns on the right are "
-        "limits. They use the best two thresholds, which no engine can know, because they follow "
-        "from all labels. In the first of the two columns, the thresholds are on the scores that "
-        "the parts had when they were decided. In the second column, they are on the scores of a "
-        "model that was trained beforehand on all labels of the set. "
-        "[guarantees.csv](guarantees.csv) has a row for each replay.",
+        f"{commits}. {origin} An entry is: **net seconds** / certain decisions / share of the "
+        "accepted parts that were bad. The two columns on the right are limits that no engine can "
+        "reach. For them we chose afterwards, with all labels known, the accept threshold and the "
+        "reject threshold that save most. The first of the two columns applies the thresholds to "
+        "the score that each part had when it was decided (under `cost`). The second column "
+        "applies them to the scores of a model that was trained beforehand on the whole set, with "
+        "cross-fitting: a copy of the model that was trained without the label of a part scores "
+        "this part. [guarantees.csv](guarantees.csv) has a row for each replay.",
         "",
         *table_lines(["set", "parts", *names], table),
     ]

@@ -8,7 +8,7 @@ The score stands in for the reducer, in the same engine:
 - on `oscillation`, each trace's probability of success by Bayes' rule. The generator is known, so
   no embedding can say much more about a part;
 - on a recorded set, the probability by a `conv` that was trained beforehand on all labels of the
-  set. It is cross-fitted: no part is scored by a member that saw its label.
+  set. It is cross-fitted: no part is scored by a copy that saw its label.
 
 The table compares them with `conv` and `rocket` on the same parts in the same order, and gives the
 95 % interval of the mean difference from `rocket`.
@@ -107,7 +107,7 @@ def oscillation_posterior(traces: Traces) -> Floats:
 def trained_beforehand(data: Dataset) -> Score:
     """Cross-fit a `conv` on a whole set, and return a function that looks up scores of its traces.
 
-    The score of a trace is that of the one member that was trained without its label. The function
+    The score of a trace is that of the one copy that was trained without its label. The function
     raises KeyError for a trace that is not in the set.
     """
     traces = as_traces(data.X)

@@ -96,7 +96,7 @@ def findings(frame: pd.DataFrame) -> list[str]:
     Returns
     -------
     lines : list of str
-        "holds: ..." or "does NOT hold: ..." for each finding, recipe and interval.
+        "confirmed: ..." or "not confirmed: ..." for each finding, recipe and interval.
     """
     lines: list[str] = []
     for (recipe, interval), rows in frame.groupby(["recipe", "interval"], sort=False):
@@ -106,7 +106,7 @@ def findings(frame: pd.DataFrame) -> list[str]:
 
 def _finding(holds: bool, claim: str, measured: str) -> str:
     """Return the line of a finding: whether it holds, the claim, and what was measured."""
-    return f"{'holds' if holds else 'does NOT hold'}: {claim}: {measured}"
+    return f"{'confirmed' if holds else 'not confirmed'}: {claim}: {measured}"
 
 
 def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
@@ -126,10 +126,12 @@ def _interval_findings(recipe: str, interval: str, rows: Any) -> Iterator[str]:
     n_cells = len(means)
     if is_ours and n_cells > 1 and interval in INTERVALS and certain.any():
         answers = bool(certain.max() - certain.min() > ANSWERS * certain.mean())
-        claim = "Wilson reacts" if interval == "wilson" else "Binomial does not react"
+        claim = (
+            "Wilson interval reacts" if interval == "wilson" else "binomial interval does not react"
+        )
         measured = f"{certain.min():.1f} to {certain.max():.1f} certain decisions over the cells"
         holds = answers == (interval == "wilson")
-        yield _finding(holds, f"{claim} to alpha and LB; {condition}", measured)
+        yield _finding(holds, f"the {claim} to alpha and LB; {condition}", measured)
     shares = (means["false_positive"] / certain).fillna(0.0)
     n_kept = int((shares < 1.0 - means.index.get_level_values("lower_bound")).sum())
     most = f"at most {100 * shares.max():.1f} % of the certain decisions"

@@ -3,7 +3,7 @@
     python training/train_encoder.py --data recordings.npz --out out/encoder
 
 The traces are preprocessed as `ConvReducer` does it, a fifth of the parts is held out, and a plain
-PyTorch loop trains a single member. After each epoch the held-out parts are predicted. The weights
+PyTorch loop trains a single copy. After each epoch the held-out parts are predicted. The weights
 of the epoch with the smallest held-out log loss are kept. Writes to --out:
 
     encoder.pt   the weights, tensors only: ConvReducer(checkpoint="out/encoder/encoder.pt")
@@ -132,14 +132,14 @@ def check_classes(labels: NDArray[np.int8]) -> None:
 def train(
     members: Members, training: TensorDataset, held_out: TensorDataset, epochs: int, seed: int
 ) -> tuple[Members, list[Epoch]]:
-    """Train a single member; return the weights of the best epoch, and a row per epoch.
+    """Train a single copy; return the weights of the best epoch, and a row per epoch.
 
     Each epoch prints a line.
 
     Parameters
     ----------
     members : Members
-        A single member; its weights are changed.
+        A single copy; its weights are changed.
     training, held_out : TensorDataset
         As `split_parts` returns them.
     epochs : int
@@ -243,7 +243,8 @@ def draw_curve(curve: list[Epoch], base_rate: float, path: Path) -> None:
 
 CARD = """## encoder.pt
 
-Weights of the network of `conv`, from which the members of an engine can start.
+The weights of the network of `conv`. An engine has five copies of this network, which can start
+from these weights.
 
     {command}
 
@@ -270,9 +271,9 @@ The epoch was chosen on the same parts, so the figures are a little better than 
     DataEngine(reducer=ConvReducer(checkpoint="{checkpoint}"))
 
 **Limits.** Do not use this file to judge an engine on `{name}`, and do not import the labels of
-`{name}` into an engine that starts from it. The weights have seen these labels. Counted in an
-embedding that saw them, they make the engine more certain than it may be. Scales of the signals are
-not in the file: each engine learns them from its own traces.
+`{name}` into an engine that starts from it. The weights were trained on these labels. An engine
+that counts them is more certain than the evidence allows. The file does not contain the scales of
+the signals: each engine learns them from its own traces.
 """
 
 

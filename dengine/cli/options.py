@@ -322,7 +322,7 @@ POLICY = {
         "--lower-bound",
         type=LOWER_BOUND,
         help=(
-            "LB, a share of parts: 0.95 lets at most 5 % of the accepted parts be bad.  "
+            "LB, a share of parts: 0.95 tolerates 5 % of bad parts among the accepted parts.  "
             "[default: the recipe's]"
         ),
     ),

@@ -117,8 +117,8 @@ def run(
     parts, and a recording continues after its last part that was labelled or accepted: no part is
     learned from twice. A robot runs dengine/cells/ur/ur_cell.script, or a program with the same
     handshake; --trigger and --samples say what is recorded of it. If too many decisions are wrong,
-    or too many traces are unlike all known ones, the engine enters safe mode: every part is
-    verified until fresh evidence shows recovery. --shadow stays in force in the store, until
+    or too many traces are unlike all known ones, the engine enters safe mode: parts are
+    verified until new outcomes allow decisions again. --shadow stays in force in the store, until
     `dengine policy STORE --shadow off`. At the end a table shows what was decided, what was wrong
     and what was saved. Ctrl-C or SIGTERM ends the run after the current cycle and shows what was
     done; a second one ends it at once. If the cell fails, what was done is shown, too, and the exit
@@ -213,7 +213,7 @@ def _safe_mode_line(change: Record) -> str:
     """Return a sentence: after which cycle safe mode began, and why, or that it ended."""
     event = "safe mode ended"
     if change["reason"]:
-        event = f"safe mode, every part is verified: {change['reason']}"
+        event = f"safe mode, parts are verified until outcomes allow decisions: {change['reason']}"
     return f"After cycle {change['cycle']}: {event}."
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError, TraceError, expect, instead, listed
-from ..records import TraceSpec
+from ..records import Ints, TraceSpec
 from ..traces import as_traces
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class Dataset:
     channels: Names = ()
     source: Texts | None = None
     fit: str = "strict"
-    lengths: NDArray[np.int64] | None = None
+    lengths: Ints | None = None
     notes: Names = ()
     unlabelled: int = 0
     ordered: bool = True

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError, instead, listed, shortened
+from ..records import Floats
 from .description import TextForm
 
 Cells = NDArray[Any]
-Floats = NDArray[np.float64]
 LARGEST = 3.4028235e38  # of a sample, which is a float32
 # A minus sign that typographers use, which Excel writes in some languages.
 MINUS = "−"

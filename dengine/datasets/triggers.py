@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import SettingError, shortened
+from ..records import Floats
 
-Signals = Mapping[str, NDArray[np.float64]]  # (n,) each
+Signals = Mapping[str, Floats]  # (n,) each
 MAX_STEP = 1.5  # steps from one sample to the next if none is missing
 
 
@@ -185,7 +186,7 @@ class StartFinder:
 
 
 def place(
-    times: Sequence[float], values: NDArray[np.float64], start: float, samples: int, step: float
+    times: Sequence[float], values: Floats, start: float, samples: int, step: float
 ) -> Placed:
     """Put samples into a trace, each at the place nearest to its time.
 

@@ -311,11 +311,12 @@ class Certificate:
     def sentence(self) -> str:
         """The claim about accepted parts in English: "Of 1,203 parts ..., at most 3.5 % were bad".
 
-        It names the confidence and the tolerance. If nothing can be claimed, it says so, and why.
-        With prices it also says what the checks that were left out would have cost, what bad parts
-        cost at most, rounded up, and the difference, rounded down: what was saved at least, or lost
-        at most. These costs are missing if the bound is 1 or all parts were checked. With prices
-        the last sentence says when accepting pauses.
+        It names the confidence and the tolerance (with prices, the share of bad parts up to which
+        accepting pays). If nothing can be claimed, it says so, and why. With prices it also says
+        what the checks that were left out would have cost, what bad parts cost at most, rounded up,
+        and the difference, rounded down: what was saved at least, or lost at most. These costs are
+        missing if the bound is 1 or all parts were checked. With prices the last sentence says when
+        accepting pauses.
         """
         unknown = (
             "silence is no success: set audit_rate, or stops='all' where every bad part stops the "

@@ -12,13 +12,11 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ..records import ACTIONS
+from ..records import ACTIONS, Floats, Ints
 from .neighbours import RadiusNeighbours
 from .policy import Policy, check_radius
 from .references import RadiusIndex
 from .rule import DecisionRule
-
-Ints = NDArray[np.int64]
 
 
 # scikit-learn ships no types
@@ -105,7 +103,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         n_success, n_failure = self._decisions(Z)[:, 3:].astype(np.int64).T
         return n_success, n_failure
 
-    def predict_interval(self, Z: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def predict_interval(self, Z: ArrayLike) -> tuple[Floats, Floats]:
         """Bound the success probability of each row of Z (n, d).
 
         Returns
@@ -121,7 +119,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         positions = self._decisions(Z)[:, 0]
         return np.array([ACTIONS[int(position)] for position in positions], dtype=object)
 
-    def predict_proba(self, Z: ArrayLike) -> NDArray[np.float64]:
+    def predict_proba(self, Z: ArrayLike) -> Floats:
         """Return the observed rates of both classes within the radius.
 
         Parameters
@@ -178,7 +176,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         rule = rule or self.policy().rule()
         return RadiusNeighbours(index, rule, self.radius, scored and rule.sorts)
 
-    def _decisions(self, Z: ArrayLike) -> NDArray[np.float64]:
+    def _decisions(self, Z: ArrayLike) -> Floats:
         """Decide on each row of Z (n, d); raises NotFittedError before `fit`.
 
         Returns float64 (n, 5): `ActionCode`, lower, upper, n_success, n_failure.

@@ -55,12 +55,12 @@ class MemberRule(DecisionRule):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why every part is verified at present: a position in `SAFE_MODES`."""
+        """Return why the safe mode began: a position in `SAFE_MODES`, 0 outside of one."""
         return int(self.evidence.safe_mode.item())
 
     @torch.jit.unused
     def start_in_safe_mode(self, safe_mode: int) -> None:
-        """Verify everything from the start, as after an alarm, until outcomes show recovery.
+        """Accept and reject nothing from the start, like after an alarm, until outcomes allow it.
 
         `safe_mode` is a `SafeMode`; NONE changes nothing.
         """

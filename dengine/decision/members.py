@@ -18,10 +18,11 @@ most alpha while that claim is true. So the pooled rule opens a level while the 
 them, in units of one false accept, and opens a level while the balance is at least -`OVERDRAFT`.
 
 *Safe mode.* A mean over all members reacts late to drift. So CUSUM detectors (`certificate.cusum`)
-watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm every
-part is verified until the members since the alarm show recovery: under the pooled rule by the bet,
-under the priced rule by the account, and under the watched rule by the likelihood ratio of the
-detector's two hypotheses, the tolerance and twice the tolerance.
+watch the accepted parts, the rejected parts, and the share of novel traces. After an alarm both
+sides are closed: nothing is accepted or rejected. A side opens again when its members since the
+alarm show recovery: under the pooled rule by the bet, under the priced rule by the account, and
+under the watched rule by the likelihood ratio of the detector's two hypotheses, the tolerance and
+twice the tolerance.
 """
 
 import math
@@ -33,7 +34,7 @@ from torch import Tensor, nn
 from ..records import ActionCode
 from .certificate import OVERDRAFT, cusum
 
-SAFE_MODES = (  # why every part is verified, by `SafeMode`
+SAFE_MODES = (  # why the safe mode began, by `SafeMode`
     "",
     "accepted parts failed more often than the tolerance",
     "rejected parts were good more often than the tolerance",
@@ -61,7 +62,7 @@ class Detector(IntEnum):
 
 
 class SafeMode(IntEnum):
-    """The detector whose alarm has every part verified; NONE outside of a safe mode.
+    """The detector whose alarm began the safe mode; NONE outside of a safe mode.
 
     An alarm during a safe mode keeps the smaller of the two values. Exported files give the value.
     """
@@ -287,7 +288,7 @@ class MemberEvidence(nn.Module):
         `inclusion_probability`, with which this outcome would be asked for, says how it counts: 1
         as checked, above 0 as audited, and at 0 only the drift detectors see it. A wrong outcome
         may raise an alarm, which starts the safe mode: both sides (accepting, rejecting) are
-        closed, so every part is verified until one has a threshold again that is not `CLOSED`.
+        closed, so parts are verified until a side has a threshold again that is not `CLOSED`.
 
         A safe mode ends only here. After an alarm of a side it ends when that side has such a
         threshold; the other side may have one earlier, and then decides again. After too many novel
@@ -377,7 +378,7 @@ class MemberEvidence(nn.Module):
         return total
 
     def raise_alarm(self, detector: int) -> None:
-        """Start the safe mode (every part is verified) for a detector, or start it anew during one.
+        """Start the safe mode (both sides are closed) for a detector, or start it anew during one.
 
         An alarm during a safe mode keeps the reason that stands first in `SafeMode`: a side that
         has not shown its tolerance yet stays the reason when novel traces come on top.

@@ -312,10 +312,14 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
 def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
     """Return (offset, gain), float64 (P,) each, so that offset + gain * features is standardised.
 
-    A glitch among the references must not be the measure of the others, so mean and deviation are
-    computed after the outermost values of each feature (n, P) are drawn in. A floor is added to the
-    deviation, so the gain is finite. It is so small that a feature which never moved is far away
-    once it moves, but larger than the rounding errors of that feature.
+    `features` are float64 (n, P), n at least 3. The 1 + n // TAIL_TRACES smallest and largest
+    values of each feature are first clipped to the next value inside, so that a glitch in one
+    reference does not set the scale of the others. Mean and deviation are those of the clipped
+    values.
+
+    The gain is 1 / (deviation + floor), so it is finite. The floor is 1 % of the median deviation
+    of all features, plus 1e-5 of the feature's absolute mean, which covers its rounding errors. So
+    a feature that is constant in the references lies far out as soon as it moves.
     """
     n = len(features)
     n_outer = 1 + n // TAIL_TRACES
@@ -353,7 +357,7 @@ def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tens
     distance is the `QUANTILE` of the squared distances to the nearest other point. It is capped at
     six times their 0.9 quantile, so that a few outliers are not the measure of the others, and is
     at least 0.001. Outliers are the points whose nearest point is farther than that, or farther
-    than three times the 0.9 quantile.
+    than both 0.001 and three times the 0.9 quantile.
 
     The reach of a point is the usual distance. But if more than three points are outliers, some of
     them may be a cluster, a kind of its own: an outlier reaches to its third nearest outlier if all

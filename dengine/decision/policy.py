@@ -50,15 +50,16 @@ class Policy:
     interval : str, default "wilson"
         A name in `INTERVALS`.
     audit_rate : float, optional
-        Share of certain decisions that are verified all the same, from 0 to 1. A guarantee on
-        rejects needs it, and so do "pooled" and "cost" if not all line stops are known. None: 0,
-        or 0.05 if `prices` are given without a guarantee.
+        Share of certain decisions that are verified all the same, from 0 to 1. "pooled" and "cost"
+        need it if not all line stops are known; "pooled" then covers rejected parts as well. None:
+        0, or 0.05 if `prices` are given without a guarantee.
     guarantee : str, optional
         The rule that turns a bound into an action: a name in `RULES`, or `module:Class` of a
         subclass of `DecisionRule`. "local", the paper's rule, is about the neighbourhood of one
-        trace. "pooled" is about all parts together. "cost" is about what all parts cost by
-        `prices`; then `lower_bound` does not influence decisions, and `alpha` influences only the
-        safe mode. None: "local", or "cost" if `prices` are given.
+        trace. "pooled" is about all members together. "cost" is about what all members cost by
+        `prices`, as far as their outcomes are known; then `lower_bound` does not influence
+        decisions, and `alpha` influences only the safe mode. None: "local", or "cost" if `prices`
+        are given.
     stops : {"some", "all"}, default "some"
         "all": every bad accepted part stops the line and is reported before the next decision. If
         nothing is reported until then, the part is confirmed. "some": a missing report says
@@ -258,7 +259,8 @@ class Policy:
         Raises
         ------
         SettingError
-            If the class cannot be imported, is no `DecisionRule`, or takes other arguments.
+            If the class cannot be imported, is no `DecisionRule`, or its constructor raises
+            TypeError, since it takes other arguments. What else the constructor raises passes.
         """
         from . import member_rules  # torch is imported where it is used
         from .rule import DecisionRule
@@ -320,7 +322,7 @@ class Policy:
     def action(self, lower: float, upper: float) -> Action:
         """Return the action that one bound allows by the paper's rule, whatever the guarantee is.
 
-        ACCEPT if lower >= LB, REJECT if upper <= 1 - LB, otherwise VERIFY.
+        ACCEPT if lower >= LB, otherwise REJECT if upper <= 1 - LB, otherwise VERIFY, also for NaN.
         """
         from .rule import action_of
 

@@ -232,10 +232,10 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def set_part(self, slot: int, part: int) -> None:
-        """Replace the part of a slot by the hash `part`; 0 is an unknown part.
+        """Replace the part of the point in a slot by the hash `part`; 0 is an unknown part.
 
-        `first` and `repeats` are updated for the part that leaves and the part that comes,
-        `part_filter` only for the part that comes.
+        `first` (the first slot of each point's part) and `repeats` are updated for the points of
+        the old and of the new part. The new part is added to `part_filter`; the old one stays.
         """
         leaving = int(self.parts[slot].item())
         if leaving != 0 and int(self.repeats.item()) > 0:
@@ -261,7 +261,7 @@ class RadiusIndex(nn.Module):
         ----------
         z : Tensor of float32, shape (K, d)
             One query, embedded in every space: by K encoders, each of which never saw the labels of
-            the points in its space.
+            the points in its space. A single row is compared with all points, whatever their space.
         part : int, default 0
             Hash of the query's part, whose own points are infinitely far; 0 excludes none.
 
@@ -344,6 +344,8 @@ class RadiusIndex(nn.Module):
         numbers: ArrayLike | None = None,
     ) -> None:
         """Add many points, the first row as the oldest; in a full index they replace the oldest.
+
+        `agreement` is not computed anew, see `estimate_agreement`.
 
         Parameters
         ----------

@@ -143,12 +143,12 @@ class DecisionRule(nn.Module):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why every part is verified at present, as a position in `SAFE_MODES`."""
+        """Return why the safe mode began: a position in `SAFE_MODES`, 0 outside of one."""
         return 0
 
     @torch.jit.unused
     def start_in_safe_mode(self, safe_mode: int) -> None:
-        """Verify everything from the start, as after an alarm; rules without a safe mode ignore it.
+        """Start in a safe mode, like after an alarm; rules without a safe mode ignore it.
 
         `safe_mode` is a `SafeMode`; NONE changes nothing.
         """

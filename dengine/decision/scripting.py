@@ -39,8 +39,10 @@ def script(module: nn.Module) -> Any:
 
     Raises
     ------
-    RuntimeError
-        If TorchScript cannot compile it.
+    RuntimeError, torch.jit.frontend.FrontendError
+        If TorchScript cannot compile it, because of its types or of its syntax.
+    OSError
+        If its source text cannot be found.
     """
     with _SCRIPTING, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=r".*torch\.jit\..* is deprecated.*")
@@ -80,9 +82,9 @@ def register_tensors(module: nn.Module) -> None:
     """Make the plain tensors of a module part of its `state_dict`, as persistent buffers.
 
     These are attributes that hold a tensor, and buffers that are not persistent, also of its
-    submodules. A tensor that is an expanded view, so that several of its numbers share memory, is
-    copied, since it cannot be written to. Tensors in a list, tuple or dict stay as they are, and so
-    does a tensor whose name is an attribute of the module's class.
+    submodules. A tensor that is not contiguous is copied, since an expanded view, in which several
+    numbers share memory, cannot be written to. Tensors in a list, tuple or dict stay as they are,
+    and so does a tensor whose name is an attribute of the module's class.
     """
     for submodule in module.modules():
         for name, value in attributes_of(submodule).items():

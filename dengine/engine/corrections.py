@@ -98,8 +98,8 @@ class Corrections:
         References, the next retrain, the rule and the certificate take the label as corrected; the
         fold of its trace stays. A baseline, which cannot take a label back, is retrained before
         this returns. The label as it was reported stays in the store. A training under way in the
-        executor is discarded, and begins again. If a safe mode, in which every part is verified,
-        begins or ends by this, `on_safe_mode` is called.
+        executor is discarded, and begins again. If a safe mode begins or ends by this,
+        `on_safe_mode` is called.
 
         Parameters
         ----------
@@ -287,12 +287,12 @@ class Corrections:
         somebody chooses the best of the certificates of m policies, the error probability of that
         certificate is up to m alpha.
 
-        A safe mode, in which every part is verified after an alarm, goes on until fresh evidence
-        ends it. If the new rule has no safe mode, the safe mode ends now, and `on_safe_mode` is
-        called. An accepted part whose outcome was not reported before the change stays unreported.
-        With `Policy(shadow=True)` each part that the model is certain of is an audit:
-        `Decision.predicted` says what the model would have done, and all outcomes are learned from
-        as always. The shadow mode stays on when the engine is opened again.
+        A safe mode goes on until new outcomes end it. If the new rule has no safe mode, the safe
+        mode ends now, and `on_safe_mode` is called. An accepted part whose outcome was not reported
+        before the change stays unreported. With `Policy(shadow=True)` each part that the model is
+        certain of is an audit: `Decision.predicted` says what the model would have done, and all
+        outcomes are learned from as always. The shadow mode stays on when the engine is opened
+        again.
 
         Parameters
         ----------

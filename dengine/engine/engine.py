@@ -846,7 +846,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     @property
     def safe_mode(self) -> str:
-        """Why the engine is in safe mode, in which it verifies every part; "" if it is not."""
+        """Why the engine is in safe mode; "" if it is not.
+
+        In safe mode it verifies parts until new outcomes allow accepting, or rejecting, again.
+        """
         return self._live.newest.safe_mode
 
     def find(self, decision_id: str) -> StoredDecision | None:

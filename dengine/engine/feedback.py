@@ -300,10 +300,9 @@ class Feedback:
         """Record an event, then call `on_safe_mode`, if a safe mode began or ended since the last
         call.
 
-        In a safe mode every part is verified after an alarm of the rule. `reason_ended` is recorded
-        if one ended. If recording the event or the user's function fails, that is logged and not
-        tried again; callers do this only after labels are stored, so that such a failure costs no
-        label.
+        A safe mode begins after an alarm of the rule. `reason_ended` is recorded if one ended. If
+        recording the event or the user's function fails, that is logged and not tried again;
+        callers do this only after labels are stored, so that such a failure costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

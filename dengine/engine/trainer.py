@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..decision.scripting import reason_of
 from ..errors import DengineError, SettingError, log
 from ..model.base import EngineModel
-from ..records import TRAINED, TraceArray
+from ..records import TRAINED, Ints, TraceArray
 from ..reducers.base import StopRule
 from ..store.records import LabelledTraces
 
@@ -148,7 +148,7 @@ class TrainedOn:
         retrain replaces; 0: the version is not pinned.
     """
 
-    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     corrected_to: int = 0
     counts_from: int = 0
     pinned: int = 0
@@ -238,7 +238,7 @@ class Trained:
     seconds: float = 0.0
     last_seconds: float = 0.0
     begin: float = 0.0
-    seq: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seq: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
 @runtime_checkable

@@ -22,11 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import Policy
 from ..errors import SettingError, expect
-from ..records import ACTIONS, is_number, is_whole
+from ..records import ACTIONS, Floats, Ints, is_number, is_whole
 from ..traces import as_traces
 
-Floats = NDArray[np.float64]
-Counts = NDArray[np.int64]
+Counts = Ints
 Labels = NDArray[np.bool_]
 Traces = NDArray[np.float32]
 
@@ -87,8 +86,8 @@ class Baseline(ABC):
     seed: int = 0
     thresholds: tuple[float, float] | None = field(default=None, init=False)
     is_trained: bool = field(default=False, init=False)
-    # The engine asks three times about the same trace: its bytes, and the prediction.
-    _last: tuple[bytes, BaselinePrediction] | None = field(default=None, init=False)
+    # The engine asks three times about the same trace: its shape and bytes, and the prediction.
+    _last: tuple[Any, BaselinePrediction] | None = field(default=None, init=False)
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Train from scratch and return self.
@@ -162,11 +161,13 @@ class Baseline(ABC):
         labels returns the integer 0, and no array, for both counts; so does an untrained one.
         """
         traces = as_traces(X)
-        key = traces.tobytes()
+        key = traces.shape, traces.tobytes()
         if self._last is None or self._last[0] != key:
-            prediction = BaselinePrediction(np.zeros(len(traces)), np.ones(len(traces)))
-            if self.is_trained:
-                prediction = self._predict(traces)
+            prediction = (
+                self._predict(traces)
+                if self.is_trained
+                else BaselinePrediction(np.zeros(len(traces)), np.ones(len(traces)))
+            )
             self._last = (key, prediction)
         return self._last[1]
 

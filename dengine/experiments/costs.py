@@ -37,9 +37,10 @@ from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import AUDIT_RATE, RULES, Policy
 from ..errors import SettingError, amount, expect, percent
 from ..files import FilePath
+from ..records import Floats
 from .grid import Task, play_tasks
 from .metrics import Costs, ErrorRate, pooled_error
-from .replay import Contender, Floats, Replay, replay_policy
+from .replay import Contender, Replay, replay_policy
 
 if TYPE_CHECKING:
     import pandas as pd

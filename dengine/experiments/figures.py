@@ -23,10 +23,10 @@ from ..datasets import Dataset
 from ..errors import OutputError, amount, counted, instead
 from ..files import write_output
 from ..history.explain import Explanation
-from ..records import Action, TraceSpec
+from ..records import Action, Floats, TraceSpec
 from ..reducers import has_own_unit
 from .costs import CostCurve, policy_name
-from .replay import Floats, Replay
+from .replay import Replay
 from .survey import channel_means
 
 if TYPE_CHECKING:

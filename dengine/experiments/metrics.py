@@ -10,12 +10,11 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..decision.intervals import wilson_interval
 from ..decision.policy import PRICES
 from ..errors import expect
-from ..records import is_number
+from ..records import Floats, is_number
 
 # What was decided -> the field of `Replay` that marks the wrong ones among them.
 SIDES = {"accepted": "false_positive", "rejected": "false_negative"}
@@ -102,7 +101,7 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
     return ErrorRate(n_decided, n_wrong, n_traces, rate, float(lower), float(upper))
 
 
-def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> NDArray[np.float64]:
+def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> Floats:
     """Return for each trace in how many cycles of all replays a field was True, shape (size,).
 
     `name` is a field of `Replay` with a bool for each cycle; `index` of the replay says which trace

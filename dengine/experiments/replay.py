@@ -27,7 +27,18 @@ from ..decision.policy import Policy
 from ..engine.engine import DataEngine
 from ..errors import SettingError, expect
 from ..recipe import RECIPES, Recipe
-from ..records import ACTIONS, Action, Cycle, Decision, Outcome, Reason, RetrainReport, TraceSpec
+from ..records import (
+    ACTIONS,
+    Action,
+    Cycle,
+    Decision,
+    Floats,
+    Ints,
+    Outcome,
+    Reason,
+    RetrainReport,
+    TraceSpec,
+)
 from ..reducers import has_own_unit
 from ..reducers.base import Reducer
 from .baselines import BASELINES, make_baseline
@@ -36,7 +47,6 @@ from .metrics import VERIFY_SECONDS, Costs
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Row = dict[str, Any]  # of a table, by column
 # Fields of a decision that a replay keeps -> their type in its arrays.
@@ -180,19 +190,19 @@ class Replay:
     truth: NDArray[Any]
     lower: Floats
     upper: Floats
-    n_success: NDArray[np.int64]
-    n_failure: NDArray[np.int64]
+    n_success: Ints
+    n_failure: Ints
     position: Floats
     decide_seconds: Floats
     stopped: Bools
     reason: NDArray[np.str_]
-    version: NDArray[np.int64]
+    version: Ints
     safe_mode: Bools
     clock_s: Floats | None = None
     retrains: tuple[RetrainReport, ...] = ()
     recipe: Recipe = field(default_factory=Recipe)
     name: str = ""
-    index: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    index: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     dataset: str = ""
     seed: int = 0
     confirm: bool = False

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, trace_hash
 from ..model.neighbours import NEWEST, near_repeats
-from ..records import TraceArray
+from ..records import Floats, TraceArray
 from ..traces import LARGEST, as_traces
 
 
@@ -167,7 +167,7 @@ def survey_dataset(data: Dataset) -> Survey:
     )
 
 
-def channel_means(X: TraceArray) -> NDArray[np.float64]:
+def channel_means(X: TraceArray) -> Floats:
     """Return each channel's mean over the trace, (n, C), of traces (n, C, T)."""
     return np.asarray(X.mean(axis=2, dtype=np.float64))
 
@@ -189,7 +189,7 @@ def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Dr
     return tuple(_drift(*pair) for pair in zip(("good", *data.spec.names), quantities, strict=True))
 
 
-def _drift(name: str, values: NDArray[np.float64]) -> Drift:
+def _drift(name: str, values: Floats) -> Drift:
     """Return the drift of values (n,) in recorded order, leaving out those that are NaN.
 
     The correlation and its p-value are NaN if there are fewer than three values, or all are equal.

@@ -160,7 +160,7 @@ def prepare_export(
     try:
         decider = model.build_decider(conditions)
         defect = next(filter(None, compare_points(decider, examples, points)), "")
-    except (RuntimeError, torch.jit.Error) as error:
+    except (RuntimeError, torch.jit.Error, torch.jit.frontend.FrontendError) as error:
         defect = f"it does not run as TorchScript, {reason_of(error)}"
     if defect:
         raise ExportError(f"{model.name} cannot be exported: {defect}.")

@@ -277,7 +277,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def safe_mode(self) -> int:
-        """Return why every part is verified at present, as a `SafeMode`."""
+        """Return why the safe mode began, as a `SafeMode`; NONE outside of a safe mode."""
         safe_mode: int = self.decider.predictor.neighbours.rule.safe_mode()
         return safe_mode
 

@@ -274,7 +274,7 @@ class ExportedModel:
 
     @property
     def safe_mode(self) -> str:
-        """Why every part is verified at present, in words; "" if it is not."""
+        """Why the safe mode began, in words; "" outside of a safe mode."""
         return SAFE_MODES[self.module.safe_mode()]
 
     def save(self, path: FilePath, *, key: FilePath | None = None, force: bool = False) -> Path:

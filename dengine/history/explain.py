@@ -20,12 +20,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
-from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
+from ..records import Action, Floats, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
 from ..store.records import POLICY_KINDS, SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from .envelope import Envelope, envelope_of
@@ -253,9 +252,7 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     return next(began, "")
 
 
-def _measure_distances(
-    item: StoredDecision, version: PastVersion | None
-) -> NDArray[np.float64] | None:
+def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Floats | None:
     """Return the distances from a decision's embedding to the references of a version, shape (n,).
 
     Each is measured in the embedding space of the reference, and they are in the order of the
@@ -267,14 +264,14 @@ def _measure_distances(
         return None
     query = torch.tensor(embedding, dtype=torch.float32)
     squared = version.index.squared_distances(query, item.content_hash)
-    distances: NDArray[np.float64] = np.sqrt(squared.double().numpy())
+    distances: Floats = np.sqrt(squared.double().numpy())
     return distances
 
 
 def _find_neighbours(
     store: SqlStore,
     version: PastVersion | None,
-    distances: NDArray[np.float64] | None,
+    distances: Floats | None,
     radius: float,
     n: int,
 ) -> Iterator[Neighbour]:

@@ -67,7 +67,7 @@ class Circumstances:
     novelty : Novelty or None
         As in `Explanation`.
     safe_mode : str
-        Why everything was verified; "" outside safe mode.
+        Why the safe mode had begun; "" outside safe mode.
     """
 
     recipe: Recipe
@@ -196,7 +196,7 @@ WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
         "The labels of its neighbours do not count then."
     ),
     Reason.SAFE_MODE: lambda decision, trace, circumstances: (
-        " in safe mode, in which every part is verified: "
+        " in safe mode, which began after an alarm: "
         f"{circumstances.safe_mode or 'its reason is not kept'}."
     ),
     Reason.NO_STORE: lambda *_: (

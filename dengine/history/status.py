@@ -162,9 +162,9 @@ class Watch:
     Attributes
     ----------
     recovery : str
-        In safe mode a text: how many parts since the alarm are evidence, and after about how many
-        more parts safe mode ends, if everything goes on as it has since the alarm. "" outside safe
-        mode. If novel traces began the safe mode, the evidence is that for accepting.
+        In safe mode a text: how many parts since the alarm count as evidence, and after about how
+        many more parts safe mode ends, if everything goes on as it has since the alarm. "" outside
+        safe mode. If novel traces began the safe mode, the evidence is that for accepting.
     accepts, rejects, novelty : float
         From 0 to 1; at 1 the alarm begins safe mode. All are 0 in a safe mode that novel traces
         began.
@@ -199,7 +199,7 @@ class Status:
         Number of the version that a rollback put in force, while no automatic retrain replaces it;
         0: none is pinned.
     safe_mode : str
-        Why everything is verified; "" outside safe mode.
+        Why the safe mode began; "" outside safe mode.
     safe_mode_time : float or None
         When safe mode last began or ended; None: never.
     new_labels : int
@@ -590,12 +590,15 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
         # With the part that raised the alarm.
         n_parts = 1 + len(store.decisions.select(HistoryFilter(since=mode.time), MAX_SINCE_ALARM))
         n_more = evidence.members_to_recovery(side) * n_parts / (n + 1)
-        end = f"like this it ends after about {n_more:.0f} more"
+        end = f"if this goes on, safe mode ends after about {n_more:.0f} more parts"
         if n_more <= 0.0:
-            end = "enough, it ends when few of the newest are wrong or novel"
+            end = "this is enough: safe mode ends when few of the newest are wrong or novel"
         elif n_more > MAX_SINCE_ALARM:
-            end = "like this it does not end"
-        recovery = f"{n} of {n_parts} parts since the alarm are evidence, {n_wrong} wrong: {end}"
+            end = "if this goes on, safe mode does not end"
+        recovery = (
+            f"{n} of {n_parts} parts since the alarm count as evidence, "
+            f"{n_wrong} of them wrong; {end}"
+        )
     sums = zip(evidence.detector_sums.tolist(), evidence.alarm_limits, strict=True)
     return Watch(recovery, *(max(0.0, total / limit) * (safe_mode != 3) for total, limit in sums))
 

@@ -195,9 +195,9 @@ class EngineModel(ABC):
     def decider(self, conditions: DecisionConditions | None) -> Decider:
         """Return the decider for these conditions, and keep it for the next call.
 
-        It is built anew if none is kept, or if the kept one is for other conditions. None stands
-        for no force limits, a sensor without a known range, and no audits. Raises ValueError if
-        nothing was fitted.
+        It is built anew if none is kept, or if the kept one is for other conditions; this raises
+        what `build_decider` raises. None, which only a `ModelPrediction` takes, stands for no force
+        limits, a sensor without a known range, and no audits.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
@@ -302,7 +302,8 @@ class EngineModel(ABC):
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
         """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
 
-        In a safe mode every part is verified; NONE is no safe mode. The default does nothing.
+        In a safe mode parts are verified until new outcomes allow decisions again; NONE is no safe
+        mode. The default does nothing.
         """
 
     @abstractmethod
@@ -318,7 +319,7 @@ class EngineModel(ABC):
 
     @property
     def safe_mode(self) -> str:
-        """Why every part is verified at present; "" outside a safe mode."""
+        """Why the safe mode began; "" outside a safe mode."""
         return ""
 
     def defect(self) -> str:
@@ -442,7 +443,7 @@ class BaselineAdapter(EngineModel):
         The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding. `hash_` has no
         effect, because a baseline knows nothing of parts. Raises ValueError for an unknown action
         and for counts that are not whole numbers from 0 to 2**63 - 1 (OverflowError for an infinite
-        count). Bounds are not checked.
+        count). What the baseline raises passes, and bounds are not checked.
         """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)
@@ -460,8 +461,8 @@ class BaselineAdapter(EngineModel):
     def add_reference(self, x: Floats, y: int, *_: object, **__: object) -> Floats:
         """Pass the labelled trace to the baseline's `add`, which changes the baseline in place.
 
-        Returns the trace itself, in place of a reference point. Number, hash, embedding and point
-        have no effect.
+        Extreme samples are not clipped here. Returns the trace itself, in place of a reference
+        point. Number, hash, embedding and point have no effect.
         """
         self.model.add(x, y)
         return x

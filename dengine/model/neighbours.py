@@ -169,7 +169,7 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     milliseconds. The new template decides three times on a ramp of `warm_up_shape` (C, T), so that
     later calls are fast. The process keeps it, and drops the oldest if there were `KINDS` before.
     All deciders of a structure have the same template, so do not change it: `compiled` copies it.
-    Raises RuntimeError if TorchScript cannot compile the decider.
+    Raises what `script` raises if TorchScript cannot compile the decider.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -228,7 +228,7 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 
     It is a copy of the template that the process keeps for all deciders of this structure. If the
     process has no such template, `template_of` compiles it, and calls it on a trace of
-    `warm_up_shape` (C, T). Raises RuntimeError if TorchScript cannot compile it.
+    `warm_up_shape` (C, T). Raises what `script` raises if TorchScript cannot compile it.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
     submodules = dict(module.named_modules(remove_duplicate=False))
@@ -450,7 +450,8 @@ class ModelPrediction(EngineModel):
         rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds;
         `numbers` (n,), of the labels, are kept with the references; `stop` may end the reducer's
         training early. Extreme samples are clipped first. Raises SettingError if the reducer cannot
-        be trained on these traces, and if 20 traces or more are all of one part.
+        be trained on these traces, and if 20 traces or more are all of one part. If the reducer
+        raises, it may be changed already; all else is not.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -522,7 +523,7 @@ class ModelPrediction(EngineModel):
         afterwards. The decider is built for the `DecisionConditions` under which the previous model
         decided, or, if that never decided, for those of this model. A decider that this model has
         already, with the same rule and for the same conditions, is kept. Nothing happens if the
-        previous model is no `ModelPrediction`. Raises ValueError if nothing was fitted.
+        previous model is no `ModelPrediction`. Raises what `build_decider` raises.
         """
         if not isinstance(previous, ModelPrediction):
             return
@@ -553,10 +554,10 @@ class ModelPrediction(EngineModel):
 
         Raises
         ------
-        ValueError
+        ValueError, AttributeError
             If nothing was fitted.
-        RuntimeError
-            If TorchScript cannot compile the reducer's module.
+        RuntimeError, FrontendError, OSError
+            If TorchScript cannot compile the reducer's module, see `script`.
         """
         conditions = conditions or DecisionConditions(self.trace_spec)
         encoder = self.spaces.module()
@@ -721,8 +722,8 @@ class ModelPrediction(EngineModel):
         References of the part with this hash are not counted. 0 stands for an unknown part: then
         references with the same content hash as the trace are not counted. Returns a `Verdict`, the
         tuple that `Decider.forward` returns, with the scaled embedding (K, d), a point in each of
-        the K spaces. Raises ValueError if nothing was fitted, and RuntimeError if the rule is
-        stale, because an update of it failed; but a trace with a fault is verified all the same.
+        the K spaces. Raises what `build_decider` raises, and RuntimeError if the rule is stale,
+        because an update of it failed; but a trace with a fault is verified all the same.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -844,7 +845,8 @@ class ModelPrediction(EngineModel):
         The decider is dropped. If the rule was stale, the state does not hold it, and this model's
         rule stays as it is; `rule_is_stale` always stays as it is. Raises StoreError if the state
         holds no reducer although this fitted reducer gives a state, and for a rule or gate of other
-        sizes; KeyError or ValueError for the state of another reducer.
+        sizes. For the state of another reducer it raises StoreError, KeyError, ValueError or
+        NotImplementedError. After an error do not use the model.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))

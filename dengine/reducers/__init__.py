@@ -84,8 +84,9 @@ def make_reducer(name: str, **params: Any) -> Any:
     name : str
         A name in `REDUCERS`, or `module:Class`.
     **params
-        Parameters of its class. For names in `REDUCERS` their types are checked here, and that
-        integers have at most 32 bits; `fit` checks narrower ranges.
+        Parameters of its class. For a name in `REDUCERS` the type of each value must fit the
+        parameter's default, so `random_state` must be an integer, and integers must fit into 32
+        bits; `fit` checks narrower ranges.
 
     Returns
     -------
@@ -94,7 +95,9 @@ def make_reducer(name: str, **params: Any) -> Any:
     Raises
     ------
     SettingError
-        If the name or a parameter is unknown, or a value does not pass the check.
+        If there is no such name, module or class, or it is no scikit-learn transformer; if a
+        parameter is unknown, or a value does not pass the check. What the constructor of
+        `module:Class` raises passes.
     """
     cls = reducer_class(name)
     allowed = signature(cls).parameters
@@ -142,6 +145,11 @@ def class_default(reducer: Any, name: str) -> Any:
     object
         The value of `Reducer` if the class has no such attribute, because it is another
         scikit-learn transformer.
+
+    Raises
+    ------
+    SettingError
+        For a name, as `reducer_class` does.
     """
     cls = reducer_class(reducer) if isinstance(reducer, str) else reducer
     return getattr(cls, name, getattr(__getattr__("Reducer"), name))

@@ -195,8 +195,9 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     ) -> Floats:
         """Train for an engine, and return the embedding of the traces as references.
 
-        The default fits anew, and neither `stop` nor `numbers` has an effect. A subclass may go on
-        from its last training instead.
+        The default calls `fit`, which starts anew. `stop` and `numbers` have no effect then, and
+        `folds` only says in which space each returned point lies: a subclass with several spaces
+        must give it to its fit. A subclass may also go on from its last training.
 
         Parameters
         ----------
@@ -307,19 +308,22 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         Returns
         -------
         array of float32, shape (n, C, T)
-            Writeable; the memory of X itself if X has this shape and type already.
+            Writeable; the memory of X itself if X is a writeable, contiguous float32 array.
 
         Raises
         ------
         NotFittedError
             Without `reset`, before a fit.
         ValueError
-            If a value is not finite or not a number. If X is a single trace (T,), or a table or
-            array (n, T) with other columns than in `fit`. With `reset`, if there is no trace.
+            If a value is not a number, or not finite in float32. If X is a single trace (T,), a
+            table without columns, or a table or array (n, T) with other columns than in `fit`. With
+            `reset`, if there is no trace.
+        TypeError
+            If X is sparse.
         TraceError
-            If X has another number of dimensions, or no samples. If X (n, C, T) has another shape
-            than in `fit`. With `reset`, if all samples are below 1e-12 but not all are 0, because
-            float32 hardly holds their squares.
+            If X has more than three dimensions, or (n, C, T) no channels or no samples. If X has
+            another number of channels or samples than in `fit`. With `reset`, if all samples are
+            below 1e-12 but not all are 0, because float32 hardly holds their squares.
         """
         if not reset:
             check_is_fitted(self)
@@ -484,7 +488,7 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     if folds is None:
         return content_fold(traces, n_folds)
     given = np.asarray(folds, dtype=np.int64)
-    within = given.shape == (len(traces),) and given.min() >= 0 and given.max() < n_folds
+    within = given.shape == (len(traces),) and set(range(n_folds)).issuperset(given)
     expect(within, f"{len(traces)} folds from 0 to {n_folds - 1}", given)
     return given
 
@@ -493,8 +497,8 @@ def check_classes(labels: Ints, masks: NDArray[np.bool_]) -> None:
     """Raise SettingError unless, for each fold, the labels (n,) outside it have both classes.
 
     Row k of `masks`, bool (K, n), tells which labels are outside fold k. The message asks for more
-    labels. If no label is outside a fold, all traces are the same and so in one fold: the message
-    then asks to check the sensor and the unit of measurement.
+    labels. If no label is outside a fold, it says instead that all traces are the same, which puts
+    them into one fold, and asks to check the sensor and the unit of measurement.
     """
     for fold, outside in enumerate(masks):
         n_classes = len(np.unique(labels[outside]))
@@ -542,9 +546,10 @@ def as_reducer(transformer: Any, folds: int) -> Reducer:
     """Return a transformer as a `Reducer`.
 
     A `Reducer` that has several spaces, or uses no labels, is returned as it is. Another
-    transformer that uses labels is wrapped in `CrossFitted`, which fits `folds` clones. One that
-    uses no labels is wrapped in `LabelFree` and never gets any, so its single space has seen no
-    label. Nothing is fitted here.
+    transformer whose tag says that it needs labels (`uses_labels`) is wrapped in `CrossFitted`,
+    which fits `folds` clones. A transformer without that tag is wrapped in `LabelFree` and never
+    gets labels, so its single space has seen none. Nothing is fitted here. Raises AttributeError
+    for a transformer without scikit-learn's tags, which `BaseEstimator` has.
     """
     if isinstance(transformer, Reducer) and (
         transformer.n_spaces > 1 or not transformer.uses_labels
@@ -591,6 +596,7 @@ class LabelFree(_Wrapping):
         """Fit a clone of the transformer, `reducer_`, on traces X; labels are ignored.
 
         X has the shape (n, T) or (n, C, T). Returns self. `dim_` becomes the number of coordinates.
+        Raises what `check_traces` and the transformer raise.
         """
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.as_input(traces))
@@ -645,7 +651,7 @@ class CrossFitted(_Wrapping):
             If K is below 2, the labels are missing or not of two classes, or the traces outside a
             fold have a single class.
         TraceError, ValueError
-            If X has a shape that is none of traces, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

@@ -23,7 +23,7 @@ def save_checkpoint(members: Members, path: str | Path) -> None:
     An existing file is replaced. The file is written as a whole or not at all. Raises SettingError
     if there is more than one copy, OutputError if the file cannot be written.
     """
-    expect(members.count == 1, "a single member", members.count)
+    expect(members.count == 1, "a single copy of the network", members.count)
     content = BytesIO()  # torch's own writer aborts the process on a full disk
     torch.save(members.state_dict(), content)
     write_output(path, content.getvalue(), force=True)
@@ -54,13 +54,14 @@ def load_checkpoint(members: Members, path: str | Path) -> None:
     with torch.no_grad():
         for name, value in state.items():
             weight = weights[names[name]]
-            value.view(-1, *weight.shape).copy_(weight)  # the same weights for each member
+            value.view(-1, *weight.shape).copy_(weight)  # the same weights for each copy
 
 
 def read_tensors(path: str | Path) -> dict[str, Tensor]:
     """Return the dict of tensors that `torch.save` wrote to a file, without running code of it.
 
-    Raises SettingError if the file cannot be read, or holds anything but a dict of dense tensors.
+    Raises SettingError if the file cannot be read, or holds anything but a dict of dense tensors of
+    types that NumPy has.
     """
     with instead(SettingError, f"The checkpoint {path} cannot be read", OSError):
         content = Path(path).read_bytes()

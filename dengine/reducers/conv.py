@@ -262,8 +262,8 @@ class ConvReducer(TorchReducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, `rocket_` included; return self.
 
-        The parameters must be the same. Raises StoreError if the state holds no `rocket_`, because
-        an older release stored it, and if the state is of another network.
+        The constructor's parameters must be the same. Raises StoreError if the state is of another
+        network, or of an older release, which stored no `rocket_`. After an error do not use it.
         """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone

@@ -203,8 +203,9 @@ def count_features(networks: nn.Module, count: int, channels: int, samples: int)
 
     `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
     evaluation mode, so that no statistics change; afterwards the networks are in training mode.
-    Raises ValueError unless the output is a tensor of floats with three dimensions, three rows and
-    at least one feature. Exceptions of the networks' `forward` are not caught.
+    Raises ValueError unless the output, which must be a tensor, holds floats and has three
+    dimensions, three rows and at least one feature. What the networks' `forward` raises passes, and
+    they stay in evaluation mode then.
     """
     networks.eval()
     with torch.no_grad():

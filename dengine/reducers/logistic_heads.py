@@ -139,7 +139,7 @@ def fit_heads(
         Asked before each step, which all heads take together. None: the steps go on until all heads
         have converged, or `max_iter`.
     min_steps : int, default 0
-        Steps that are taken even after the deadline of `stop`, but not beyond its `max_steps`.
+        Number of first steps that the deadline of `stop` does not prevent.
 
     Returns
     -------
@@ -256,6 +256,7 @@ def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Ten
 def masked_loss(logits: Tensor, y: Tensor, mask: Tensor) -> Tensor:
     """Compute mean log losses, in nats, over the rows that each mask selects.
 
-    logits (..., K, n), labels y (n,), mask (K, n) of 1 and 0. Returns (..., K).
+    logits (..., K, n), labels y (n,), mask (K, n) of 1 and 0. Returns (..., K), NaN for a mask
+    that selects no row.
     """
     return (mask * (F.softplus(logits) - y * logits)).sum(-1) / mask.sum(1)

@@ -41,7 +41,7 @@ class PcaReducer(Reducer):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Compute the principal axes of traces (`components_`) and their mean (`mean_`).
 
-        Labels are ignored. A trace is one row, channel after channel.
+        A trace is one row, channel after channel.
 
         Parameters
         ----------
@@ -57,10 +57,11 @@ class PcaReducer(Reducer):
         Raises
         ------
         SettingError
-            If there are no more traces than `n_components`, or if a trace has fewer samples than
-            that, all channels together.
+            If there are `n_components` traces or fewer, or if a trace has fewer samples than that,
+            all channels together.
         TraceError, ValueError
-            If X has a shape that is none of traces, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite. ValueError also for a
+            parameter that scikit-learn refuses, such as `n_components=0`.
         """
         rows = as_rows(self.check_traces(X, reset=True))
         if len(rows) <= self.n_components:

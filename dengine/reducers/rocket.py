@@ -338,7 +338,7 @@ class RocketReducer(Reducer):
             If a parameter is out of its range, labels or folds do not fit the traces, a trace has
             a single sample, or the traces outside a fold have a single class.
         TraceError, ValueError
-            If X has a shape that is none of traces, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -361,11 +361,12 @@ class RocketReducer(Reducer):
         The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
         (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,) identify the
         traces: a trace that was in the last call has its features in a cache. `stop` may end the
-        Newton steps. If there are more than 4000 traces, the heads are fitted to 4000 of them,
-        chosen by a hash of the numbers. The module `net_`, and so the module that `module` returned
-        before, is changed in place. The points are float32 (n, d), row i in space ``folds[i]``.
-        Raises SettingError for fewer than 20 traces, and if the traces outside a fold have a single
-        class.
+        Newton steps, but in the first fit its deadline leaves them three. If there are more than
+        4000 traces, the heads are fitted to 4000 of them, chosen by a hash of the numbers. The
+        module `net_`, and so the module that `module` returned before, is changed in place. The
+        points are float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than
+        20 traces, if the traces outside a fold have a single class, and at the first call for a
+        parameter out of its range or fewer than 2 samples.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -413,8 +414,8 @@ class RocketReducer(Reducer):
         """Compute the features of traces (n, C, T), and cache them for the next `train`.
 
         `train` finds them again by `numbers`, the numbers of the labels; without numbers nothing is
-        cached. The first call also draws the kernels. With fewer than `MIN_TRACES` traces nothing
-        is done.
+        cached. The cache then holds these traces and no others. The first call also draws the
+        kernels. With fewer than `MIN_TRACES` traces nothing is done.
         """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_initialize(X), numbers)
@@ -529,10 +530,11 @@ class RocketReducer(Reducer):
         self.note_ = note if useless else ""
 
     def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
-        """Write the classifier heads of all towers to `net_`, each multiplied by its share.
+        """Write the classifier heads of all towers to `net_`, so that it gives a logit per space.
 
-        `shares` has a tensor (K,) for each `Tower`, its share of logit k. The heads in `net_` are
-        overwritten.
+        Logit k of `net_` becomes the sum over the towers of share k times the tower's own logit k.
+        `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns them. The heads in
+        `net_` are overwritten.
         """
         net = self.net_
         logit_columns = slice(0, net.n_scores, self.n_components)
@@ -559,7 +561,7 @@ class RocketReducer(Reducer):
     def _compute_components(self, raw: Tensor) -> None:
         """Compute feature scales and principal components anew from raw features (n, P).
 
-        About 1000 rows at most, evenly spaced, are read; `n_component_traces_` becomes n.
+        At most 1000 rows, evenly spaced, are read; `n_component_traces_` becomes n.
 
         A `Tower` holds a group of features, their principal components, and one linear classifier,
         a head, for each fold. `towers_` gets a new tower for each group; its heads are the ones
@@ -658,7 +660,10 @@ class RocketReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last fit: Newton steps, and heads that predict the base rate."""
+        """Return the report of the last fit: Newton steps, and heads that predict the base rate.
+
+        Raises NotFittedError before there are kernels, AttributeError before the first fit.
+        """
         check_is_fitted(self, "net_")
         return FitReport(self.n_iter_, self.note_)
 
@@ -666,8 +671,9 @@ class RocketReducer(Reducer):
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
         The points in space k come from head k, the classifier that was fitted without the labels of
-        fold k. Raises NotFittedError before a fit, ValueError for traces of another shape and for
-        values that are not finite.
+        fold k. If kernels were drawn (`precompute`, `untrained_module`) but nothing was fitted, all
+        probabilities are 0.5. Raises NotFittedError before there are kernels, ValueError for traces
+        of another shape and for values that are not finite.
         """
         traces = self.check_traces(X)
         with torch.inference_mode():
@@ -687,7 +693,8 @@ class RocketReducer(Reducer):
 
         They are the shape, the counters, the losses, the fields of each `Tower`, and the tensors of
         `net_`, whose names begin with "net.". The cache of features is not among them. Losses and
-        towers are not copies. Raises NotFittedError before a fit.
+        towers are not copies. Raises NotFittedError before there are kernels, AttributeError before
+        the first fit.
         """
         check_is_fitted(self, "net_")
         counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]
@@ -704,7 +711,7 @@ class RocketReducer(Reducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         Afterwards the cache of features is empty and `note_` is "". Raises StoreError if the sizes
-        do not follow from the parameters.
+        do not follow from the parameters; the fitted model is lost then.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
@@ -746,7 +753,7 @@ class RocketReducer(Reducer):
 
 
 def sample_rows(n: int, numbers: Ints | None) -> Ints:
-    """Draw `MAX_TRAINING_TRACES` of n rows, in order, without reading labels.
+    """Draw `MAX_TRAINING_TRACES` of n rows, without reading labels; return them in order.
 
     A hash of the labels' numbers (n,) draws them, evenly in time. So most rows are those of the
     last fit, and the heads start near their final weights. If `numbers` is None, they are 0 to

@@ -209,7 +209,7 @@ class TorchReducer(Reducer):
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes, the larger one for success.
+            Labels of two classes, the larger one for success; a single class is trained on, too.
         folds : array of int64, shape (n,), optional
             Fold of each trace, 0 to K - 1. None: by a hash of its content.
 
@@ -224,7 +224,7 @@ class TorchReducer(Reducer):
             does not give (B, features), the checkpoint cannot be used, a trace has a single sample,
             or fewer than two traces lie outside a fold.
         TraceError, ValueError
-            If X has a shape that is none of traces, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite.
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -246,7 +246,8 @@ class TorchReducer(Reducer):
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
         the last training, or from initial weights the first time. `numbers` is not read. Returns
         the points of the traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError
-        for fewer than 20 traces in the first training, and for fewer than two outside a fold.
+        for fewer than two traces outside a fold, and at the first training for fewer than 20
+        traces, or a parameter, network or checkpoint that cannot be used.
         """
         traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
@@ -341,7 +342,8 @@ class TorchReducer(Reducer):
         The networks with averaged weights and new statistics of batch normalisation become
         `encoder_`. `n_steps_left_` becomes 0 if `stop` limits the number of steps, else the number
         of steps that are missing until training is complete. `numbers` is not read. Returns the
-        points of the traces, float32 (n, d), row i in space ``folds[i]``.
+        points of the traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError for
+        fewer than two traces outside a fold; `encoder_` stays then.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -466,7 +468,7 @@ class TorchReducer(Reducer):
         members.eval()
 
     def _new_encoder(self) -> Encoder:
-        """Return a new module that embeds: the preprocessor and a copy of `averaged_members_`."""
+        """Return a new module that embeds: the preprocessor itself and a copy of the averages."""
         members = fold_batch_norms(copy.deepcopy(self.averaged_members_).eval())
         encoder = Encoder(self.preprocessor_, members, self.n_components)  # type: ignore[arg-type]
         return encoder.eval().requires_grad_(False)
@@ -498,8 +500,8 @@ class TorchReducer(Reducer):
         """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
 
         The points in space k come from network k, which was trained without the labels of fold k.
-        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
-        that are not finite.
+        Raises NotFittedError before there are networks, ValueError for traces of another shape and
+        for values that are not finite.
         """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
@@ -530,8 +532,9 @@ class TorchReducer(Reducer):
         """Return the module that embeds, (B, C, T) -> (B, K, d), for compiling or exporting.
 
         It is the present `encoder_`, which later trainings replace and do not change. None if
-        TorchScript cannot compile the network: the first call finds this out, and logs a warning.
-        Raises NotFittedError before a fit.
+        TorchScript cannot compile the network: the first call finds this out, and logs a warning,
+        unless a warning for this network and shape was logged before (`can_compile`). Raises
+        NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
@@ -580,8 +583,8 @@ class TorchReducer(Reducer):
         """Restore what `get_state` returned, and return self.
 
         The constructor's parameters must be the same. Raises StoreError if the sizes are others, or
-        if the network gives other points for a fixed trace than when the state was taken. A state
-        without these points is not checked.
+        if the network gives other points for a fixed trace than when the state was taken; a state
+        without these points is not checked so. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
@@ -629,8 +632,9 @@ class TorchReducer(Reducer):
         """Raise SettingError for a parameter out of its range.
 
         folds must be an integer from 2 to 1000, batch_size one of at least 2, steps and fit_steps
-        of at least 1. n_components is 1 or 2, learning_rate above 0, weight_averaging below 1, and
-        no other number is negative. checkpoint is a text or path; no file is looked at.
+        of at least 1, shift of at least 0, all up to a million. n_components is 1 or 2,
+        learning_rate above 0, weight_averaging below 1, and no other number is negative or
+        infinite. checkpoint is a text or path; no file is looked at.
         """
         expect(self.n_components in (1, 2), "n_components 1 or 2", self.n_components)
         smallest = {"folds": 2, "steps": 1, "fit_steps": 1, "batch_size": 2, "shift": 0}
@@ -714,8 +718,9 @@ def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
     """Return whether TorchScript compiles a network; log a warning if it does not.
 
     A user's network may hold Python that TorchScript does not support. To find out, two copies of
-    it are built, compiled and run, once for each network and shape. The state of torch's global
-    random generator does not change.
+    it are built, compiled and run. A process keeps the answers for the last 32 networks and shapes,
+    and logs nothing when it gives such an answer again. The state of torch's global random
+    generator does not change.
     """
     try:
         with torch.random.fork_rng(devices=[]), torch.inference_mode():

@@ -147,7 +147,7 @@ class UmapEncoder(nn.Module):
         """Distances to the nearest references (B, n_neighbors) -> membership strengths, same shape.
 
         A strength lies between 0 and 1 and is 1 for the nearest reference. The strengths of a row
-        sum to about ``log2(n_neighbors)``.
+        sum to about ``log2(n_neighbors)``; if all distances of a row are equal, all are 1.
         """
         beyond = distances - distances.amin(1, keepdim=True)
         beyond = beyond / (beyond.mean(1, keepdim=True) + 1e-12)
@@ -243,10 +243,10 @@ class UmapReducer(Reducer):
         Raises
         ------
         SettingError
-            If a parameter is out of its range, or there are no more traces than `n_neighbors` or
-            than `n_components`.
+            If a parameter is out of its range, or there are `n_neighbors` or `n_components` traces
+            or fewer.
         TraceError, ValueError
-            If X has a shape that is none of traces, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite.
         """
         traces = self.check_traces(X, reset=True)
         self.check(len(traces))
@@ -479,7 +479,8 @@ class UmapReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        What `precompute` found is dropped. Raises StoreError if the frames are of another size.
+        What `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module
+        that averages traces, have other sizes than the shape of the traces in `state` asks for.
         """
         channels, samples = self.restore_shape(state)
         n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])
@@ -501,7 +502,8 @@ class UmapReducer(Reducer):
     def check(self, n_traces: int) -> None:
         """Raise SettingError for a parameter out of its range, or too few traces.
 
-        There must be more traces than `n_neighbors` and than `n_components`.
+        n_components must be an integer from 1 to 100, n_neighbors from 2 to 1000, and there must be
+        more traces than either. min_dist is from 0 to 1, n_epochs an integer of at least 1 or None.
         """
         expect(is_whole(self.n_components, 1, 100), "n_components from 1 to 100", self.n_components)
         expect(is_whole(self.n_neighbors, 2, 1000), "n_neighbors from 2 to 1000", self.n_neighbors)

@@ -62,7 +62,7 @@ class Frames(nn.Module):
 
     @torch.jit.unused
     def learn(self, traces: Tensor) -> None:
-        """Set centre and scale, in place, from traces (n, C, T)."""
+        """Set centre and scale of a new module, in place, from traces (n, C, T)."""
         self.centre.copy_(traces.double().mean(0))
         deviation = self(traces).double().square().mean().sqrt()
         self.scale.copy_(torch.where(deviation > 0.0, deviation, 1.0))
@@ -248,9 +248,9 @@ def membership_strengths(distances: Tensor, n_neighbors: int) -> Tensor:
 
     A strength is ``exp(-(distance - rho) / sigma)``, but at most 1. rho is the distance to the
     nearest neighbour that is not identical. sigma is chosen such that the strengths of a trace sum
-    to ``log2(n_neighbors)``, but it is at least a small share of the mean distance. The method is
-    that of `smooth_knn_dist` and `compute_membership_strengths` in umap-learn, with a local
-    connectivity of 1.
+    to ``log2(n_neighbors)``, but it is at least a small share of the mean distance; the sum is also
+    larger if many neighbours are as near as rho. The method is that of `smooth_knn_dist` and
+    `compute_membership_strengths` in umap-learn, with a local connectivity of 1.
 
     Parameters
     ----------

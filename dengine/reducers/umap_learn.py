@@ -57,8 +57,6 @@ class UmapLearnReducer(Reducer):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit umap-learn's UMAP on traces, which takes seconds, and keep it as `umap_`.
 
-        Labels are ignored.
-
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
@@ -73,9 +71,10 @@ class UmapLearnReducer(Reducer):
         Raises
         ------
         SettingError
-            If there are no more traces than `n_neighbors`.
+            If there are `n_neighbors` traces or fewer.
         TraceError, ValueError
-            If X has a shape that is none of traces, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite. ValueError also for a
+            parameter that umap-learn refuses.
         ImportError
             If umap-learn is not installed.
         """

@@ -105,7 +105,11 @@ class Metrics:
                 "Version of the model that decides; 0 before the first retrain.",
                 engine.version,
             ),
-            ("safe_mode", "1 in safe mode, where every part is verified.", bool(engine.safe_mode)),
+            (
+                "safe_mode",
+                "1 in safe mode, where parts are verified until new outcomes allow decisions.",
+                bool(engine.safe_mode),
+            ),
             ("shadow", "1 in shadow mode, where every part is verified.", engine.policy.shadow),
             (
                 "store_fault",

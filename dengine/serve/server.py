@@ -304,6 +304,6 @@ def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
 def log_safe_mode(reason: str) -> None:
     """Log that the safe mode began for a reason, or that it ended (an empty reason)."""
     if reason:
-        log.warning("safe mode, every part is verified: %s", reason)
+        log.warning("safe mode, parts are verified until outcomes allow decisions: %s", reason)
     else:
         log.info("the safe mode ended")

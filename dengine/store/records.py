@@ -32,7 +32,7 @@ from ..errors import (
     shortened,
 )
 from ..files import FilePath, read_archive
-from ..records import Action, Arrays, Decision, RetrainReport, Source, State, TraceArray
+from ..records import Action, Arrays, Decision, Ints, RetrainReport, Source, State, TraceArray
 
 # Kinds of events.
 SAFE_MODE_BEGAN = "safe mode"
@@ -265,10 +265,10 @@ class LabelledTraces:
         Content hash of each, as in `StoredDecision`.
     """
 
-    seq: NDArray[np.int64]
+    seq: Ints
     traces: TraceArray
     labels: NDArray[np.int8]
-    hashes: NDArray[np.int64]
+    hashes: Ints
 
     def rows(self) -> Iterator[tuple[int, TraceArray, int, int]]:
         """Return the labelled traces one by one: number, trace, label and hash."""

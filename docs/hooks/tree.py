@@ -12,6 +12,7 @@ from pathlib import Path
 REPO = Path(__file__).resolve().parents[2]
 README = REPO / "README.md"
 TREE = re.compile(r"(?<=^```text\n)dengine/ .*?(?=^```$)", flags=re.DOTALL | re.MULTILINE)
+BUNDLED = "The bundled set insertion with its card, and the units of channels"  # no module says it
 OTHER_FOLDERS = {
     "docs/": "tutorials, how-to, reference, explanation; `make docs` builds the site into site/",
     "models/": "trained files with their cards",
@@ -32,9 +33,9 @@ def rows() -> dict[str, str]:
     """Return the rows, name -> text: the modules in one row, the families, other folders."""
     package = REPO / "dengine"
     modules = sorted(path.stem for path in package.glob("[!_]*.py"))
-    families = sorted(package.glob("*/__init__.py"))
-    clauses = {f"  {path.parent.name}/": clause(path) for path in families}
-    return {"dengine/": ", ".join(modules)} | clauses | OTHER_FOLDERS
+    clauses = {f"  {path.parent.name}/": clause(path) for path in package.glob("*/__init__.py")}
+    clauses["  data/"] = BUNDLED
+    return {"dengine/": ", ".join(modules)} | dict(sorted(clauses.items())) | OTHER_FOLDERS
 
 
 def tree() -> str:

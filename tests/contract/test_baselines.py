@@ -131,6 +131,13 @@ def test_neighbours_decide_only_where_all_k_agree() -> None:
     np.testing.assert_allclose(baseline.predict_interval(asked), [[1.0, 0.0, 1 / 3]] * 2)
 
 
+def test_traces_of_the_same_bytes_and_another_shape_get_a_prediction_of_their_own() -> None:
+    baseline = new("always")
+    for shape in ((2, 1, 5), (1, 2, 5), (1, 1, 10)):
+        assert baseline.predict(np.zeros(shape)).lower.shape == shape[:1]
+        assert baseline.decide(np.zeros(shape)).shape == shape[:1]
+
+
 def test_a_narrow_kernel_counts_a_label_at_the_very_place_twice(traces: Any) -> None:
     # The published effective sample size in two dimensions is 2 sum w: Wilson's interval of twice
     # the counts.

@@ -183,9 +183,8 @@ def test_safe_mode_says_why_everything_was_verified(tmp_path: Path) -> None:
         usual = engine.decide(data.X[0] + np.float32(0.001))
         assert usual.reason is Reason.SAFE_MODE
         explanation = engine.explain(usual.id)
-        assert (
-            "in safe mode, in which every part is verified: too many traces were novel"
-            in said_of(explanation)
+        assert "in safe mode, which began after an alarm: too many traces were novel" in said_of(
+            explanation
         )
         assert "Nothing could pass, whatever the bound: too many traces were novel" in said_of(
             explanation

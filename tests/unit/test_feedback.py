@@ -260,7 +260,8 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
     recovery = engine.status(watching=True).watch.recovery
     n_parts = len(cycles) - first  # with the part that raised the alarm
     assert re.fullmatch(
-        rf"\d+ of {n_parts} parts since the alarm are evidence, \d+ wrong: like this it does not end",
+        rf"\d+ of {n_parts} parts since the alarm count as evidence, "
+        r"\d+ of them wrong; if this goes on, safe mode does not end",
         recovery,
     )
     fresh = ReplayCell(make_data(800, samples=60, seed=9))  # the bad ones were learned

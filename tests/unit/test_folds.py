@@ -11,8 +11,10 @@ from scipy import stats
 from dengine import TraceSpec
 from dengine.decision.decider import Decider, DecisionConditions, VerifyAll
 from dengine.decision.scripting import script
+from dengine.errors import SettingError
 from dengine.folds import content_fold, content_hash, fold_of, toss
 from dengine.records import Reason
+from dengine.reducers.base import folds_of
 from dengine.traces import TraceGate
 
 any_float32 = st.floats(width=32, allow_nan=True, allow_infinity=True)
@@ -100,6 +102,15 @@ def test_folds_are_balanced(folds: int, step: float) -> None:
         content_fold(np.round(noise(10_000, 20) / step) * step, folds), minlength=folds
     )
     assert stats.chisquare(sizes).pvalue > 1e-4
+
+
+def test_given_folds_are_taken_if_each_trace_has_one_within_the_range_also_for_no_trace() -> None:
+    traces = noise(2)[:, None]
+    assert folds_of(traces, 2, [1, 0]).tolist() == [1, 0]
+    assert folds_of(traces[:0], 2, []).tolist() == folds_of(traces[:0], 2).tolist() == []
+    for n, folds in ((2, [0]), (2, [0, 2]), (2, [-1, 0]), (2, []), (0, [0])):
+        with pytest.raises(SettingError, match=f"{n} folds from 0 to 1"):
+            folds_of(traces[:n], 2, folds)
 
 
 @pytest.mark.parametrize("rate", [0.02, 0.25, 0.5])

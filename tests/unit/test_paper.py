@@ -28,7 +28,7 @@ def frame(interval: str = "wilson", recipe: str = "conv", **cells) -> pd.DataFra
 
 
 def by_claim(found: list[str], claim: str) -> list[bool]:
-    return [line.startswith("holds: ") for line in found if claim in line]
+    return [line.startswith("confirmed: ") for line in found if claim in line]
 
 
 def test_the_published_figures_are_the_papers(repo: Path) -> None:
@@ -65,8 +65,8 @@ def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
 def test_the_papers_own_figures_bear_its_findings_out() -> None:
     lines = findings(pd.concat([frame(), frame("binomial")]))
     claims = (
-        "Wilson reacts",
-        "Binomial does not react",
+        "Wilson interval reacts",
+        "binomial interval does not react",
         "share of false positives",
         "delays the first",
     )
@@ -86,7 +86,7 @@ def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_not
     lines = findings(
         pd.concat([frame(certain=900), frame("binomial", certain=500, false_positive=60)])
     )
-    assert by_claim(lines, "Wilson reacts") == [False]
+    assert by_claim(lines, "Wilson interval reacts") == [False]
     assert by_claim(lines, "share of false positives") == [True, False]
     assert any("in 3 of 9 cells, at most 12.0 %" in line for line in lines)  # not at LB 90 and 95 %
     assert by_claim(findings(frame(first_certain=50.0)), "delays the first") == [False] * 3

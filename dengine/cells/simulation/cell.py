@@ -12,11 +12,10 @@ take.
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from ...errors import DengineError, expect
-from ...records import Outcome, TraceArray, TraceSpec
+from ...records import Floats, Outcome, TraceArray, TraceSpec
 from .conditions import (
     RATE_HZ,
     SAMPLES,
@@ -49,7 +48,7 @@ class SensorFaults:
 
 
 def read_sensor(
-    force: NDArray[np.float64],
+    force: Floats,
     faults: SensorFaults,
     parameters: CellParameters,
     rng: np.random.Generator,
@@ -77,7 +76,7 @@ def read_sensor(
     """
     keep = float(np.exp(-2 * np.pi * parameters.bandwidth_hz / RATE_HZ))
     # The sensor has a low-pass filter of first order.
-    true: NDArray[np.float64] = lfilter([1 - keep], [1, -keep], force)
+    true: Floats = lfilter([1 - keep], [1, -keep], force)
     samples = len(true)
     time_s = np.arange(samples) / RATE_HZ
     # Six of each are drawn and one is used, so that the bundled traces can be made again.

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import DengineError, SettingError, expect, instead
+from ...records import Floats
 from .conditions import RATE_HZ, SAMPLES, Conditions
 
 TIME_STEP_S = 0.0005
@@ -45,7 +45,7 @@ class Push:
         How far the part slid up in the gripper.
     """
 
-    force: NDArray[np.float64]
+    force: Floats
     height_mm: float
     slip_mm: float
 
@@ -102,9 +102,7 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     return Push(force, height_mm=top_mm - (LENGTH_MM - DEPTH_MM), slip_mm=slip_mm)
 
 
-def _drive(
-    mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int
-) -> NDArray[np.float64]:
+def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int) -> Floats:
     """Run the controller of the push; return the force (1000,) in newtons, at 500 Hz.
 
     `steps` is the number of physics steps per sample; `data` is advanced. The force before the

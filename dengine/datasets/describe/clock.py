@@ -6,13 +6,14 @@ from contextlib import suppress
 import numpy as np
 
 from ...errors import listed
+from ...records import Floats
 from ..checks import check_clock
 from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Fault
 from ..description import UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
-from .columns import Column, Floats, Proposal, Tables
+from .columns import Column, Proposal, Tables
 
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"

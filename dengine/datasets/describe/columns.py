@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import DataError
+from ...records import Floats
 from ..description import Clock, Description, TextForm
 from ..read.clock import ISO, times_of
 from ..read.split import column_kind
@@ -35,7 +36,6 @@ NUMBER = re.compile(
 )
 Stated = Mapping[str, Any]
 Tables = Sequence[Table]
-Floats = NDArray[np.float64]
 
 
 def counts_of(words: Iterable[str]) -> str:

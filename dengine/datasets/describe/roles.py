@@ -228,9 +228,12 @@ def propose_lengths(p: Proposal) -> None:
     usual = int(np.median(lengths or 0))
     others = [n for n in lengths if n != usual]
     if others and p.description.traces.lengths == "strict":
-        text = f"{len(others)} of {len(lengths)} have other lengths, {min(others)} to {max(others)}"
+        text = (
+            f"{len(others)} of {len(lengths)} recordings have another length, "
+            f"{min(others)} to {max(others)}"
+        )
         how = "pad" if len(others) > SPARSE * len(lengths) else "strict"
-        p.put("traces.lengths", how, f"{text}; or cut, pad-all, resample, strict")
+        p.put("traces.lengths", how, f"{text}; other choices: cut, pad-all, resample, strict")
     p.put("traces.samples", usual)
 
 

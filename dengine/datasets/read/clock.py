@@ -7,8 +7,9 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from ...errors import DataError, instead
+from ...records import Floats
 from ..description import Clock, TextForm
-from ..table import Cells, Floats, Table, UnreadableError
+from ..table import Cells, Table, UnreadableError
 
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}

@@ -15,12 +15,12 @@ import torch
 from numpy.typing import NDArray
 
 from ...errors import DataError, instead, listed
-from ...records import FITS
+from ...records import FITS, Floats
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, lost_note, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, Channel, Description, RowWords, TextForm
-from ..table import Cells, Floats, Recording, Table, UnreadableError
+from ..table import Cells, Recording, Table, UnreadableError
 from ..units import conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
+from ...records import Floats
 from ..description import Clock, Description
-from ..table import Floats, Table, UnreadableError
+from ..table import Table, UnreadableError
 from ..triggers import StartFinder, as_trigger
 from .clock import column_times, times_of
 from .frames import as_cells

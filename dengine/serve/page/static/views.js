@@ -32,7 +32,7 @@ export function warnings(status) {
   // Return the banners above every view, the worst first.
   const texts = [];
   if (status.store_fault) texts.push(`The store cannot be written: ${status.store_fault}`);
-  if (status.safe_mode) texts.push(`Safe mode: every part is verified until fresh evidence keeps the tolerance (${status.safe_mode})`);
+  if (status.safe_mode) texts.push(`Safe mode: parts are verified until new outcomes allow decisions (${status.safe_mode})`);
   if (status.shadow) texts.push("Shadow mode: every part is verified, and the model only predicts");
   if (status.pinned) texts.push(`Version ${status.pinned} was rolled back to, and no automatic retrain replaces it until it is released`);
   if (status.alarm && (status.loss || !status.safe_mode) && !status.store_fault) texts.unshift(status.alarm); // else the alarm has the same text
