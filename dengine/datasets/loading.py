@@ -273,10 +273,14 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
 def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
-    Quarantined and forgotten traces are left out. If several traces are of one part, `part` is the
-    hash by which the store counts them as one part; otherwise it is None. Raises DataError if the
-    store has no labelled traces, or if its rows contradict its ledger, the chain of hashes over
-    them, and StoreError if the store cannot be opened.
+    The labels are those of the store's cell and of the other cells of its product. Quarantined
+    traces and forgotten labels are left out. So is a trace that is not as it was stored, and an
+    event is written to the store. If several traces are of one part, `part` is the hash by which
+    the store counts them as one part; otherwise it is None.
+
+    Raises DataError if the store has no labelled traces, or if its rows contradict its ledger, the
+    chain of hashes over them. Raises StoreError if the store cannot be opened or read, and if its
+    traces have different shapes.
     """
     from ..store.opening import opening
 

@@ -324,8 +324,10 @@ class LiveModel:
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         """Return the arrays by name with which the store can restore a model as a version.
 
-        They hold the model, what it was trained on, and which corrections and overdue checks count.
-        If an overdue check counts, an engine that opens the store rebuilds the rule.
+        They hold the model with its rule, the labels that it was trained on, and how far
+        corrections and overdue checks count. If an overdue check counts, they say so
+        (`includes_overdue`): an engine that opens the store then does not take the stored rule, but
+        rebuilds it.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)

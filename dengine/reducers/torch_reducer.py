@@ -659,7 +659,8 @@ def draw_batches(
 ) -> Iterator[Tensor]:
     """Yield, for each step, the rows on which each of K networks is trained.
 
-    Network k passes over all rows outside fold k in random order, and then again in another order.
+    Network k passes over all rows outside fold k in random order, and then again in another order;
+    a batch may span two passes.
 
     Parameters
     ----------

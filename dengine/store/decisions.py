@@ -151,7 +151,9 @@ class DecisionTable(CellTable):
         ]
 
     def pending(self, since_version: int = 0) -> list[StoredDecision]:
-        """Return the decisions that asked for a check and have no label, oldest first.
+        """Return the cell's decisions with action VERIFY that have no label, oldest first.
+
+        Accepted decisions are not among them, see `unreported_accepts`.
 
         Parameters
         ----------

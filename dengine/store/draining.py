@@ -89,9 +89,9 @@ class Drainer:
     def fault(self) -> str:
         """Why the store cannot be written or read at present; "" if it can.
 
-        The reason is a fault of the journal, or the last error of the database, until a later
-        attempt succeeds, or a record that has waited for the database longer than both the `limit`
-        of this drainer and LAG_SECONDS.
+        The first of these is given: a fault of the journal; the last error of the database, until a
+        later attempt succeeds; that the oldest record has waited for the database longer than
+        `limit` and than LAG_SECONDS (1 s).
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
