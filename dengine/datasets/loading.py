@@ -152,7 +152,8 @@ def count_files(source: str, description: Description | None) -> int:
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the error message for recordings without a description.
 
-    It lists the open keys of a proposal, and has the commands that show and save it.
+    It lists the open keys of a proposal, whose value is `?`, and has the commands that show and
+    save it.
     """
     notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
     questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())

@@ -130,8 +130,8 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
 def cusum(share: float, parts: float) -> tuple[int, int]:
     """Design the CUSUM detector that notices soonest when the share of wrong decisions doubles.
 
-    A wrong decision adds `step` to a sum, a right one takes 1 from it, but the sum never falls
-    below 0. The detector alarms when the sum is `limit` or more.
+    A wrong decision adds `step` to a sum, a right one takes 1 from it, and the sum restarts at 0
+    if it would fall below. The detector alarms when the sum is `limit` or more.
 
     Parameters
     ----------

@@ -178,7 +178,7 @@ class NoveltyGate(nn.Module):
 def fit_novelty(
     traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None
 ) -> NoveltyGate:
-    """Fit the gate that takes these traces for usual; there is no randomness.
+    """Fit a novelty gate, which takes these traces for usual; there is no randomness.
 
     At most `REFERENCES` of the traces, evenly spaced in time, become its references; of these,
     traces whose features overflow are left out. Each group of features (level, texture,

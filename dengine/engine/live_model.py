@@ -244,7 +244,7 @@ class LiveModel:
         It is the rule of the model in force, or of the untrained template before the first retrain.
         It begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
         outcomes, as wrong decisions. Labels that are not in the store yet are not, so the rule
-        forgets them: store them before.
+        loses them: store them before.
 
         An update that fails here is logged and makes the rule stale: every part is then verified
         until the engine is opened again. A rule that was stale before stays so. The store's ledger

@@ -157,7 +157,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     """Explain one decision from what its store keeps; nothing is trained or embedded.
 
     The policy is the one that was in force at the decision. A damaged label, and a damaged trace of
-    the envelope's, is left out, and an event is written to the store. Nothing else is written.
+    those that make the envelope (the band of the successes), is left out, and an event is written
+    to the store. Nothing else is written.
 
     Parameters
     ----------

@@ -635,6 +635,8 @@ MIN_STRETCH = 20  # decisions of a stretch: a share of fewer jumps
 def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
     """Read the course of a store: counts over time, retrains, safe modes.
 
+    A stretch is a number of consecutive decisions that are counted together.
+
     Parameters
     ----------
     store : SqlStore

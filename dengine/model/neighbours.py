@@ -188,7 +188,7 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     """Return a hashable key, equal for two modules if one compiled module can serve for both.
 
     The key holds the class and the attributes of all submodules; of a tensor it holds only the
-    shape, because `compiled` sets the values. The gate of the force limits is left out. The class
+    shape, because `compiled` sets the values. The module of the force limits is left out. The class
     itself is in the key, not its name: a notebook cell that is run again defines another class.
     """
     parts = [
@@ -669,7 +669,7 @@ class ModelPrediction(EngineModel):
         self.rule_is_stale = was_stale
 
     def reset_rule(self, safe_mode: int) -> None:
-        """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
+        """Reset the rule, so that no outcome counts; it starts in this safe mode, a `SafeMode`.
 
         NONE is no safe mode. The rule is reset in place, because the compiled module shares
         its tensors. `rule_is_stale` stays as it is.
@@ -719,10 +719,9 @@ class ModelPrediction(EngineModel):
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
         """Decide on one raw trace x (C, T), in the unit of the sensor, under these conditions.
 
-        The decider (the compiled module that decides) is built first if the one that the model
-        keeps is for other conditions. References of the part with this hash are not counted. 0
-        stands for an unknown part: then references with the same content hash as the trace are not
-        counted.
+        The decider, the module that decides, is built first if the one that the model keeps is for
+        other conditions. References of the part with this hash are not counted. 0 stands for an
+        unknown part: then references with the same content hash as the trace are not counted.
 
         Returns
         -------

@@ -143,7 +143,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit anew and forget earlier fits. Engines call `train`, which may continue the last fit.
+        """Fit anew and discard earlier fits. Engines call `train`, which may continue the last fit.
 
         Parameters
         ----------

@@ -318,7 +318,7 @@ class RocketReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Draw the kernels anew and fit the classifier heads; earlier fits are forgotten.
+        """Draw the kernels anew and fit the classifier heads; earlier fits are discarded.
 
         Parameters
         ----------
@@ -432,7 +432,7 @@ class RocketReducer(Reducer):
     def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
-        No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
+        No label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
         range or fewer than 2 samples.
         """
         self.build(traces.shape[1], traces.shape[2], averaging(torch.from_numpy(traces)))

@@ -3,7 +3,7 @@ computes them from raw traces, `compute_raw_features` those of many traces at on
 functions draw the kernels and place them.
 
     x (B, C, T) -> means of a few samples each, channels of one scale            (B, C, L)
-    tower 1     -> F kernels of 9 taps at each of D dilations, at P places       (D, F, P * B)
+    tower 1     -> F kernels of 9 inputs at each of D dilations, at P places     (D, F, P * B)
                 -> a ramp from 0 to 1 around a threshold
                 -> its mean over R regions, plus twice that over all regions     (B, D * F * R)
     tower 2     -> G groups of 8 kernels at each dilation, at Q places of the

@@ -369,10 +369,11 @@ class HttpApi:
     async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
         """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
-        With `hours` a stretch is a shift. Without it all decisions are split into at most 120
-        stretches of at least 20 decisions; the newest stretch may have fewer. At most the newest
-        120 stretches are returned, but all retrains and safe modes of the cell. 422: `hours` is
-        shorter than one second and not 0.
+        A stretch is a number of decisions that are counted together. With `hours` a
+        stretch is a shift. Without it all decisions are split into at most 120 stretches of at
+        least 20 decisions; the newest stretch may have fewer. At most the newest 120 stretches are
+        returned, but all retrains and safe modes of the cell. 422: `hours` is shorter than one
+        second and not 0.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,

@@ -88,7 +88,7 @@ class RobotCalls:
     async def begin(self, request: Any = "") -> str:
         """Begin a new part, and have the recorder wait for its insertion.
 
-        The pieces of its trace that `add` took before are forgotten. Pieces are kept for the newest
+        The pieces of its trace that `add` took before are discarded. Pieces are kept for the newest
         `MAX_PARTS` parts; for an older part call this again. The recorder, which records the force
         of one insertion, works for the newest part alone: the recording of an earlier part that was
         not decided on is dropped. If the recorder fails, that is logged, and `decide_recorded` then

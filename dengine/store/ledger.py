@@ -452,7 +452,10 @@ def _find_table_error(
 
 
 def chain_writes(engine: sa.Engine) -> None:
-    """Have an engine call `_chain_statement` before every statement, to chain inserted rows."""
+    """Have an engine call `_chain_statement` before every statement.
+
+    The function gives inserted rows their sums, and adds these to the ledger's next entry.
+    """
     sa.event.listen(engine, "before_execute", _chain_statement, retval=True)
 
 
