@@ -152,7 +152,8 @@ def count_files(source: str, description: Description | None) -> int:
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the error message for recordings without a description.
 
-    It lists the open keys of a proposal, and has the commands that show and save it.
+    It lists the open keys of a proposal, whose value is `?`, and has the commands that show and
+    save it.
     """
     notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
     questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())
@@ -273,10 +274,14 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
 def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
-    Quarantined and forgotten traces are left out. If several traces are of one part, `part` is the
-    hash by which the store counts them as one part; otherwise it is None. Raises DataError if the
-    store has no labelled traces, or if its rows contradict its ledger, the chain of hashes over
-    them, and StoreError if the store cannot be opened.
+    The labels are those of the store's cell and of the other cells of its product. Quarantined
+    traces and forgotten labels are left out. So is a trace that is not as it was stored, and an
+    event is written to the store. If several traces are of one part, `part` is the hash by which
+    the store counts them as one part; otherwise it is None.
+
+    Raises DataError if the store has no labelled traces, or if its rows contradict its ledger, the
+    chain of hashes over them. Raises StoreError if the store cannot be opened or read, and if its
+    traces have different shapes.
     """
     from ..store.opening import opening
 
