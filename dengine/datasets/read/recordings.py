@@ -142,9 +142,11 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
         if other != label:
-            message = f"Expected labels that agree, [label] says {WORDS[label]}"
-            message = f"{message}, [[check]] {i} says {WORDS[other]}"
-            raise UnreadableError(message, column=labels[i].source.column)
+            raise UnreadableError(
+                f"Expected labels that agree, [label] says {WORDS[label]}, [[check]] {i} says "
+                f"{WORDS[other]}",
+                column=labels[i].source.column,
+            )
     return label
 
 
