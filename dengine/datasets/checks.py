@@ -69,6 +69,7 @@ def check_text(text: TextForm) -> None:
         f"one character each in text.delimiter and text.decimal, got {marks}": (
             [*map(len, marks)] == [1, 1]
         ),
+        "text.thousands other than text.decimal": text.thousands != text.decimal,
         "text.data, the line of the first samples, of 1 or more": text.data > 0,
     }
     expect_all(wanted)

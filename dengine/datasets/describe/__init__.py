@@ -7,7 +7,7 @@ the candidates. `load_dataset` then reads exactly what the description says.
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +27,7 @@ from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
 from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
-from .text_form import propose_form
+from .text_form import propose_form, propose_marks
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -81,6 +81,8 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     """
     p = Proposal(stated or {}, Description().with_values(stated or {}))
+    if p.description.text.thousands == ".":
+        p.put("text.decimal", ",")
     check_text(p.description.text)
     if hasattr(source, "columns"):
         p.put("format", "frame")
@@ -90,7 +92,13 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
             p.put("layout", "mcap")
             propose_bag(p)
         else:
-            propose_tables(p, read_tables(p))
+            contents = contents_of(p)
+            if p.description.format == "text":
+                propose_form(p, contents)
+            if UNKNOWN in (p.description.text.header, *p.description.text.names):
+                p.notes["channels"] = "they follow from text.header and text.names"
+            else:
+                propose_tables(p, read_tables(p, contents))
     return replace(p.description, notes=p.notes)
 
 
@@ -172,16 +180,12 @@ def contents_of(p: Proposal) -> dict[str, bytes]:
     return contents
 
 
-def read_tables(p: Proposal) -> list[Table]:
+def read_tables(p: Proposal, contents: Mapping[str, bytes]) -> list[Table]:
     """Return one table for each file that is looked at, if it has the most frequent columns.
 
-    For text files the keys of `[text]` are set in `p` first, and files of another form move from
-    `p.names` to `p.others`. Damaged files are left out, also those with a line that has a wrong
-    number of cells. Raises DataError if all are damaged, or if no text file is a text.
+    Damaged files are left out, also those with a line that has a wrong number of cells. For text
+    files the marks in numbers are set in `p`. Raises DataError if all files are damaged.
     """
-    contents = contents_of(p)
-    if p.description.format == "text":
-        propose_form(p, contents)
     files: list[Table] = []
     faults: list[Fault] = []
     for name in [name for name in p.names if name in contents]:
@@ -189,6 +193,8 @@ def read_tables(p: Proposal) -> list[Table]:
             files.append(table_in(p, contents[name], name))
     if faults and not files:
         raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
+    if p.description.format == "text":
+        propose_marks(p, files)
     heads = [tuple(table.columns) for table in files]
     usual = max(heads, key=heads.count, default=())
     return [table for table, head in zip(files, heads, strict=True) if head == usual]

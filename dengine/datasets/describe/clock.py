@@ -13,32 +13,36 @@ from ..description import UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
-from .columns import Column, Proposal, Tables
+from ..units import quantity_of, unit_in
+from .columns import FEW, Column, Proposal, Tables
 
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
-    r"|(^|\.)(t|ms|s|us|ns|sec|secs|seconds|date|datum|uhr|x_value|ticks)$|^t[ _/\[(]"
+    r"|(^|\.)(t|ms|us|ns|sec|secs|seconds|date|datum|uhr|x_value|ticks)$|^t[ _/\[(]"
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
 UNIT_IN_NAME = re.compile(
-    r"(?:[\[(/_ ]|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|sec))\s*[\])]?$"
+    r"(?:[\[(/_ ]|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])]?$"
 )
 # Names that are a unit. Whole seconds and nanoseconds may stand in two columns beside each other.
 NAMED_UNIT = re.compile(
-    r"(?i)(?P<ns>(?:^|[^a-z])n(?:ano)?_?se|nsecs?$)|(?P<ms>^milli|^ms$|(?-i:[a-z]Ms$))"
-    r"|(?P<us>^micros)|(?P<s>(?:^|[^n])secs?(?:onds?)?$)"
+    r"(?i)(?P<ns>(?:^|[^a-z])n(?:ano)?_?se|nsecs?$)|(?P<ms>^milli|millis|^ms$|(?-i:[a-z]Ms$))"
+    r"|(?P<us>micros)|(?P<s>(?:^|[^a-z])secs?(?:onds?)?$)"
 )
 # Counts since some day: their unit, the seconds from that day to 1970, and what they are called.
 EPOCHS = (
     *((unit, 0, f"{unit} since 1970") for unit in ("s", "ms", "us", "ns")),
     ("d", 2_209_161_600, "days since 1900, as spreadsheets count them"),
+    ("0.0864 s", 2_209_161_600, "1e-6 days since 1900, as WinCC counts them"),
     ("0.1 us", 11_644_473_600, "0.1 us since 1601"),
     ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
 )
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
-SLOWEST_STEP = 0.04  # of numbers that are taken for seconds because they are small
-FEW = 0.1  # of the recordings that may have a gap, and of the steps that may fall
+# Smaller steps are taken for seconds: as milliseconds they would be of a rate above 50 kHz.
+SLOWEST_STEP = 0.019
+EVEN = 1e-4  # by which a rate may differ from a whole number of hertz
+STROKE = "s"  # a name of seconds, and of a stroke
 ANSWERS = (  # to a clock that the reader would refuse
     "state the longest time.gap (0: any; with traces.lengths=resample if the clock jitters), or "
     "time.wrap of a counter that begins again, another time.column, or none, [], and time.rate_hz"
@@ -56,7 +60,8 @@ def propose_clock(p: Proposal) -> None:
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if stated:
         clocks = [p.columns[name] for name in stated if name in p.columns]
-    every = p.columns.values() if clocks or "c0" in p.description.text.names else ()
+    has_all = clocks or "c0" in p.description.text.names
+    every = [c for c in p.columns.values() if has_all or (c.name == STROKE and is_timed(c))]
     has_days = any(has_day(form) for column in clocks for form in column.forms)
     coarse = [] if has_days else [c for c in p.unused if c.forms or is_coarse(c)]
     names = [c.name for c in every if c in clocks or c in coarse or not clocks]
@@ -79,7 +84,13 @@ def is_clock(column: Column) -> bool:
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    return is_named and is_rising(column)
+    return is_named and is_timed(column)
+
+
+def is_timed(column: Column) -> bool:
+    """Return whether a column has numbers that rise, and no unit of another quantity than time."""
+    unit = column.unit or unit_in(column.name)
+    return quantity_of(unit) is None and is_rising(column)
 
 
 def is_coarse(column: Column) -> bool:
@@ -104,21 +115,27 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
-    why it is `?`, or which size proves the unit. If day and month can be confused, the form is `?`
-    for a column that alone tells the time or that changes within a recording. Beside a column of
-    times, dates of one day get the first form: the order of day and month does not change the steps
-    between samples.
+    why it is `?`, or which size proves the unit. If day and month can be confused, the form is `?`,
+    unless all recordings are of one day, which a column beside this one does not pass. The form is
+    `?`, too, if the size of the numbers proves another unit than the file or the name states.
 
     is_alone : whether no other column tells a part of the time.
     """
     forms = column.forms
-    if len(forms) > 1 and (is_alone or not column.fixed):
+    if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    for unit in (*forms, column.unit, _unit_in(column.name)):
-        if unit in forms or unit.lstrip("0123456789. ") in UNITS:
-            return unit.replace("sec", "s")
-    unit, p.notes["time.format"] = _unit_by_size(column)
+    stated = [re.sub("(?i)secs?", "s", unit) for unit in (column.unit, _unit_in(column.name))]
+    for unit in (*forms, *stated):
+        if unit in forms:
+            return unit
+        if unit.lstrip("0123456789. ") in UNITS:
+            counted = _unit_since(column)
+            if counted and scale_of(counted[0]) != scale_of(unit):
+                p.notes["time.format"] = f"{unit}, as stated, or {counted[0]}: {counted[1]}"
+                return UNKNOWN
+            return unit
+    unit, p.notes["time.format"] = _unit_since(column) or _unit_by_size(column)
     return unit
 
 
@@ -128,6 +145,17 @@ def _unit_in(name: str) -> str:
         return match[1].replace(",", ".")
     match = NAMED_UNIT.search(name)
     return (match and match.lastgroup) or ""
+
+
+def _unit_since(column: Column) -> tuple[str, str] | None:
+    """Return the unit of numbers that count since some day, and a note; None if they do not."""
+    rising = column.steps[column.steps > 0]
+    for unit, zero, title in EPOCHS if len(rising) else ():
+        scale = scale_of(unit)
+        start = float(column.numbers[0][0]) * scale - zero
+        if YEARS[0] <= start <= YEARS[1] and is_rate(float(np.median(rising)) * scale):
+            return unit, f"{title}, by the size of the numbers"
+    return None
 
 
 def _unit_by_size(column: Column) -> tuple[str, str]:
@@ -140,15 +168,12 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
     if not len(rising):
         odd = listed([*column.odd][:3])
         return UNKNOWN, f"no form of times that is known fits {odd}: state it, or text.drop"
-    first = float(column.numbers[0][0])
     step = float(np.median(rising))
-    for unit, zero, title in EPOCHS:
-        scale = scale_of(unit)
-        if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
-            return unit, f"{title}, by the size of the numbers"
-    if step <= SLOWEST_STEP:
+    steps = {unit: step * UNITS[unit] for unit in ("s", "min", "ms", "us", "ns")}
+    per_minute = 1 / steps["min"]
+    is_minutes = is_rate(steps["min"]) and abs(per_minute / round(per_minute) - 1) < EVEN
+    if step <= SLOWEST_STEP and not is_minutes:
         return "s", f"seconds, for steps of {step:.6g}; the unit is not stated"
-    steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns")}
     rates = ", ".join(f"{unit} ({1 / s:.6g} Hz)" for unit, s in steps.items() if is_rate(s))
     return UNKNOWN, f"steps of {step:.6g}, the unit is not stated: {rates}"
 

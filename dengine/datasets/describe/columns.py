@@ -29,6 +29,7 @@ FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
 LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
+FEW = 0.1  # of the recordings may be damaged or have a gap, and of the steps may fall
 MOST_CELLS = 20  # of a recording whose form of times is looked at
 # A number with any decimal mark and any mark of groups.
 NUMBER = re.compile(
@@ -74,10 +75,17 @@ class Column:
 
     @cached_property
     def numbers(self) -> list[Floats]:
-        """The numbers of each recording; empty if any cell is not a number as `form` writes it."""
-        with suppress(DataError):
-            return [table.numbers(self.name, self.form) for table in self.tables]
-        return []
+        """The numbers of each recording that has only numbers as `form` writes them.
+
+        Empty if more than 10 % of the recordings have other cells.
+        """
+        numbers = list[Floats]()
+        for i, table in enumerate(self.tables):
+            with suppress(DataError):
+                numbers.append(table.numbers(self.name, self.form))
+            if i + 1 - len(numbers) > FEW * len(self.tables):
+                return []
+        return numbers
 
     @cached_property
     def steps(self) -> Floats:

@@ -16,7 +16,7 @@ from ..read.recordings import kept_rows
 from ..table import Table
 from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
-from .clock import is_rising, propose_clock, propose_rate
+from .clock import is_timed, propose_clock, propose_rate
 from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import lines_of, part_words, propose_label, row_of, with_meanings
 from .layout import PART_NAME
@@ -28,6 +28,7 @@ PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|we
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
+LOST_OR_OTHER = "rows without a value are no samples, drop = '', or lost ones, invalid = ''"
 LOADS = ("force", "torque")
 FORCES = (
     re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
@@ -188,7 +189,7 @@ def _units(p: Proposal) -> dict[str, str]:
         n = column.counts.total()
         strange = [w for w, k in odd.items() if w.lower() not in LOST and k > STRANGE * n]
         is_number = len(column.counts) - len(odd) > 1 and odd.total() <= MOST_FREQUENT * n
-        is_clock = CLOCK_NAME.search(name) and is_rising(column)
+        is_clock = CLOCK_NAME.search(name) and is_timed(column)
         is_other = is_clock or COUNTER_NAME.fullmatch(name) or column.fixed
         if is_number and not strange and not is_other:
             units[name] = column.unit or unit_in(name.rstrip(ANY))
@@ -200,8 +201,9 @@ def find_lost(p: Proposal) -> None:
 
     They are those already there, and the words of `LOST`, in any case of letters, that a channel
     has; "" is an empty cell. If more than 10 % of the cells of a channel are empty, "" is not added
-    for it: these rows belong to another signal. `[rows]` then drops them, with a note, unless it
-    has words of this channel already. A stated `text.missing` stays.
+    for it: beside a clock these rows belong to another signal. `[rows]` then drops them, with a
+    note, unless it has words of this channel already. Without a clock `[rows]` is `?` for it. A
+    stated `text.missing` stays.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
@@ -210,8 +212,12 @@ def find_lost(p: Proposal) -> None:
         lost = {word for word in column.odd if word.lower() in LOST}
         if column.counts[""] > SPARSE * column.counts.total():
             lost -= {""}
-            rows.setdefault(name, RowWords((ANY,), ("",)))
-            p.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"
+            if name not in rows:
+                about, text = RowWords((ANY,), ("",)), "rows without a value are no samples of it"
+                if not p.description.time.column:
+                    about, text = RowWords((UNKNOWN,)), LOST_OR_OTHER
+                rows[name] = about
+                p.notes |= dict.fromkeys((f"rows.{name}.drop", f"rows.{name}.keep"), text)
         missing |= lost
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))

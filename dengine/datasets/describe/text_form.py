@@ -6,10 +6,10 @@ Each value follows from a count over the lines that were looked at. If two value
 import codecs
 import re
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..description import UNKNOWN, TextForm
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..table import pattern_of
 from ..units import is_unit
-from .columns import LEAST_RUN, NUMBER, Proposal, Stated
+from .columns import LEAST_RUN, NUMBER, Proposal, Stated, Tables
 
 DELIMITERS = (";", "\t", "|", ",", BLANK)
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
@@ -33,8 +33,9 @@ MOST_NAMES = 20  # columns without a header that get a name each
 MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
-    r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|s|ms|us|ns|min|h)[\])]?"
+    r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
 )
+LETTER = re.compile(r"[^\W\d_]")
 Rows = Sequence[Sequence[str]]
 
 
@@ -43,21 +44,23 @@ class Look:
     """The first lines of a file.
 
     form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
+    head : the cells of the lines to the header.
     """
 
     form: TextForm
     width: int
     line: str
     rows: Rows
+    head: Rows
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
     """Return how a text file is written, by its first 200 lines; None if it is empty or no text.
 
-    stated : keys that the user gave; only `text.encoding` and `text.delimiter` are used.
+    stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
     encoding, text = decode(content, stated.get("text.encoding", ""))
-    lines = text.splitlines()[:MOST_LINES]
+    lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))[:MOST_LINES]
     if "\0" in text or not text.strip():
         return None
     marks = stated.get("text.delimiter", DELIMITERS)
@@ -66,10 +69,15 @@ def look(content: bytes, stated: Stated) -> Look | None:
         delimiter = ","
         width = 1
     rows = [split_line(line, delimiter) if line.strip() else [] for line in lines]
-    data = _first_row(rows, width)
-    header, units = _head_lines(rows[:data], width)
+    first = _first_row(rows, width)
+    header = stated.get("text.header", 0)
+    if isinstance(header, str):
+        header = next((i for i, line in enumerate(lines, 1) if line.startswith(header)), 0)
+    heads = [i for i in _wide_lines(rows, first, width) if i >= header]
+    header, units = _head_lines(rows, heads, header)
+    data = max(first, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
+    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], rows[:header])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -112,28 +120,69 @@ def _count_numbers(cells: Sequence[str]) -> int:
 def _first_row(rows: Rows, width: int) -> int:
     """Return the first row of samples, from 0; 0 if there is none.
 
-    It is the first of four successive rows that each have about as many numbers as is usual.
+    It is the first of four successive rows that each have about as many numbers as is usual, or the
+    first of the rows right above them that are as wide and begin with a number.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
-    return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
+    first = next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
+    while first and counts[first - 1] and NUMBER.fullmatch(rows[first - 1][0]):
+        first -= 1
+    return first
 
 
-def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
+def _wide_lines(rows: Rows, first: int, width: int) -> list[int]:
+    """Return the lines, from 1, above the samples that have words and at least `width` cells.
+
+    Columns at the end that are empty in all samples are not counted.
+
+    first : the first row of samples, from 0.
+    """
+    while width > 1 and not any(map(str.strip, chain(*(row[width - 1 :] for row in rows[first:])))):
+        width -= 1
+    above = enumerate(rows[:first], 1)
+    return [i for i, row in above if len(row) >= width and LETTER.search("".join(row))]
+
+
+def _head_lines(rows: Rows, heads: Sequence[int], stated: int) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The header is the last line with at least `width` cells. But if that holds only units, and an
-    earlier line is as wide, it is the line of the units, and the earlier one is the header.
+    The line of the units is the last one that holds only units, and the header is the wide line
+    before it, or the last one if there are no units. Below a stated header one unit is enough.
 
-    rows : the cells of the lines above the samples.
+    heads : the wide lines. stated : the header; 0 if it is not stated.
     """
-    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(map(str.strip, row))]
-    units = 0
-    if len(heads) > 1:
-        cells = filter(None, map(str.strip, rows[heads[-1] - 1]))
-        if all(is_unit(cell) or UNIT_WORDS.fullmatch(cell) for cell in cells):
-            units = heads.pop()
-    return max(heads, default=0), units
+    least = 0.01 if stated else 1
+    units = max((i for i in heads[1:] if _share_of_units(rows[i - 1]) >= least), default=0)
+    header = stated or max((i for i in heads if not units or i < units), default=0)
+    return header, units
+
+
+def _share_of_units(row: Sequence[str]) -> float:
+    """Return the share of units among the cells of a row that are not empty."""
+    return float(np.mean([is_unit(w) or bool(UNIT_WORDS.fullmatch(w)) for w in _words(row)] or 0))
+
+
+def _words(row: Sequence[str]) -> list[str]:
+    """Return the cells of a row that are not empty."""
+    return [*filter(None, map(str.strip, row))]
+
+
+def _doubtful_heads(above: Rows) -> list[str]:
+    """Return the lines that may be the header, with their numbers, if the header is doubtful.
+
+    It is, if it has a unit among its names, or a name twice, and a line above it has as many words
+    and no number.
+
+    above : the cells of the lines above the samples, the header last.
+    """
+    lines = [*map(_words, above)]
+    names = lines[-1] if lines else []
+    if not _share_of_units(names) and len({*names}) == len(names):
+        return []
+    heads = {i: line for i, line in enumerate(lines, 1) if len(line) >= len(names)}
+    shown = [f"{i} ({' '.join(line)})" for i, line in heads.items() if not _count_numbers(line)]
+    return shown if len(shown) > 1 else []
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
@@ -150,7 +199,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
         if item := look(content, p.stated):
             groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
+        do = "state text.encoding, like cp932 or utf-16-le, if they are texts"
+        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none; {do}.")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
@@ -163,8 +213,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     """Set the keys of `[text]` in `p`, as the first of these files is written.
 
-    If the header stands at different lines, `text.header` becomes its text. A note warns if the
-    encoding is guessed. The marks in numbers are set by `propose_marks`.
+    If the header stands at different lines, `text.header` becomes its text. If it is doubtful, it
+    is `?`, with a note that shows the lines. A note warns if the encoding is guessed.
 
     looks : the first lines of files of one form.
     """
@@ -178,28 +228,33 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     if any(item.form.encoding == LATIN for item in looks):
         form = replace(form, encoding=LATIN)
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    names = () if p.stated.get("text.header") else tuple(_column_names(usual))
+    names = tuple(_column_names(usual)) if usual.line or not above else ()
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
-    cells = {cell.strip() for item in looks for row in item.rows for cell in row}
-    propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
+    if heads := _doubtful_heads(usual.head):
+        p.put("text.header", UNKNOWN, f"the line of the names is one of {listed(heads)}")
+    if UNKNOWN in names:
+        p.notes["text.names"] = f"{usual.width} names for {usual.line.strip()!r}"
 
 
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    If the header has more names than there are columns, its first names are used. Without a header
-    the names are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names all of them. Such
-    a matrix has a part in each row; if its first column has few different whole numbers, it is
-    named `class`.
+    The last columns, which are empty, may lack a name. If the header has more names than there are
+    columns, they are `?`. Without a header the names are `c0`, `c1`, ...; for 20 columns or more it
+    is `x*`, which names all of them. Such a matrix has a part in each row; if its first column has
+    few different whole numbers, it is named `class`.
 
     usual : the first lines of a typical file.
     """
     width = usual.width
     if usual.line:
         line = COMMENT.sub("", usual.line.lstrip())
-        names = header_names(split_line(line, usual.form.delimiter))
-        return names[:width] if len(names) > width else []
+        cells = split_line(line, usual.form.delimiter)
+        if any(map(str.strip, cells[width:])):
+            return [UNKNOWN]
+        names = header_names([*cells, *[""] * (width - len(cells))])
+        return names[:width] if len(cells) != width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
@@ -207,7 +262,7 @@ def _column_names(usual: Look) -> Sequence[str]:
     return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
 
 
-def propose_marks(p: Proposal, cells: Collection[str]) -> None:
+def propose_marks(p: Proposal, tables: Tables) -> None:
     """Set in `p` the decimal mark and the mark between groups of digits that read most numbers.
 
     `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if both
@@ -215,12 +270,15 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     between groups is `?`, with a note, if fewer than 5 % of the numbers need it and no number has
     both a point and a comma: `7,286` among `7.1` and `8.2` may be a damaged number.
 
-    cells : texts that are numbers with some marks.
+    tables : those of the files that are looked at, with all cells as texts.
     """
+    words = {word for table in tables for column in table.columns.values() for word in column}
+    cells = [*filter(NUMBER.fullmatch, {word.strip() for word in words})]
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
     n_read = dict[tuple[str, str], int]()
     possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
-    for mark, group in product(possible, GROUPS):
+    groupings = [p.description.text.thousands] if "text.thousands" in p.stated else GROUPS
+    for mark, group in product(possible, groupings):
         if mark != group:
             pattern = pattern_of(mark, group)
             n_read[mark, group] = sum(n for cell, n in counts.items() if pattern.fullmatch(cell))
@@ -229,7 +287,7 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     p.put("text.decimal", marks[0])
     p.put("text.thousands", groups[0])
     is_both = any({*".,"} <= {*cell} for cell in cells)
-    n_needed = most - n_read[marks[0], ""]
+    n_needed = most - n_read.get((marks[0], ""), 0)
     if groups[0] in (".", ",") and not is_both and n_needed < (1 - LIKELY) * len(cells):
         p.put("text.thousands", UNKNOWN, f"'.' or ',', or '' if there is none: {n_needed} need it")
     marked = [cell for cell in cells if {*cell}.intersection(".,")]
