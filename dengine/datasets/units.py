@@ -56,7 +56,5 @@ def unit_in(name: str) -> str:
 
     Behind `/` or `_` a single letter or digit is none, except N: `Fz_W` is a force in world axes.
     """
-    match = re.search(r"([\[({<]|\bin |[/_])\s*([^\[\](){}<>/_ ]+)\s*[\])}>]?$", name)
-    if not match or (match[1] in "/_" and match[2] != "N" and len(match[2]) == 1):
-        return ""
-    return match[2] if is_unit(match[2]) else ""
+    match = re.search(r"(?:[\[({<]|\bin |[/_](?![^N]$))\s*([^\[\](){}<>/_ ]+)\s*[\])}>]?$", name)
+    return match[1] if match and is_unit(match[1]) else ""

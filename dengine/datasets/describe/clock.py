@@ -30,18 +30,19 @@ NAMED_UNIT = re.compile(
     r"(?i)(?P<ns>(?:^|[^a-z])n(?:ano)?_?se|nsecs?$)|(?P<ms>^milli|millis|^ms$|(?-i:[a-z]Ms$))"
     r"|(?P<us>micros)|(?P<s>(?:^|[^a-z])secs?(?:onds?)?$)"
 )
+MILLIONTHS = "0.0864 s"  # of a day
 # Counts since some day: their unit, the seconds from that day to 1970, and what they are called.
 EPOCHS = (
     *((unit, 0, f"{unit} since 1970") for unit in ("s", "ms", "us", "ns")),
     ("d", 2_209_161_600, "days since 1900, as spreadsheets count them"),
-    ("0.0864 s", 2_209_161_600, "1e-6 days since 1900, as WinCC counts them"),
+    (MILLIONTHS, 2_209_161_600, "1e-6 days since 1900, as WinCC counts them"),
     ("0.1 us", 11_644_473_600, "0.1 us since 1601"),
     ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
 )
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Smaller steps are taken for seconds: as milliseconds they would be of a rate above 50 kHz.
 SLOWEST_STEP = 0.019
-EVEN = 1e-4  # by which a rate may differ from a whole number of hertz
+EVEN = 0.05  # Hz by which a rate may differ from a whole number
 STROKE = "s"  # a name of seconds, and of a stroke
 ANSWERS = (  # to a clock that the reader would refuse
     "state the longest time.gap (0: any; with traces.lengths=resample if the clock jitters), or "
@@ -60,8 +61,8 @@ def propose_clock(p: Proposal) -> None:
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if stated:
         clocks = [p.columns[name] for name in stated if name in p.columns]
-    has_all = clocks or "c0" in p.description.text.names
-    every = [c for c in p.columns.values() if has_all or (c.name == STROKE and is_timed(c))]
+    is_open = clocks or "c0" in p.description.text.names or STROKE in p.columns
+    every = p.columns.values() if is_open else ()
     has_days = any(has_day(form) for column in clocks for form in column.forms)
     coarse = [] if has_days else [c for c in p.unused if c.forms or is_coarse(c)]
     names = [c.name for c in every if c in clocks or c in coarse or not clocks]
@@ -117,7 +118,7 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
     why it is `?`, or which size proves the unit. If day and month can be confused, the form is `?`,
     unless all recordings are of one day, which a column beside this one does not pass. The form is
-    `?`, too, if the size of the numbers proves another unit than the file or the name states.
+    `?`, too, for numbers like the millionths of days that WinCC writes, if another unit is stated.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -125,18 +126,15 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    stated = [re.sub("(?i)secs?", "s", unit) for unit in (column.unit, _unit_in(column.name))]
-    for unit in (*forms, *stated):
-        if unit in forms:
-            return unit
-        if unit.lstrip("0123456789. ") in UNITS:
-            counted = _unit_since(column)
-            if counted and scale_of(counted[0]) != scale_of(unit):
-                p.notes["time.format"] = f"{unit}, as stated, or {counted[0]}: {counted[1]}"
-                return UNKNOWN
-            return unit
-    unit, p.notes["time.format"] = _unit_since(column) or _unit_by_size(column)
-    return unit
+    by_size, note = ("", "") if forms else _unit_by_size(column)
+    for unit in (*forms, column.unit, _unit_in(column.name)):
+        unit = unit.replace("sec", "s")
+        if unit in forms or unit.lstrip("0123456789. ") in UNITS:
+            if by_size != MILLIONTHS or unit == MILLIONTHS:
+                return unit
+            by_size, note = UNKNOWN, f"{unit}, as stated, or {by_size}: {note}"
+    p.notes["time.format"] = note
+    return by_size
 
 
 def _unit_in(name: str) -> str:
@@ -145,17 +143,6 @@ def _unit_in(name: str) -> str:
         return match[1].replace(",", ".")
     match = NAMED_UNIT.search(name)
     return (match and match.lastgroup) or ""
-
-
-def _unit_since(column: Column) -> tuple[str, str] | None:
-    """Return the unit of numbers that count since some day, and a note; None if they do not."""
-    rising = column.steps[column.steps > 0]
-    for unit, zero, title in EPOCHS if len(rising) else ():
-        scale = scale_of(unit)
-        start = float(column.numbers[0][0]) * scale - zero
-        if YEARS[0] <= start <= YEARS[1] and is_rate(float(np.median(rising)) * scale):
-            return unit, f"{title}, by the size of the numbers"
-    return None
 
 
 def _unit_by_size(column: Column) -> tuple[str, str]:
@@ -168,11 +155,15 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
     if not len(rising):
         odd = listed([*column.odd][:3])
         return UNKNOWN, f"no form of times that is known fits {odd}: state it, or text.drop"
+    first = float(column.numbers[0][0])
     step = float(np.median(rising))
+    for unit, zero, title in EPOCHS:
+        scale = scale_of(unit)
+        if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
+            return unit, f"{title}, by the size of the numbers"
     steps = {unit: step * UNITS[unit] for unit in ("s", "min", "ms", "us", "ns")}
-    per_minute = 1 / steps["min"]
-    is_minutes = is_rate(steps["min"]) and abs(per_minute / round(per_minute) - 1) < EVEN
-    if step <= SLOWEST_STEP and not is_minutes:
+    rate = 1 / steps["min"]
+    if step <= SLOWEST_STEP and (rate < LEAST_RATE_HZ or abs(rate - round(rate)) > EVEN):
         return "s", f"seconds, for steps of {step:.6g}; the unit is not stated"
     rates = ", ".join(f"{unit} ({1 / s:.6g} Hz)" for unit, s in steps.items() if is_rate(s))
     return UNKNOWN, f"steps of {step:.6g}, the unit is not stated: {rates}"

@@ -80,12 +80,10 @@ class Column:
         Empty if more than 10 % of the recordings have other cells.
         """
         numbers = list[Floats]()
-        for i, table in enumerate(self.tables):
+        for table in self.tables:
             with suppress(DataError):
                 numbers.append(table.numbers(self.name, self.form))
-            if i + 1 - len(numbers) > FEW * len(self.tables):
-                return []
-        return numbers
+        return numbers if len(numbers) >= (1 - FEW) * len(self.tables) else []
 
     @cached_property
     def steps(self) -> Floats:

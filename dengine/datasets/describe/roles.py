@@ -28,7 +28,6 @@ PART_LINE = re.compile(r"(?i)serial|barcode|dmc|part ?(no|num|id)|teilenummer|we
 QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
-LOST_OR_OTHER = "rows without a value are no samples, drop = '', or lost ones, invalid = ''"
 LOADS = ("force", "torque")
 FORCES = (
     re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
@@ -201,23 +200,19 @@ def find_lost(p: Proposal) -> None:
 
     They are those already there, and the words of `LOST`, in any case of letters, that a channel
     has; "" is an empty cell. If more than 10 % of the cells of a channel are empty, "" is not added
-    for it: beside a clock these rows belong to another signal. `[rows]` then drops them, with a
-    note, unless it has words of this channel already. Without a clock `[rows]` is `?` for it. A
-    stated `text.missing` stays.
+    for it if there is a clock: these rows belong to another signal. `[rows]` then drops them, with
+    a note, unless it has words of this channel already. A stated `text.missing` stays.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
     for name in p.description.channels.keys() & p.columns.keys():
         column = p.columns[name]
         lost = {word for word in column.odd if word.lower() in LOST}
-        if column.counts[""] > SPARSE * column.counts.total():
+        is_sparse = column.counts[""] > SPARSE * column.counts.total()
+        if is_sparse and p.description.time.column:
             lost -= {""}
-            if name not in rows:
-                about, text = RowWords((ANY,), ("",)), "rows without a value are no samples of it"
-                if not p.description.time.column:
-                    about, text = RowWords((UNKNOWN,)), LOST_OR_OTHER
-                rows[name] = about
-                p.notes |= dict.fromkeys((f"rows.{name}.drop", f"rows.{name}.keep"), text)
+            rows.setdefault(name, RowWords((ANY,), ("",)))
+            p.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"
         missing |= lost
     set_rows(p, rows)
     p.put("text.missing", sorted(missing))

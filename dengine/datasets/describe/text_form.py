@@ -9,7 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from itertools import chain, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -68,13 +68,9 @@ def look(content: bytes, stated: Stated) -> Look | None:
     if share == 0:  # a single column
         delimiter = ","
         width = 1
-    rows = [split_line(line, delimiter) if line.strip() else [] for line in lines]
+    rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     first = _first_row(rows, width)
-    header = stated.get("text.header", 0)
-    if isinstance(header, str):
-        header = next((i for i, line in enumerate(lines, 1) if line.startswith(header)), 0)
-    heads = [i for i in _wide_lines(rows, first, width) if i >= header]
-    header, units = _head_lines(rows, heads, header)
+    header, units = _head_lines(rows[:first], rows[first:], stated.get("text.header"))
     data = max(first, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], rows[:header])
@@ -120,69 +116,55 @@ def _count_numbers(cells: Sequence[str]) -> int:
 def _first_row(rows: Rows, width: int) -> int:
     """Return the first row of samples, from 0; 0 if there is none.
 
-    It is the first of four successive rows that each have about as many numbers as is usual, or the
-    first of the rows right above them that are as wide and begin with a number.
+    It is the first of four successive rows that each begin with a number, or have about as many
+    numbers as is usual.
     """
-    counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
+    counts = [_count_numbers(row[:1]) * width or _count_numbers(row) for row in rows]
+    counts = [n if len(row) == width else 0 for n, row in zip(counts, rows, strict=True)]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
-    first = next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
-    while first and counts[first - 1] and NUMBER.fullmatch(rows[first - 1][0]):
-        first -= 1
-    return first
+    return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
-def _wide_lines(rows: Rows, first: int, width: int) -> list[int]:
-    """Return the lines, from 1, above the samples that have words and at least `width` cells.
-
-    Columns at the end that are empty in all samples are not counted.
-
-    first : the first row of samples, from 0.
-    """
-    while width > 1 and not any(map(str.strip, chain(*(row[width - 1 :] for row in rows[first:])))):
-        width -= 1
-    above = enumerate(rows[:first], 1)
-    return [i for i, row in above if len(row) >= width and LETTER.search("".join(row))]
-
-
-def _head_lines(rows: Rows, heads: Sequence[int], stated: int) -> tuple[int, int]:
+def _head_lines(above: Rows, samples: Rows, stated: Any) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The line of the units is the last one that holds only units, and the header is the wide line
-    before it, or the last one if there are no units. Below a stated header one unit is enough.
-
-    heads : the wide lines. stated : the header; 0 if it is not stated.
+    Both have a letter and as many cells as the first sample, or one less if the last cells of all
+    samples are empty. The line of the units is the last one that holds only units, and the header
+    the one before it; without units, it is the last one. Below a stated line of the header one unit
+    is enough.
     """
-    least = 0.01 if stated else 1
-    units = max((i for i in heads[1:] if _share_of_units(rows[i - 1]) >= least), default=0)
+    width = len(samples[0]) - (not any(row[-1] for row in samples if row))
+    lines = {i: row for i, row in enumerate(above, 1) if LETTER.search("".join(row))}
+    heads = [i for i, row in lines.items() if len(row) >= width]
+    least = 1.0
+    if isinstance(stated, int) and stated:
+        heads = [stated, *(i for i in heads if i > stated)]
+        least = 0.01
+    units = max((i for i in heads[1:] if _share_of_units(lines[i]) >= least), default=0)
     header = stated or max((i for i in heads if not units or i < units), default=0)
     return header, units
 
 
+def _doubtful_heads(above: Rows) -> list[str]:
+    """Return the lines that may be the header, with their numbers; empty if only the last may be.
+
+    That is doubtful if it has a unit among its names, or a name twice, and another line has as many
+    words and no number.
+
+    above : the cells of the lines from the first to the header.
+    """
+    names = above[-1] if above else ()
+    n = sum(map(bool, names))
+    same = [(i, row) for i, row in enumerate(above, 1) if sum(map(bool, row)) >= n]
+    heads = [f"{i} ({' '.join(row)})" for i, row in same if not _count_numbers(row)]
+    is_odd = _share_of_units(names) > 0 or len({*filter(None, names)}) < n
+    return heads if is_odd and len(heads) > 1 else []
+
+
 def _share_of_units(row: Sequence[str]) -> float:
     """Return the share of units among the cells of a row that are not empty."""
-    return float(np.mean([is_unit(w) or bool(UNIT_WORDS.fullmatch(w)) for w in _words(row)] or 0))
-
-
-def _words(row: Sequence[str]) -> list[str]:
-    """Return the cells of a row that are not empty."""
-    return [*filter(None, map(str.strip, row))]
-
-
-def _doubtful_heads(above: Rows) -> list[str]:
-    """Return the lines that may be the header, with their numbers, if the header is doubtful.
-
-    It is, if it has a unit among its names, or a name twice, and a line above it has as many words
-    and no number.
-
-    above : the cells of the lines above the samples, the header last.
-    """
-    lines = [*map(_words, above)]
-    names = lines[-1] if lines else []
-    if not _share_of_units(names) and len({*names}) == len(names):
-        return []
-    heads = {i: line for i, line in enumerate(lines, 1) if len(line) >= len(names)}
-    shown = [f"{i} ({' '.join(line)})" for i, line in heads.items() if not _count_numbers(line)]
-    return shown if len(shown) > 1 else []
+    are_units = [is_unit(cell) or bool(UNIT_WORDS.fullmatch(cell)) for cell in row if cell]
+    return float(np.mean(are_units or 0))
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
@@ -277,8 +259,7 @@ def propose_marks(p: Proposal, tables: Tables) -> None:
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
     n_read = dict[tuple[str, str], int]()
     possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
-    groupings = [p.description.text.thousands] if "text.thousands" in p.stated else GROUPS
-    for mark, group in product(possible, groupings):
+    for mark, group in product(possible, GROUPS):
         if mark != group:
             pattern = pattern_of(mark, group)
             n_read[mark, group] = sum(n for cell, n in counts.items() if pattern.fullmatch(cell))
@@ -287,7 +268,7 @@ def propose_marks(p: Proposal, tables: Tables) -> None:
     p.put("text.decimal", marks[0])
     p.put("text.thousands", groups[0])
     is_both = any({*".,"} <= {*cell} for cell in cells)
-    n_needed = most - n_read.get((marks[0], ""), 0)
+    n_needed = most - n_read[marks[0], ""]
     if groups[0] in (".", ",") and not is_both and n_needed < (1 - LIKELY) * len(cells):
         p.put("text.thousands", UNKNOWN, f"'.' or ',', or '' if there is none: {n_needed} need it")
     marked = [cell for cell in cells if {*cell}.intersection(".,")]

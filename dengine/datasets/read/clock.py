@@ -97,9 +97,8 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
         period = 0.0 if is_date or any(map(has_day, (unit, *clock.format))) else DAY
     else:
         scale = scale_of(unit)
-        if UNITS.get(bare(table.units.get(name, "")), scale) != scale:
-            message = f"Expected the unit {unit}, as time.format says, got {table.units[name]}"
-            raise UnreadableError(message, form.units, name)
+        if unit in UNITS:
+            scale = UNITS.get(bare(table.units.get(name, "")), scale)
         times: Cells = table.numbers(name, form)
         table.refuse(np.isnan(times), "a time", name)
         with suppress(ValueError, OverflowError):
