@@ -81,8 +81,6 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     """
     p = Proposal(stated or {}, Description().with_values(stated or {}))
-    if p.description.text.thousands == ".":
-        p.put("text.decimal", ",")
     check_text(p.description.text)
     if hasattr(source, "columns"):
         p.put("format", "frame")

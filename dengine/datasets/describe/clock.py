@@ -14,7 +14,7 @@ from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
 from ..units import quantity_of, unit_in
-from .columns import FEW, Column, Proposal, Tables
+from .columns import Column, Proposal, Tables
 
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
@@ -30,20 +30,18 @@ NAMED_UNIT = re.compile(
     r"(?i)(?P<ns>(?:^|[^a-z])n(?:ano)?_?se|nsecs?$)|(?P<ms>^milli|millis|^ms$|(?-i:[a-z]Ms$))"
     r"|(?P<us>micros)|(?P<s>(?:^|[^a-z])secs?(?:onds?)?$)"
 )
-MILLIONTHS = "0.0864 s"  # of a day
 # Counts since some day: their unit, the seconds from that day to 1970, and what they are called.
 EPOCHS = (
     *((unit, 0, f"{unit} since 1970") for unit in ("s", "ms", "us", "ns")),
     ("d", 2_209_161_600, "days since 1900, as spreadsheets count them"),
-    (MILLIONTHS, 2_209_161_600, "1e-6 days since 1900, as WinCC counts them"),
+    ("0.0864 s", 2_209_161_600, "1e-6 days since 1900, as WinCC counts them"),
     ("0.1 us", 11_644_473_600, "0.1 us since 1601"),
     ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
 )
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Smaller steps are taken for seconds: as milliseconds they would be of a rate above 50 kHz.
 SLOWEST_STEP = 0.019
-EVEN = 0.05  # Hz by which a rate may differ from a whole number
-STROKE = "s"  # a name of seconds, and of a stroke
+FEW = 0.1  # of the recordings that may have a gap, and of the steps that may fall
 ANSWERS = (  # to a clock that the reader would refuse
     "state the longest time.gap (0: any; with traces.lengths=resample if the clock jitters), or "
     "time.wrap of a counter that begins again, another time.column, or none, [], and time.rate_hz"
@@ -61,7 +59,7 @@ def propose_clock(p: Proposal) -> None:
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if stated:
         clocks = [p.columns[name] for name in stated if name in p.columns]
-    is_open = clocks or "c0" in p.description.text.names or STROKE in p.columns
+    is_open = clocks or "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
     every = p.columns.values() if is_open else ()
     has_days = any(has_day(form) for column in clocks for form in column.forms)
     coarse = [] if has_days else [c for c in p.unused if c.forms or is_coarse(c)]
@@ -85,13 +83,8 @@ def is_clock(column: Column) -> bool:
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    return is_named and is_timed(column)
-
-
-def is_timed(column: Column) -> bool:
-    """Return whether a column has numbers that rise, and no unit of another quantity than time."""
-    unit = column.unit or unit_in(column.name)
-    return quantity_of(unit) is None and is_rising(column)
+    has_unit = quantity_of(column.unit or unit_in(column.name)) is not None
+    return is_named and not has_unit and is_rising(column)
 
 
 def is_coarse(column: Column) -> bool:
@@ -117,8 +110,7 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
     why it is `?`, or which size proves the unit. If day and month can be confused, the form is `?`,
-    unless all recordings are of one day, which a column beside this one does not pass. The form is
-    `?`, too, for numbers like the millionths of days that WinCC writes, if another unit is stated.
+    unless another column tells the time of day and all recordings have one date.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -126,15 +118,11 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    by_size, note = ("", "") if forms else _unit_by_size(column)
     for unit in (*forms, column.unit, _unit_in(column.name)):
-        unit = unit.replace("sec", "s")
-        if unit in forms or unit.lstrip("0123456789. ") in UNITS:
-            if by_size != MILLIONTHS or unit == MILLIONTHS:
-                return unit
-            by_size, note = UNKNOWN, f"{unit}, as stated, or {by_size}: {note}"
-    p.notes["time.format"] = note
-    return by_size
+        if unit in forms or unit.replace("msec", "ms").lstrip("0123456789. ") in UNITS:
+            return unit.replace("sec", "s")
+    unit, p.notes["time.format"] = _unit_by_size(column)
+    return unit
 
 
 def _unit_in(name: str) -> str:
@@ -161,10 +149,9 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
         scale = scale_of(unit)
         if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
             return unit, f"{title}, by the size of the numbers"
-    steps = {unit: step * UNITS[unit] for unit in ("s", "min", "ms", "us", "ns")}
-    rate = 1 / steps["min"]
-    if step <= SLOWEST_STEP and (rate < LEAST_RATE_HZ or abs(rate - round(rate)) > EVEN):
+    if step <= SLOWEST_STEP:
         return "s", f"seconds, for steps of {step:.6g}; the unit is not stated"
+    steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns")}
     rates = ", ".join(f"{unit} ({1 / s:.6g} Hz)" for unit, s in steps.items() if is_rate(s))
     return UNKNOWN, f"steps of {step:.6g}, the unit is not stated: {rates}"
 

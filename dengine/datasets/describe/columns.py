@@ -29,7 +29,6 @@ FORMS = (DAY, ISO, *DAYS, *TIMES, "%M:%S.%f", *ZONED, *MOMENTS)
 LIKE_A_TIME = re.compile(r"\d+[:\-./T](\d+|[A-Za-z]{3})[:\-./T]\d|\d+:\d+\.\d|\d{8}T\d{6}")
 LEAST_RUN = 8  # rows of a part
 MOST_WORDS = 12  # that are told apart, as labels
-FEW = 0.1  # of the recordings may be damaged or have a gap, and of the steps may fall
 MOST_CELLS = 20  # of a recording whose form of times is looked at
 # A number with any decimal mark and any mark of groups.
 NUMBER = re.compile(
@@ -83,7 +82,7 @@ class Column:
         for table in self.tables:
             with suppress(DataError):
                 numbers.append(table.numbers(self.name, self.form))
-        return numbers if len(numbers) >= (1 - FEW) * len(self.tables) else []
+        return numbers * (len(numbers) >= 0.9 * len(self.tables))
 
     @cached_property
     def steps(self) -> Floats:

@@ -44,7 +44,7 @@ class Look:
     """The first lines of a file.
 
     form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
-    head : the cells of the lines to the header.
+    head : the cells of the line above the header and of the header.
     """
 
     form: TextForm
@@ -70,10 +70,11 @@ def look(content: bytes, stated: Stated) -> Look | None:
         width = 1
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     first = _first_row(rows, width)
-    header, units = _head_lines(rows[:first], rows[first:], stated.get("text.header"))
+    header, units = _head_lines(rows, first, stated.get("text.header", 0))
     data = max(first, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], rows[:header])
+    head = rows[max(header - 2, 0) : header]
+    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], head)
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -125,46 +126,44 @@ def _first_row(rows: Rows, width: int) -> int:
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
-def _head_lines(above: Rows, samples: Rows, stated: Any) -> tuple[int, int]:
+def _head_lines(rows: Rows, first: int, stated: int) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
     Both have a letter and as many cells as the first sample, or one less if the last cells of all
-    samples are empty. The line of the units is the last one that holds only units, and the header
-    the one before it; without units, it is the last one. Below a stated line of the header one unit
-    is enough.
+    samples are empty. The last such line is the header. But if more than half of its words are
+    units, and there is another one, it is the line of the units, and that one is the header.
+
+    stated : the line of the header; 0 if it is not stated.
     """
-    width = len(samples[0]) - (not any(row[-1] for row in samples if row))
-    lines = {i: row for i, row in enumerate(above, 1) if LETTER.search("".join(row))}
-    heads = [i for i, row in lines.items() if len(row) >= width]
-    least = 1.0
-    if isinstance(stated, int) and stated:
-        heads = [stated, *(i for i in heads if i > stated)]
-        least = 0.01
-    units = max((i for i in heads[1:] if _share_of_units(lines[i]) >= least), default=0)
-    header = stated or max((i for i in heads if not units or i < units), default=0)
-    return header, units
+    width = len(rows[first]) - (not any(row[-1] for row in rows[first:] if row))
+    heads = [i for i, row in enumerate(rows[:first], 1) if len(row) >= width and i >= stated]
+    heads = [i for i in heads if LETTER.search("".join(rows[i - 1]))]
+    units = 0
+    if len(heads) > 1 and 2 * _count_units(rows[heads[-1] - 1]) > _count_words(rows[heads[-1] - 1]):
+        units = heads.pop()
+    return stated or max(heads, default=0), units
 
 
-def _doubtful_heads(above: Rows) -> list[str]:
-    """Return the lines that may be the header, with their numbers; empty if only the last may be.
+def _count_units(row: Sequence[str]) -> int:
+    """Return how many cells are units."""
+    return sum(1 for cell in row if is_unit(cell) or UNIT_WORDS.fullmatch(cell))
 
-    That is doubtful if it has a unit among its names, or a name twice, and another line has as many
-    words and no number.
 
-    above : the cells of the lines from the first to the header.
+def _count_words(row: Sequence[str]) -> int:
+    """Return how many cells are not empty."""
+    return sum(map(bool, row))
+
+
+def _is_doubtful(head: Rows) -> bool:
+    """Return whether the names may stand in the line above the header.
+
+    They may if it has as many words, and the header has a unit among its names, or a name twice.
+
+    head : the cells of the line above the header, if there is one, and of the header.
     """
-    names = above[-1] if above else ()
-    n = sum(map(bool, names))
-    same = [(i, row) for i, row in enumerate(above, 1) if sum(map(bool, row)) >= n]
-    heads = [f"{i} ({' '.join(row)})" for i, row in same if not _count_numbers(row)]
-    is_odd = _share_of_units(names) > 0 or len({*filter(None, names)}) < n
-    return heads if is_odd and len(heads) > 1 else []
-
-
-def _share_of_units(row: Sequence[str]) -> float:
-    """Return the share of units among the cells of a row that are not empty."""
-    are_units = [is_unit(cell) or bool(UNIT_WORDS.fullmatch(cell)) for cell in row if cell]
-    return float(np.mean(are_units or 0))
+    names = head[-1] if len(head) > 1 else ()
+    is_odd = _count_units(names) or len({*names}) < len(names)
+    return bool(is_odd) and _count_words(head[0]) >= _count_words(names)
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
@@ -181,8 +180,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
         if item := look(content, p.stated):
             groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        do = "state text.encoding, like cp932 or utf-16-le, if they are texts"
-        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none; {do}.")
+        where = f"{listed(p.names)}, found none; state text.encoding"
+        raise DataError(f"Expected a text with numbers in {where} if it is not UTF-8.")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
@@ -195,8 +194,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     """Set the keys of `[text]` in `p`, as the first of these files is written.
 
-    If the header stands at different lines, `text.header` becomes its text. If it is doubtful, it
-    is `?`, with a note that shows the lines. A note warns if the encoding is guessed.
+    If the header stands at different lines, `text.header` becomes its text. If the line above it
+    may be the header, it is `?`, with a note that shows both. A note warns if the encoding is guessed.
 
     looks : the first lines of files of one form.
     """
@@ -213,8 +212,9 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     names = tuple(_column_names(usual)) if usual.line or not above else ()
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
-    if heads := _doubtful_heads(usual.head):
-        p.put("text.header", UNKNOWN, f"the line of the names is one of {listed(heads)}")
+    if _is_doubtful(usual.head):
+        text = listed(" ".join(row) for row in usual.head)
+        p.put("text.header", UNKNOWN, f"line {above - 1} or {above} has the names: {text}")
     if UNKNOWN in names:
         p.notes["text.names"] = f"{usual.width} names for {usual.line.strip()!r}"
 
