@@ -27,7 +27,7 @@ from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
 from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
-from .text_form import propose_form, propose_marks
+from .text_form import propose_form
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -191,8 +191,6 @@ def read_tables(p: Proposal, contents: Mapping[str, bytes]) -> list[Table]:
             files.append(table_in(p, contents[name], name))
     if faults and not files:
         raise DataError(f"Expected a table of samples, found none: {faults[0]}.")
-    if p.description.format == "text":
-        propose_marks(p, files)
     heads = [tuple(table.columns) for table in files]
     usual = max(heads, key=heads.count, default=())
     return [table for table, head in zip(files, heads, strict=True) if head == usual]

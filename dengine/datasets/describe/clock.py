@@ -119,7 +119,7 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
     for unit in (*forms, column.unit, _unit_in(column.name)):
-        if unit in forms or unit.replace("msec", "ms").lstrip("0123456789. ") in UNITS:
+        if unit in forms or unit.replace("sec", "s").lstrip("0123456789. ") in UNITS:
             return unit.replace("sec", "s")
     unit, p.notes["time.format"] = _unit_by_size(column)
     return unit

@@ -6,7 +6,7 @@ Each value follows from a count over the lines that were looked at. If two value
 import codecs
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import product
@@ -19,7 +19,7 @@ from ..description import UNKNOWN, TextForm
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..table import pattern_of
 from ..units import is_unit
-from .columns import LEAST_RUN, NUMBER, Proposal, Stated, Tables
+from .columns import LEAST_RUN, NUMBER, Proposal, Stated
 
 DELIMITERS = (";", "\t", "|", ",", BLANK)
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
@@ -44,37 +44,42 @@ class Look:
     """The first lines of a file.
 
     form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
-    head : the cells of the line above the header and of the header.
+    is_doubtful : whether the line above the header has words in all columns, while the header has a
+    unit among its names, or a name twice.
     """
 
     form: TextForm
     width: int
     line: str
     rows: Rows
-    head: Rows
+    is_doubtful: bool
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
-    """Return how a text file is written, by its first 200 lines; None if it is empty or no text.
+    """Return how a text file is written, by its first 400 kB; None if it is empty or no text.
 
     stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
     encoding, text = decode(content, stated.get("text.encoding", ""))
-    lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))[:MOST_LINES]
+    lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
     if "\0" in text or not text.strip():
         return None
     marks = stated.get("text.delimiter", DELIMITERS)
-    share, width, delimiter = max((*_share_of_numbers(lines, mark), mark) for mark in marks)
+    share, width, delimiter = max(
+        (*_share_of_numbers(lines[:MOST_LINES], mark), mark) for mark in marks
+    )
     if share == 0:  # a single column
         delimiter = ","
         width = 1
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
-    first = _first_row(rows, width)
+    first = _first_row(rows[:MOST_LINES], width)
     header, units = _head_lines(rows, first, stated.get("text.header", 0))
     data = max(first, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    head = rows[max(header - 2, 0) : header]
-    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:], head)
+    above, names = (rows[header - 2 : header] if header > 1 else ([""], []))
+    is_odd = _count_units(names) > 0 or len({*names}) < len(names)
+    line = "".join(lines[header - 1 : header])
+    return Look(form, width, line, rows[data:], all(above) and is_odd)
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -120,8 +125,8 @@ def _first_row(rows: Rows, width: int) -> int:
     It is the first of four successive rows that each begin with a number, or have about as many
     numbers as is usual.
     """
-    counts = [_count_numbers(row[:1]) * width or _count_numbers(row) for row in rows]
-    counts = [n if len(row) == width else 0 for n, row in zip(counts, rows, strict=True)]
+    wide = [row if len(row) == width else [] for row in rows]
+    counts = [_count_numbers(row[:1]) * width or _count_numbers(row) for row in wide]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
@@ -139,7 +144,8 @@ def _head_lines(rows: Rows, first: int, stated: int) -> tuple[int, int]:
     heads = [i for i, row in enumerate(rows[:first], 1) if len(row) >= width and i >= stated]
     heads = [i for i in heads if LETTER.search("".join(rows[i - 1]))]
     units = 0
-    if len(heads) > 1 and 2 * _count_units(rows[heads[-1] - 1]) > _count_words(rows[heads[-1] - 1]):
+    words = [*filter(None, rows[heads[-1] - 1])] if len(heads) > 1 else []
+    if 2 * _count_units(words) > len(words):
         units = heads.pop()
     return stated or max(heads, default=0), units
 
@@ -147,23 +153,6 @@ def _head_lines(rows: Rows, first: int, stated: int) -> tuple[int, int]:
 def _count_units(row: Sequence[str]) -> int:
     """Return how many cells are units."""
     return sum(1 for cell in row if is_unit(cell) or UNIT_WORDS.fullmatch(cell))
-
-
-def _count_words(row: Sequence[str]) -> int:
-    """Return how many cells are not empty."""
-    return sum(map(bool, row))
-
-
-def _is_doubtful(head: Rows) -> bool:
-    """Return whether the names may stand in the line above the header.
-
-    They may if it has as many words, and the header has a unit among its names, or a name twice.
-
-    head : the cells of the line above the header, if there is one, and of the header.
-    """
-    names = head[-1] if len(head) > 1 else ()
-    is_odd = _count_units(names) or len({*names}) < len(names)
-    return bool(is_odd) and _count_words(head[0]) >= _count_words(names)
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
@@ -180,8 +169,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
         if item := look(content, p.stated):
             groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        where = f"{listed(p.names)}, found none; state text.encoding"
-        raise DataError(f"Expected a text with numbers in {where} if it is not UTF-8.")
+        where = f"in {listed(p.names)}, found none"
+        raise DataError(f"Expected a text with numbers {where}: is text.encoding right?")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
@@ -212,11 +201,12 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     names = tuple(_column_names(usual)) if usual.line or not above else ()
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
-    if _is_doubtful(usual.head):
-        text = listed(" ".join(row) for row in usual.head)
-        p.put("text.header", UNKNOWN, f"line {above - 1} or {above} has the names: {text}")
+    if usual.is_doubtful:
+        p.put("text.header", UNKNOWN, f"{above}, {usual.line.strip()!r}, or a line above it")
     if UNKNOWN in names:
         p.notes["text.names"] = f"{usual.width} names for {usual.line.strip()!r}"
+    cells = {cell for item in looks for row in item.rows for cell in row}
+    propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
 def _column_names(usual: Look) -> Sequence[str]:
@@ -244,7 +234,7 @@ def _column_names(usual: Look) -> Sequence[str]:
     return ["class", "x*"] if is_class and all(map(WHOLE.fullmatch, firsts)) else ["x*"]
 
 
-def propose_marks(p: Proposal, tables: Tables) -> None:
+def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     """Set in `p` the decimal mark and the mark between groups of digits that read most numbers.
 
     `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if both
@@ -252,10 +242,8 @@ def propose_marks(p: Proposal, tables: Tables) -> None:
     between groups is `?`, with a note, if fewer than 5 % of the numbers need it and no number has
     both a point and a comma: `7,286` among `7.1` and `8.2` may be a damaged number.
 
-    tables : those of the files that are looked at, with all cells as texts.
+    cells : texts that are numbers with some marks.
     """
-    words = {word for table in tables for column in table.columns.values() for word in column}
-    cells = [*filter(NUMBER.fullmatch, {word.strip() for word in words})]
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
     n_read = dict[tuple[str, str], int]()
     possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
