@@ -7,7 +7,7 @@ the candidates. `load_dataset` then reads exactly what the description says.
 import math
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -90,13 +90,7 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
             p.put("layout", "mcap")
             propose_bag(p)
         else:
-            contents = contents_of(p)
-            if p.description.format == "text":
-                propose_form(p, contents)
-            if UNKNOWN in (p.description.text.header, *p.description.text.names):
-                p.notes["channels"] = "they follow from text.header and text.names"
-            else:
-                propose_tables(p, read_tables(p, contents))
+            propose_tables(p, read_tables(p))
     return replace(p.description, notes=p.notes)
 
 
@@ -178,12 +172,17 @@ def contents_of(p: Proposal) -> dict[str, bytes]:
     return contents
 
 
-def read_tables(p: Proposal, contents: Mapping[str, bytes]) -> list[Table]:
+def read_tables(p: Proposal) -> list[Table]:
     """Return one table for each file that is looked at, if it has the most frequent columns.
 
-    Damaged files are left out, also those with a line that has a wrong number of cells. For text
-    files the marks in numbers are set in `p`. Raises DataError if all files are damaged.
+    For text files the keys of `[text]` are set in `p` first, and files of another form move from
+    `p.names` to `p.others`. Damaged files are left out, also those with a line that has a wrong
+    number of cells. Raises DataError if all are damaged, if no text file is a text, or if it is not
+    certain which line or which names are the header.
     """
+    contents = contents_of(p)
+    if p.description.format == "text":
+        propose_form(p, contents)
     files: list[Table] = []
     faults: list[Fault] = []
     for name in [name for name in p.names if name in contents]:

@@ -35,7 +35,6 @@ WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
     r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
 )
-LETTER = re.compile(r"[^\W\d_]")
 Rows = Sequence[Sequence[str]]
 
 
@@ -44,15 +43,12 @@ class Look:
     """The first lines of a file.
 
     form : of the file. width : cells of a row. line : the header. rows : the cells of the samples.
-    is_doubtful : whether the line above the header has words in all columns, while the header has a
-    unit among its names, or a name twice.
     """
 
     form: TextForm
     width: int
     line: str
     rows: Rows
-    is_doubtful: bool
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
@@ -76,10 +72,7 @@ def look(content: bytes, stated: Stated) -> Look | None:
     header, units = _head_lines(rows, first, stated.get("text.header", 0))
     data = max(first, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
-    above, names = (rows[header - 2 : header] if header > 1 else ([""], []))
-    is_odd = _count_units(names) > 0 or len({*names}) < len(names)
-    line = "".join(lines[header - 1 : header])
-    return Look(form, width, line, rows[data:], all(above) and is_odd)
+    return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
@@ -134,20 +127,29 @@ def _first_row(rows: Rows, width: int) -> int:
 def _head_lines(rows: Rows, first: int, stated: int) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    Both have a letter and as many cells as the first sample, or one less if the last cells of all
-    samples are empty. The last such line is the header. But if more than half of its words are
-    units, and there is another one, it is the line of the units, and that one is the header.
+    The header is the last line that is as wide as the samples; cells that are empty in the first
+    sample need no name. But if more than half of its words are units, and an earlier line is as
+    wide, it is the line of the units, and the earlier one is the header. Raises DataError if the
+    line above the header may be the header, too: it is as wide, without an empty cell, and the
+    header has a unit among its names, or a name twice.
 
     stated : the line of the header; 0 if it is not stated.
     """
-    width = len(rows[first]) - (not any(row[-1] for row in rows[first:] if row))
-    heads = [i for i, row in enumerate(rows[:first], 1) if len(row) >= width and i >= stated]
-    heads = [i for i in heads if LETTER.search("".join(rows[i - 1]))]
+    width = max((i for i, cell in enumerate(rows[first], 1) if cell), default=1)
+    above = enumerate(rows[:first], 1)
+    heads = [i for i, row in above if len(row) >= width and any(row) and i >= stated]
     units = 0
-    words = [*filter(None, rows[heads[-1] - 1])] if len(heads) > 1 else []
-    if 2 * _count_units(words) > len(words):
+    if len(heads) > 1 and 2 * _count_units(rows[heads[-1] - 1]) > len(
+        [*filter(None, rows[heads[-1] - 1])]
+    ):
         units = heads.pop()
-    return stated or max(heads, default=0), units
+    header = stated or max(heads, default=0)
+    if {header, header - 1} <= {*heads} and all(rows[header - 2]):
+        above, names = rows[header - 2 : header]
+        if _count_units(names) or len({*names}) < len(names):
+            lines = f"{header - 1}, {above}, or {header}, {names}"
+            raise DataError(f"Expected one line of names, got {lines}; state text.header.")
+    return header, units
 
 
 def _count_units(row: Sequence[str]) -> int:
@@ -183,8 +185,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     """Set the keys of `[text]` in `p`, as the first of these files is written.
 
-    If the header stands at different lines, `text.header` becomes its text. If the line above it
-    may be the header, it is `?`, with a note that shows both. A note warns if the encoding is guessed.
+    If the header stands at different lines, `text.header` becomes its text. A note warns if the encoding is guessed.
 
     looks : the first lines of files of one form.
     """
@@ -201,10 +202,6 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     names = tuple(_column_names(usual)) if usual.line or not above else ()
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
-    if usual.is_doubtful:
-        p.put("text.header", UNKNOWN, f"{above}, {usual.line.strip()!r}, or a line above it")
-    if UNKNOWN in names:
-        p.notes["text.names"] = f"{usual.width} names for {usual.line.strip()!r}"
     cells = {cell for item in looks for row in item.rows for cell in row}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
@@ -212,8 +209,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    The last columns, which are empty, may lack a name. If the header has more names than there are
-    columns, they are `?`. Without a header the names are `c0`, `c1`, ...; for 20 columns or more it
+    The last columns may lack a name. Raises DataError for more names than columns. Without a header the names are `c0`, `c1`, ...; for 20 columns or more it
     is `x*`, which names all of them. Such a matrix has a part in each row; if its first column has
     few different whole numbers, it is named `class`.
 
@@ -224,7 +220,7 @@ def _column_names(usual: Look) -> Sequence[str]:
         line = COMMENT.sub("", usual.line.lstrip())
         cells = split_line(line, usual.form.delimiter)
         if any(map(str.strip, cells[width:])):
-            return [UNKNOWN]
+            raise DataError(f"Expected {width} names, got {cells}; state text.names.")
         names = header_names([*cells, *[""] * (width - len(cells))])
         return names[:width] if len(cells) != width else []
     if width < MOST_NAMES:
