@@ -69,7 +69,7 @@ def look(content: bytes, stated: Stated) -> Look | None:
         width = 1
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     first = _first_row(rows[:MOST_LINES], width)
-    header, units = _head_lines(rows, first, stated.get("text.header", 0))
+    header, units = _head_lines(rows[:first], width, stated.get("text.header", 0))
     data = max(first, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
@@ -124,37 +124,28 @@ def _first_row(rows: Rows, width: int) -> int:
     return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
 
 
-def _head_lines(rows: Rows, first: int, stated: int) -> tuple[int, int]:
+def _head_lines(rows: Rows, width: int, stated: int) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The header is the last line that is as wide as the samples; cells that are empty in the first
-    sample need no name. But if more than half of its words are units, and an earlier line is as
-    wide, it is the line of the units, and the earlier one is the header. Raises DataError if the
-    line above the header may be the header, too: it is as wide, without an empty cell, and the
-    header has a unit among its names, or a name twice.
+    The header is the last line with at least `width` cells. But if more than half of its words are
+    units, and an earlier line is as wide, it is the line of the units, and the earlier one is the
+    header. Raises DataError if the header has a unit among its names, or a name twice, and the line
+    before it has no empty cell: then that may be the header.
 
-    stated : the line of the header; 0 if it is not stated.
+    rows : the cells of the lines above the samples. stated : the header; 0 if it is not stated.
     """
-    width = max((i for i, cell in enumerate(rows[first], 1) if cell), default=1)
-    above = enumerate(rows[:first], 1)
-    heads = [i for i, row in above if len(row) >= width and any(row) and i >= stated]
+    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(row) and i >= stated]
     units = 0
-    if len(heads) > 1 and 2 * _count_units(rows[heads[-1] - 1]) > len(
-        [*filter(None, rows[heads[-1] - 1])]
-    ):
+    while len(heads) > 1 and not units:
+        names = [*filter(None, rows[heads[-1] - 1])]
+        n = sum(is_unit(name) or bool(UNIT_WORDS.fullmatch(name)) for name in names)
+        if 2 * n <= len(names):
+            if all(rows[heads[-2] - 1]) and not stated and (n or len({*names}) < len(names)):
+                lines = f"{heads[-2]} and {heads[-1]}"
+                raise DataError(f"Expected one line of names, got {lines}; state text.header.")
+            break
         units = heads.pop()
-    header = stated or max(heads, default=0)
-    if {header, header - 1} <= {*heads} and all(rows[header - 2]):
-        above, names = rows[header - 2 : header]
-        if _count_units(names) or len({*names}) < len(names):
-            lines = f"{header - 1}, {above}, or {header}, {names}"
-            raise DataError(f"Expected one line of names, got {lines}; state text.header.")
-    return header, units
-
-
-def _count_units(row: Sequence[str]) -> int:
-    """Return how many cells are units."""
-    return sum(1 for cell in row if is_unit(cell) or UNIT_WORDS.fullmatch(cell))
+    return stated or max(heads, default=0), units
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
@@ -199,7 +190,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     if any(item.form.encoding == LATIN for item in looks):
         form = replace(form, encoding=LATIN)
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    names = tuple(_column_names(usual)) if usual.line or not above else ()
+    names = p.stated.get("text.names") or tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
     cells = {cell for item in looks for row in item.rows for cell in row}
