@@ -62,8 +62,10 @@ def listed(names: Iterable[Any]) -> str:
 def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
-    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`. Only the names in `OPTIONS`
-    are rewritten. Text in single quotes, which messages use for data, and all other text stay.
+    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`, and a name alone in
+    parentheses, `(samples)`, becomes `(--samples)`. Only the names in `OPTIONS` are rewritten; a
+    value in quotes loses them unless a shell needs them. Other text in single quotes, which
+    messages use for data, and all other text stay.
     """
 
     def to_option(match: re.Match[str]) -> str:

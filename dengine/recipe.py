@@ -265,9 +265,9 @@ class Recipe:
 
         If `radius` or `retrain_every` is None, the reducer's class is imported, and its default is
         written. Of a reducer given by name the recipe's `params` are written, and no defaults. A
-        reducer object is written as `module:Class` and its parameters. If a parameter is no plain
-        value, like the steps of a pipeline, or the class cannot be imported by name, the object is
-        written as "object Class", and the user must hand it in again.
+        reducer object is written as `module:Class` and its parameters that are not None. If a
+        parameter is no plain value, like the steps of a pipeline, or the class cannot be imported
+        by name, the object is written as "object Class", and the user must hand it in again.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)

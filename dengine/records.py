@@ -215,7 +215,7 @@ def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
         return None
     with instead(
         StoreError,
-        f"Expected a trace's contract in the settings, got {shortened(settings['trace'])}",
+        f"Expected a TraceSpec in the settings, got {shortened(settings['trace'])}",
         ValueError,
         TypeError,
         RecursionError,

@@ -427,9 +427,9 @@ def infer_trace_spec(x: TraceArray) -> tuple[TraceSpec, bool]:
     trace_spec = TraceSpec(samples=x.shape[1], channels=x.shape[0])
     if trace_spec.samples < MIN_SAMPLES:
         raise TraceError(
-            f"Expected a first trace of {MIN_SAMPLES} samples or more, for it sets the contract of "
-            f"all that follow, got {trace_spec.channels} x {trace_spec.samples}; record longer, or "
-            f"start with DataEngine(trace=TraceSpec(samples={trace_spec.samples}, "
+            f"Expected a first trace of {MIN_SAMPLES} samples or more, for it sets the TraceSpec "
+            f"of all that follow, got {trace_spec.channels} x {trace_spec.samples}; record longer, "
+            f"or start with DataEngine(trace=TraceSpec(samples={trace_spec.samples}, "
             f"channels={trace_spec.channels})) if it is meant."
         )
     reason, _ = TraceGate(trace_spec)(torch.from_numpy(x))

@@ -104,9 +104,13 @@ def data(
 
 
 def _print_open_keys(source: DataChoice, description: "Description", path: Path | None) -> None:
-    """Print a description with `?` in it, and the keys that the user must state.
+    """Print a description with `?` in it, and the keys that the user must state, with their notes.
 
-    path : the file to which the description was written, or None.
+    A key without a note is "not known". With `--json` a document with the data, the description and
+    these keys is printed instead.
+
+    source : where the data are; it names them in the document. path : the file to which the
+    description was written, which is printed; None: nothing was written.
     """
     notes = description.notes
     questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]

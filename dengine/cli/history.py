@@ -269,8 +269,8 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     """Yield (title, text) rows of an explanation.
 
     They say when the decision was made and by which version, on which part, and why. Then come the
-    notes on what was computed again, and the share of samples that leave the envelope of the known
-    successes; or a sentence that there are too few successes for an envelope.
+    notes on what was computed again, and the share of samples that leave the envelope, the band of
+    the known successes; or a sentence that there are too few successes for an envelope.
     """
     decision = explanation.decision.decision
     version = decision.model_version

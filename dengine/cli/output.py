@@ -174,10 +174,11 @@ def print_result(
 
 
 def print_parts(*parts: Any) -> None:
-    """Print tables and texts to stdout, with the passwords of database URLs masked.
+    """Print tables and texts to stdout, the texts with the passwords of database URLs masked.
 
-    They fit the terminal, or 80 columns if there is none. A text of one line is wrapped between
-    words, which keeps long paths whole. A text of several lines is printed as it is.
+    `table_of_rows` masks them in its tables. Tables and texts fit the terminal, or 80 columns if
+    there is none. A text of one line is wrapped between words, which keeps long paths whole. A text
+    of several lines is printed as it is.
     """
     from rich.console import Console
 

@@ -357,9 +357,10 @@ COLUMNS = {  # title -> count of a stretch
 def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> None:
     """Print the result of a run: a table of stretches, the cell's own report, and sentences.
 
-    The sentences say how much time was saved, how the retrains went, when safe mode began and
-    ended, and what the certificate is. The counts are added to `record`, which `--json` prints in
-    place of all that. run.csv and run.png are written to `out`.
+    A stretch is a number of consecutive cycles. The sentences say how much time was saved, how the
+    retrains went, when safe mode began and ended, and what the certificate is. The counts are added
+    to `record`, which `--json` prints in place of all that. run.csv and run.png are written to
+    `out`.
     """
     from ..experiments.figures import curves
     from ..experiments.metrics import Costs

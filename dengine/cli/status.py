@@ -174,7 +174,8 @@ def _span_cell(name: str, span: "Span") -> str:
 def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
     """Return a text on the share of wrong decisions: counts, interval, verdict on the tolerance.
 
-    If no outcome is known and nothing can be said, the text says so.
+    Without known outcomes the counts are left out. If the verdict is open as well, so is the
+    interval, and the text only says that nothing, or nothing beside the line stops, is known.
 
     Parameters
     ----------

@@ -13,66 +13,74 @@ import numpy as np
 from ..errors import DataError, instead, listed, percent
 from ..folds import content_hash
 from .dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Dataset, Fault, expect_all
-from .description import Description, TextForm
+from .description import Clock, Description, TextForm
 from .table import Recording
-
-__all__ = [
-    "LEAST_RATE_HZ",
-    "MOST_RATE_HZ",
-    "check_description",
-    "check_text",
-    "lost_note",
-    "tolerance_note",
-    "without_repeats",
-]
 
 
 def check_description(description: Description) -> None:
     """Raise DataError unless recordings can be read by a description; no file is looked at.
 
     No key may have the value `?`, except in `[ignored]` and `[[check]]`. The number of samples of a
-    trace must be stated. A time zone, if stated, must have a known name, and a rate must be between
-    1 Hz and 1 MHz. There must be a channel, and all channels must have the same `limit`, the range
-    of the sensor. Recordings that are ordered by time need a column of times, and there must be as
-    many formats as columns of times. The settings in `[text]` must pass `check_text`.
+    trace must be stated. There must be a channel, and all channels must have the same `limit`, the
+    range of the sensor. Recordings that are ordered by time need a column of times. The settings in
+    `[time]` must pass `check_clock`, and those in `[text]` `check_text`.
     """
-    clock = description.time
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
+    limits = {channel.limit for channel in description.channels.values()}
+    expect_all(
+        {
+            "traces.samples, the samples of each trace": description.traces.samples > 0,
+            "time.column, since the order is time": (
+                description.order != "time" or description.time.column
+            ),
+            "one limit for all channels": len(limits) == 1,
+        }
+    )
+    check_clock(description.time)
+    check_text(description.text)
+
+
+def check_clock(clock: Clock) -> None:
+    """Raise DataError unless times can be read with the settings in `[time]`.
+
+    A time zone, if stated, must have a known name, and a rate must be between 1 Hz and 1 MHz. There
+    must be as many formats as columns.
+    """
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")
-    n_clocks = len(clock.column)
-    limits = {channel.limit for channel in description.channels.values()}
-    wanted = {
-        "traces.samples, the samples of each trace": description.traces.samples > 0,
-        "a rate of 1 Hz to 1 MHz in time.rate_hz": (
-            not clock.rate_hz or LEAST_RATE_HZ <= clock.rate_hz <= MOST_RATE_HZ
-        ),
-        "time.column, since the order is time": n_clocks or description.order != "time",
-        "one limit for all channels": len(limits) == 1,
-        f"a format for each of {n_clocks} columns in [time]": (n_clocks in (0, len(clock.format))),
-    }
-    expect_all(wanted)
-    check_text(description.text)
+    n = len(clock.column)
+    expect_all(
+        {
+            "a rate of 1 Hz to 1 MHz in time.rate_hz": (
+                not clock.rate_hz or LEAST_RATE_HZ <= clock.rate_hz <= MOST_RATE_HZ
+            ),
+            f"a format for each of {n} columns in [time]": n in (0, len(clock.format)),
+        }
+    )
 
 
 def check_text(text: TextForm) -> None:
     """Raise DataError unless text files can be read with the settings in `[text]`.
 
     Python must know the encoding. The delimiter and the decimal mark must be one character each.
-    The samples must begin in line 1 or later.
+    The marks in numbers must differ, and be no other part of a number. The samples must begin in
+    line 1 or later.
     """
-    with instead(DataError, "Expected an encoding in text.encoding", LookupError):
+    with instead(DataError, "Expected an encoding in text.encoding", LookupError, ValueError):
         "".encode(text.encoding)  # also refuses codecs that are of no text
     marks = (text.delimiter, text.decimal)
-    wanted = {
-        f"one character each in text.delimiter and text.decimal, got {marks}": (
-            [*map(len, marks)] == [1, 1]
-        ),
-        "text.thousands other than text.decimal": text.thousands != text.decimal,
-        "text.data, the line of the first samples, of 1 or more": text.data > 0,
-    }
-    expect_all(wanted)
+    expect_all(
+        {
+            f"one character each in text.delimiter and text.decimal, got {marks}": (
+                [*map(len, marks)] == [1, 1]
+            ),
+            "two marks in text.decimal and text.thousands, that are no digit, sign or e": (
+                len({*"0123456789+-eE", text.decimal, text.thousands}) == 16
+            ),
+            "text.data, the line of the first samples, of 1 or more": text.data > 0,
+        }
+    )
 
 
 def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Fault]]:

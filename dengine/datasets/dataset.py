@@ -3,7 +3,7 @@
 A `Fault` says why a recording was left out.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,11 @@ Progress = Callable[[int], None]  # called with the number of files or traces th
 OWN = "dengine"  # key of the metadata by which a table of ours is known
 ABOUT = ("channels", "rate_hz", "unit", "limit", "fit")  # what it says
 expect_data = partial(expect, error=DataError)
+
+
+def unit_text(units: Sequence[str]) -> str:
+    """Return the units of channels as a text, one if they are the same: "kN, mm", "N" or ""."""
+    return ", ".join(units if len({*units}) > 1 else units[:1])
 
 
 def expect_all(wanted: Mapping[str, Any]) -> None:
@@ -170,11 +175,11 @@ class Dataset:
     def select(self, channels: Names) -> "Dataset":
         """Return a data set of some channels, at least one, in this order.
 
-        Of one channel, X has the shape (n, T). Raises DataError for unknown names, and if the
-        channels have no names.
+        Of one channel, X has the shape (n, T). Raises DataError for unknown names, for none, and if
+        the channels have no names.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
-        is_known = {*channels} <= {*self.channels}
+        is_known = set() < {*channels} <= {*self.channels}
         expect_data(is_known, f"channels of {self.name}, {names}", [*channels])
         places = [self.channels.index(name) for name in channels]
         X = np.ascontiguousarray(self.cube[:, places])
@@ -182,7 +187,7 @@ class Dataset:
             self,
             X=X if len(places) > 1 else X[:, 0],
             channels=channels,
-            unit=", ".join(self.spec.units[place] for place in places),
+            unit=unit_text([self.spec.units[place] for place in places]),
         )
 
     def cut(self, samples: int) -> "Dataset":

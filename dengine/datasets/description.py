@@ -309,8 +309,8 @@ class Description:
         """
         version = values.get("version", VERSION)
         is_older = isinstance(version, int) and version <= VERSION
-        do = "install a newer dengine"
-        expect_data(is_older, f"version {VERSION} of {where}", version, do)
+        wanted = f"version {VERSION} of {where}"
+        expect_data(is_older, wanted, version, "install a newer dengine")
         channels = values.get("channels")
         if isinstance(channels, Mapping):
             channels = {
@@ -328,8 +328,7 @@ class Description:
         Raises DataError if it is no TOML, and as `from_dict` does.
         """
         with instead(DataError, f"Expected TOML in {where}", ValueError, RecursionError):
-            values = tomllib.loads(text)
-        return cls.from_dict(values, where)
+            return cls.from_dict(tomllib.loads(text), where)
 
     @classmethod
     def load(cls, path: FilePath) -> "Description":
@@ -337,8 +336,10 @@ class Description:
 
         Raises DataError if the file cannot be read or has more than 1 MB, and as `from_toml` does.
         """
-        path = Path(path)
-        with instead(DataError, f"Expected a description in {path}", OSError, UnicodeDecodeError):
+        with instead(
+            DataError, f"Expected a description in {path}", OSError, ValueError, TypeError
+        ):
+            path = Path(path)
             size = path.stat().st_size
             expect_data(size <= MOST_BYTES, f"{path} of at most 1 MB", f"{size} bytes")
             return cls.from_toml(path.read_text("utf-8-sig"), str(path))
@@ -348,7 +349,7 @@ class Description:
 
         Raises OutputError if the file exists, without `force`, or cannot be written.
         """
-        return write_output(path, self.to_toml().encode(), force)
+        return write_output(path, self.to_toml().encode(errors="replace"), force)
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested dicts of TOML's types, without the notes and without default values.
@@ -491,7 +492,7 @@ def _made(kind: Any, value: Any, where: str) -> Any:
         return _as_kind(kind, value, where)
     expect_data(isinstance(value, Mapping), f"{where} to be a table", value)
     if origin is Mapping:
-        return {name: _made(args[1], item, f"{where}.{name}") for name, item in value.items()}
+        return {str(name): _made(args[1], v, f"{where}.{name}") for name, v in value.items()}
     keys = {about.name: about.type for about in fields(kind) if about.compare}
     values = {}
     for name, item in value.items():
@@ -519,7 +520,7 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
 
 def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
     """Raise DataError if a name is not one of these; it suggests the nearest, or lists them all."""
-    nearest = difflib.get_close_matches(name, names, 1)
+    nearest = difflib.get_close_matches(str(name), names, 1)
     wanted = repr(nearest[0]) if nearest else f"one of {', '.join(names)}"
     expect_data(name in names, f"{wanted} in {where}", name)
 

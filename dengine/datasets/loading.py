@@ -1,7 +1,6 @@
 """`load_dataset`, which reads formats of dengine as they are, other recordings by a description."""
 
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,18 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DataError
+from ..errors import DataError, instead
 from ..files import FilePath, is_database, read_archive, read_errors
 from ..records import stored_trace_spec
-from .dataset import OWN, Dataset, Progress, expect_data, make_dataset
+from .dataset import OWN, Dataset, Progress, expect_data, make_dataset, unit_text
 from .describe import describe
 from .description import FOLDER_FILE, Description, Stated
-from .read.files import find_files
+from .read.files import as_source, find_files
 from .read.recordings import read_recordings
 
 BUNDLED = {"insertion": "insertion.npz"}
 OWN_ARRAYS = ("X", "y", "scale", "rate_hz", "unit", "cause", "channels", "part")
-PATH = (str, os.PathLike)
 
 
 def load_dataset(
@@ -52,8 +50,8 @@ def load_dataset(
         the data set names. None: all channels.
     samples : int, optional
         Number of samples of each trace: the rest is cut off at the end. If the description states
-        fewer samples, or resamples the traces, this number replaces the one that it states. None:
-        as the description states, or as the data set is.
+        fewer samples, or none, or resamples the traces, this number replaces the one that it
+        states. None: as the description states, or as the data set is.
     progress : callable, optional
         Called with 1 after each file.
 
@@ -69,13 +67,12 @@ def load_dataset(
     DataError
         If the description is missing or has a key whose value is `?` (the message says what to
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
-        below 1, or if traces that were read without a description are shorter than `samples`.
+        below 1, if traces that were read without a description are shorter than `samples`, or if
+        a file cannot be read.
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     StoreError
         If the store in a SQLite file cannot be opened.
-    OSError
-        If a file cannot be opened to see whether it is a store.
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))
@@ -85,12 +82,13 @@ def load_dataset(
         data = read()
         data = data.select(names) if names else data
     else:
-        about = description_of(source, description)
+        place = as_source(source)
+        about = description_of(place, description)
         about = about.with_channels(names) if names else about
         traces = about.traces
-        if samples and (samples > traces.samples or traces.lengths == "resample"):
+        is_stated = isinstance(traces.samples, int) and traces.lengths != "resample"
+        if samples and not (is_stated and samples <= traces.samples):
             about = replace(about, traces=replace(traces, samples=samples))
-        place = Path(source) if isinstance(source, PATH) else source
         data = read_recordings(place, about, progress)
     return data.cut(samples) if samples else data
 
@@ -130,15 +128,14 @@ def description_of(
     if isinstance(description, Mapping):
         return Description.from_dict(description)
     if description is None:
-        do = "pass the one that describe(table) proposes"
-        expect_data(isinstance(source, PATH), "a description of the table", None, do)
-        wanted = f"a data set among {', '.join(BUNDLED)}, a file or a folder"
-        expect_data(Path(source).exists(), wanted, str(source), "it does not exist")
+        source = as_source(source)
+        wanted = "a description of the table, like the one that describe(table) proposes"
+        expect_data(isinstance(source, Path), wanted, None)
         description = saved_description(source)
         if not description.is_file():
             proposal = describe(source, stated)
             if not propose:
-                raise DataError(missing_text(Path(source), proposal))
+                raise DataError(missing_text(source, proposal))
             return proposal
     return Description.load(description).with_values(stated or {})
 
@@ -146,17 +143,17 @@ def description_of(
 def count_files(source: str, description: Description | None) -> int:
     """Return how many files of a source are read, for a progress bar.
 
-    It is 1 without a description, or if the source does not exist. Raises DataError if the
-    description fits no file.
+    It is 1 without a description. Raises DataError if the source does not exist, or the description
+    fits no file.
     """
-    path = Path(source)
-    return len(find_files(path, description)) if description is not None and path.exists() else 1
+    return 1 if description is None else len(find_files(as_source(source), description))
 
 
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the error message for recordings without a description.
 
-    It lists the open keys of a proposal, and has the commands that show and save it.
+    It lists the open keys of a proposal, whose value is `?`, and has the commands that show and
+    save it.
     """
     notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
     questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())
@@ -171,10 +168,10 @@ def missing_text(path: Path, proposal: Description) -> str:
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
     """Return a function that reads a source in a format of dengine; None if it needs a description.
 
-    None is also returned for a folder, and for a path that does not exist. A file beside which a
-    description was saved needs it, whatever it holds. Raises DataError for a source of an unknown
-    type, for a damaged .npz or Parquet file, and for a Parquet file without pyarrow. An OSError of
-    opening the file passes.
+    None is also returned for a folder. A file beside which a description was saved needs it,
+    whatever it holds. Raises DataError for a source of an unknown type, for a path that does not
+    exist, for a file that cannot be opened, for a damaged .npz or Parquet file, and for a Parquet
+    file without pyarrow.
     """
     if isinstance(source, Dataset):
         return lambda: source
@@ -182,15 +179,14 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
         return lambda: make_dataset(*source)
     if hasattr(source, "columns"):
         return partial(_from_own_frame, source) if OWN in source.attrs else None
-    wanted = "a name, a path, a Dataset, a DataFrame or a pair (X, y)"
-    expect_data(isinstance(source, PATH), wanted, source)
-    path = Path(source)
     if str(source) in BUNDLED:
-        path = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
+        source = Path(str(files("dengine"))) / "data" / BUNDLED[str(source)]
+    path = as_source(source)
     if path.is_file() and not saved_description(path).is_file():
         for is_own, read in OWN_FILES:
-            if is_own(path):
-                return partial(read, path)
+            with instead(DataError, f"Cannot read {path}", OSError):
+                if is_own(path):
+                    return partial(read, path)
     return None
 
 
@@ -266,7 +262,7 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
         arrays["y"],
         name=name,
         rate_hz=rate_hz and float(rate_hz),
-        unit=", ".join(units),
+        unit=unit_text(units),
         channels=channels,
         limit=arrays.get("limit"),
         fit=arrays.get("fit", "strict"),
@@ -278,10 +274,14 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
 def _read_store(path: Path) -> Dataset:
     """Return the labelled traces of a store, in the order of their labels, corrections applied.
 
-    Quarantined and forgotten traces are left out. If several traces are of one part, `part` is the
-    hash by which the store counts them as one part; otherwise it is None. Raises DataError if the
-    store has no labelled traces, or if its rows contradict its ledger, the chain of hashes over
-    them, and StoreError if the store cannot be opened.
+    The labels are those of the store's cell and of the other cells of its product. Quarantined
+    traces and forgotten labels are left out. So is a trace that is not as it was stored, and an
+    event is written to the store. If several traces are of one part, `part` is the hash by which
+    the store counts them as one part; otherwise it is None.
+
+    Raises DataError if the store has no labelled traces, or if its rows contradict its ledger, the
+    chain of hashes over them. Raises StoreError if the store cannot be opened or read, and if its
+    traces have different shapes.
     """
     from ..store.opening import opening
 
@@ -303,7 +303,7 @@ def _read_store(path: Path) -> Dataset:
         part=hashes if len({*hashes.tolist()}) < len(hashes) else None,
         name=path.stem,
         rate_hz=spec.rate_hz,
-        unit=spec.unit if isinstance(spec.unit, str) else ", ".join(spec.unit or ()),
+        unit=unit_text(spec.units),
         channels=spec.columns,
         limit=spec.limit,
         fit=spec.fit,

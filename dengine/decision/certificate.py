@@ -128,25 +128,25 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
 
 
 def cusum(share: float, parts: float) -> tuple[int, int]:
-    """Design the CUSUM detector that notices a doubled share of wrong parts soonest.
+    """Design the CUSUM detector that notices soonest when the share of wrong decisions doubles.
 
-    A wrong part adds `step` to a sum, a right one takes 1 from it, and the sum restarts at 0 where
-    it would fall below. It alarms at `limit`.
+    A wrong decision adds `step` to a sum, a right one takes 1 from it, and the sum restarts at 0
+    if it would fall below. The detector alarms when the sum is `limit` or more.
 
     Parameters
     ----------
     share : float
-        Probability, above 0 and below 0.5, with which a part may be wrong.
+        Probability, above 0 and below 0.5, with which a decision may be wrong.
     parts : float
-        So many parts, or more, shall pass on average before a false alarm, as long as each part is
-        wrong with probability `share` or less given the past.
+        So many parts, or more, shall pass on average before a false alarm, as long as each decision
+        is wrong with probability `share` or less given the past.
 
     Returns
     -------
     step : int
         At least 1.
     limit : int
-        The smallest limit, from 1 on, with which so many parts pass.
+        The smallest limit, 1 or more, with which `parts` or more pass on average.
 
     References
     ----------

@@ -179,7 +179,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     def _decisions(self, Z: ArrayLike) -> Floats:
         """Decide on each row of Z (n, d); raises NotFittedError before `fit`.
 
-        Returns float64 (n, 5): `ActionCode`, lower, upper, n_success, n_failure.
+        Returns float64 (n, 5): `ActionCode` (0 verify, 1 accept, 2 reject), lower, upper,
+        n_success, n_failure.
         """
         check_is_fitted(self)
         valid = validate_data(self, Z, reset=False)

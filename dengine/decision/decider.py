@@ -216,7 +216,7 @@ def decider_without_model(conditions: DecisionConditions, reason: Reason) -> Dec
 
 @lru_cache(16)
 def trace_gate(channels: int, samples: int) -> TraceGate:
-    """Return the gate that checks traces (C, T) of this shape for faults and hashes them.
+    """Return the module that checks traces (C, T) of this shape for faults and hashes them.
 
     It is cached: it has no state, so all deciders share it.
     """

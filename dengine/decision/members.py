@@ -6,8 +6,8 @@ learning.
 
 *Members* are the parts whose score reached the target level when they were decided, accepted or
 checked. The score for accepting is the lower bound, the score for rejecting 1 - upper bound. Each
-side has candidate *levels* of the score, the strictest first; the rule accepts (rejects) a part
-whose score reaches the threshold of that side, which is one of the levels, or out of reach.
+side has *levels* of the score, possible thresholds, the strictest first; the rule accepts (rejects)
+a part whose score reaches the threshold of that side, which is one of the levels, or out of reach.
 
 *The bet.* A bettor who stakes the same share on every member, against the claim "the mean failure
 probability is above the tolerance", has a capital of 1 / alpha or more with a probability of at
@@ -130,7 +130,7 @@ class MemberEvidence(nn.Module):
     tolerances : pair of float
         For each side, the largest share of wrong decisions.
     levels : two lists of float
-        For each side the candidate levels of the score, strictest first; as many on each side.
+        For each side the levels of the score, strictest first; as many on each side.
     inclusion_probability : float, default 1.0
         Probability, fixed beforehand, that the outcome of a certain decision is asked for; 1 if all
         outcomes are known.

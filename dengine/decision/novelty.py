@@ -178,20 +178,23 @@ class NoveltyGate(nn.Module):
 def fit_novelty(
     traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None
 ) -> NoveltyGate:
-    """Fit the gate that takes these traces for usual; there is no randomness.
+    """Fit a novelty gate, which takes these traces for usual; there is no randomness.
 
     At most `REFERENCES` of the traces, evenly spaced in time, become its references; of these,
-    traces whose features overflow are left out.
+    traces whose features overflow are left out. Each group of features (level, texture,
+    distortions, gaps; see the module) has a limit of its own.
 
     Parameters
     ----------
     traces : array of float32, shape (n, C, T)
         Finite, with any labels, oldest first.
     margin : float
-        Factor on the limits. A limit is the 99.5 % quantile of the references' squared distances to
-        the nearest other reference, or less, so that a few outliers do not set it. The limits are
-        wider with fewer than 200 different references, and those for distortions with fewer than
-        `REFERENCES`.
+        Factor on the limits, which are squared distances. A limit is the 99.5 % quantile of the
+        references' squared distances to the nearest other reference, at least 0.001; if there are
+        outliers, it is less, so that a few of them do not set it. With n < 200 different references
+        it is multiplied by 200 / n; the limit of distortions by `REFERENCES` / n with n <
+        `REFERENCES`. The limit of gaps is at least 4 in the end. An outlier in a cluster of
+        outliers has a wider limit, by the distance to its third nearest outlier.
     parts : array of int64, shape (n,), optional
         Hashes of the parts; None: each trace is a part of its own. Only distances between different
         parts and different traces count, because a trace that came twice is near itself.

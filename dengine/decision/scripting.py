@@ -133,7 +133,7 @@ def restore(module: nn.Module, arrays: Arrays) -> None:
 def incompatible_model_error(defect: str) -> StoreError:
     """Return the error for a stored model of another reducer, or of another version of dengine.
 
-    `defect` ends the phrase "a model whose ...", for example "encoder has other sizes".
+    `defect` ends the phrase "got one whose ...", for example "encoder has other sizes".
     """
     actual = f"one whose {defect}; its labels are whole"
     do = (

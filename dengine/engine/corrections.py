@@ -401,10 +401,11 @@ class Corrections:
     def _finish_change(
         self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
     ) -> Changed:
-        """Record an event and call `on_safe_mode` if a stored change began or ended a safe mode;
-        return what the change did.
+        """Return what a stored change did; also announce a safe mode that it began or ended.
 
-        `reason_ended` is recorded as the reason if a safe mode ended.
+        The event of the change must be in the store already. The announcement is an event and a
+        call of `on_safe_mode`; if it fails, that is logged. `reason_ended` is the reason recorded
+        for an end.
         """
         newest = self._store.events.newest(100)  # a refitted model is an event of its own
         number = max(event.number for event in newest if event.kind == change.kind)

@@ -93,9 +93,10 @@ class DecisionMaker:
         """Return a trace as float32 (channels, samples), converted as the `TraceSpec` demands.
 
         If no `TraceSpec` is in force, a trace without a fault sets it; but if another cell of the
-        product has set one, that one is taken, and the trace must fit it. Before the first training
-        the first finite trace also lets the model compile its code for such traces; a failure of
-        this is logged. Settings that could not be saved before are saved now.
+        product has set one, that one is taken, and the trace must fit it. If a `TraceSpec` is in
+        force, but the store did not take the settings, saving them is tried again; a failure is
+        logged. Until the first version is trained, the first finite trace makes the model compile
+        its code for this shape; a failure of this is logged, too.
 
         A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`.
         Raises TraceError for a wrong shape, or too few samples of a first trace, and SettingError
@@ -109,8 +110,8 @@ class DecisionMaker:
                 return as_trace(trace, self._settings.now.trace)
         elif self._settings.is_unsaved:
             self._settings.save()
-        has_contract = self._settings.now.trace is not None
-        if not self._has_seen_trace and has_contract and np.isfinite(x).all():
+        has_spec = self._settings.now.trace is not None
+        if not self._has_seen_trace and has_spec and np.isfinite(x).all():
             self._has_seen_trace = True
             if not self._live.version:  # what will answer is compiled before there is much to do
                 guarded(NOT_PRECOMPUTED, self._live.template.precompute, x[None])
@@ -181,11 +182,12 @@ class DecisionMaker:
         return self._outbox.record_decision(item)
 
     def sync(self, stored: StoredDecision) -> StoredDecision:
-        """Wait until a decision is on disk, and return the record that counts.
+        """Wait until a decision and all earlier records are on disk; return the record that counts.
 
-        If an ACCEPT or REJECT is not on disk within the store's time limit, a VERIFY with
-        `Reason.NO_STORE` replaces it in the outbox and is returned; if it has reached the disk
-        after all, it stays. A VERIFY stays as it is. Nothing is raised.
+        If that takes longer than the outbox waits, or a write fails, an ACCEPT or REJECT is
+        replaced by a VERIFY with `Reason.NO_STORE`, which is returned. But if it has reached the
+        disk meanwhile, it counts and is returned. A VERIFY is returned as it is. A timeout is not
+        raised.
         """
         decision = stored.decision
         try:
@@ -242,7 +244,7 @@ class DecisionMaker:
         `Reason.MODEL_ERROR`.
         """
         part_hash_ = 0 if part is None else part_hash(part)
-        # Without a contract the trace has a fault, and is decided all the same.
+        # Without a TraceSpec the trace has a fault, and is decided all the same.
         conditions = self._settings.conditions or DecisionConditions(
             TraceSpec(samples=x.shape[1], channels=x.shape[0])
         )

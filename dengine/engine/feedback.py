@@ -292,7 +292,7 @@ class Feedback:
         self.remedy = remedy
 
     def begin_policy(self) -> None:
-        """Forget which accepted parts have no outcome, because another policy begins."""
+        """Drop the accepted parts that wait for an outcome, because another policy begins."""
         self._unreported.clear()
         self._n_unreported = 0
 

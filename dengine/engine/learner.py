@@ -589,9 +589,10 @@ class Learner:
 
         This can be so after a label was forgotten: the training then starts from an earlier version
         or from initial weights. A thread computes what that model needs of the traces in the
-        training window, and keeps it in that model; a failure is logged. Without an executor this
-        call waits for the thread, since the time would count against the time budget of the retrain
-        otherwise. Without labels, and while an earlier thread still works, nothing is begun.
+        training window, and keeps it in that model; a failure is logged. Without an executor the
+        retrain would wait for the thread, and this would count against its time budget; so this
+        call waits for it. Without labels, and while an earlier thread still works, nothing is
+        begun.
         """
         if self._choose_start() is self.live.newest:
             return

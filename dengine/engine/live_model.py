@@ -244,7 +244,7 @@ class LiveModel:
         It is the rule of the model in force, or of the untrained template before the first retrain.
         It begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
         outcomes, as wrong decisions. Labels that are not in the store yet are not, so the rule
-        forgets them: store them before.
+        loses them: store them before.
 
         An update that fails here is logged and makes the rule stale: every part is then verified
         until the engine is opened again. A rule that was stale before stays so. The store's ledger
@@ -324,8 +324,10 @@ class LiveModel:
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         """Return the arrays by name with which the store can restore a model as a version.
 
-        They hold the model, what it was trained on, and which corrections and overdue checks count.
-        If an overdue check counts, an engine that opens the store rebuilds the rule.
+        They hold the model with its rule, the labels that it was trained on, and how far
+        corrections and overdue checks count. If an overdue check counts, they say so
+        (`includes_overdue`): an engine that opens the store then does not take the stored rule, but
+        rebuilds it.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)

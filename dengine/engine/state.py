@@ -61,7 +61,8 @@ class EngineState:
     def complete(self, status: Status) -> Status:
         """Return a copy of a status from the store, completed by what only the engine knows.
 
-        That is version, safe mode, new labels, the store's fault and lag, and whether it retrains.
+        That is version, safe mode, number of labels since the newest retrain began, the store's
+        fault, age of the oldest record that the store lacks, and whether it retrains.
         """
         return replace(
             status,

@@ -464,7 +464,10 @@ class GaussianProcess(Baseline):
         self._components = ScaledComponents(self.n_components, whiten=False, seed=self.seed)
 
     def _fit(self, X: Traces, good: Labels) -> bool:
-        """Train on the newest 500 labels; return False if they are of one class or too few."""
+        """Train on the newest 500 labels; return whether this was done.
+
+        It is not if they are of one class, or no more than `n_components`; the earlier fit stays.
+        """
         from sklearn.gaussian_process import GaussianProcessClassifier
         from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 

@@ -289,7 +289,8 @@ class Replay:
     def stretches(self, n: int) -> list[Row]:
         """Cut the run into stretches of about equal length; return the `stretch` of each.
 
-        There are n of them, or one for each cycle if there are fewer cycles; none without cycles.
+        A stretch is a number of consecutive cycles. There are n of them, or one for each cycle if
+        there are fewer cycles; none without cycles.
         """
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
         return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]

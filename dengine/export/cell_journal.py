@@ -269,7 +269,7 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
         spec = stored_trace_spec(settings)
         if spec is None or "recipe" not in settings:
             wanted = "Expected the store that the model was exported from"
-            raise StoreError(f"{wanted}, {store} knows no trace contract.")
+            raise StoreError(f"{wanted}, {store} has no TraceSpec or no recipe.")
         policy = Recipe.from_toml(settings["recipe"]).policy
         journal = read_journal(path, spec)
         exports = {

@@ -99,9 +99,9 @@ class DecisionModule(nn.Module):
     def decide(self, trace: Tensor, part: int = 0) -> DecisionFields:
         """Decide on one trace, and make this the pending decision: its outcome is not known yet.
 
-        Before that, `settle` learns an earlier accept that is still pending as good, or counts it
-        as unreported; any other pending decision is forgotten. After a faulty trace no decision is
-        pending.
+        Before that, an accept that is still pending is settled (`settle`): it is learned as good,
+        or counts as unreported. Any other pending decision is discarded. After a faulty trace no
+        decision is pending.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make this decision the pending one: the one whose outcome is not reported yet.
 
-        An earlier pending decision is forgotten. `action` is `NONE_PENDING` for a faulty trace;
+        An earlier pending decision is discarded. `action` is `NONE_PENDING` for a faulty trace;
         then no decision is pending. If `part` is 0, the part is unknown, and the hash `content` of
         the trace is used as its part. Whether the trace was novel is read from `reason`.
         """
@@ -227,9 +227,10 @@ class DecisionModule(nn.Module):
         """End the wait for the outcome of a pending accept; return whether it was learned as good.
 
         A pending accept is the part decided last, if it was accepted and nothing was reported on
-        it. With `stops_all` it is learned as good and becomes a reference; otherwise it counts as
-        unreported. Then no decision is pending. If the pending decision is no accept, or there is
-        none, nothing changes.
+        it. With `stops_all` (every line stop is reported) it is learned as good: the rule is
+        updated, and the trace becomes a reference. Otherwise it counts as unreported. Then no
+        decision is pending. If the pending decision is no accept, or there is none, nothing
+        changes.
         """
         if self.pending_action != ActionCode.ACCEPT.value:
             return False
@@ -242,7 +243,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def drop(self) -> None:
-        """Forget the pending decision: its part was not passed on, its outcome stays unknown."""
+        """Discard the pending decision: its part was not passed on, its outcome stays unknown."""
         self.pending_action = self.none_pending
 
     @torch.jit.export
@@ -251,7 +252,7 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make an earlier decision, which a journal holds, the pending decision again.
 
-        A pending accept is first settled by `settle`; any other pending decision is forgotten. The
+        A pending accept is first settled by `settle`; any other pending decision is discarded. The
         trace, (T,) or (C, T), is embedded anew. The other fields are taken as they are given;
         `part` is a hash, 0 if unknown. What the model alone would have done follows from action,
         reason and bound. After a faulty trace no decision is pending. Raises ValueError, or

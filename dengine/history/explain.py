@@ -157,7 +157,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     """Explain one decision from what its store keeps; nothing is trained or embedded.
 
     The policy is the one that was in force at the decision. A damaged label, and a damaged trace of
-    the envelope's, is left out, and an event is written to the store. Nothing else is written.
+    those that make the envelope (the band of the successes), is left out, and an event is written
+    to the store. Nothing else is written.
 
     Parameters
     ----------
@@ -305,12 +306,14 @@ def _find_neighbours(
 def _find_envelope(
     store: SqlStore, item: StoredDecision, version: PastVersion | None
 ) -> Envelope | None:
-    """Return the envelope of the successes among the newest labels up to `version.last_seq`.
+    """Return the envelope of the successes of other parts than the decision's; None if too few.
 
-    At most `MAX_ENVELOPE_LABELS` labels are read, as corrected by now. Traces of the decision's own
-    part (without a number, traces equal to its trace) are left out. Without a version, or if
-    `envelope_of` returns None for these successes, the newest labels of today are taken. None if
-    they do not suffice, either. A damaged trace is left out, and an event is written to the store.
+    The envelope is the band that contains the middle 95 % of the successes at each sample. They are
+    taken from the newest `MAX_ENVELOPE_LABELS` labels up to `version.last_seq`, the newest label
+    that the version knew at the decision. If these give no envelope (`envelope_of` returns None),
+    or without a version, they are taken from the newest labels of today. Labels are taken as
+    corrected by now. Traces of the decision's own part (without a number, traces equal to its
+    trace) are left out. So is a damaged trace, and an event is written to the store.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labels.with_traces(MAX_ENVELOPE_LABELS, last=last)

@@ -75,9 +75,10 @@ class PartMap:
 
 
 def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
-    """Read the map of the parts for a model version from the store.
+    """Read the map of the parts, the points of the web page's picture, for a model version.
 
-    A damaged label is left out, and an event is written to the store.
+    Known parts are references of the version, newest parts are decisions. A damaged label is left
+    out, and an event is written to the store.
 
     Parameters
     ----------
@@ -90,9 +91,12 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
     Returns
     -------
     PartMap
-        With the newest 250 references whose label this cell recorded. Of the cell's newest 10
-        decisions it has those that this version made and for which it embedded the trace. A part
-        that is both appears once, as a newest part.
+        The known parts are the newest 250 references whose label this cell recorded. Their labels
+        are as the version had them, or as they were reported later; a later correction does not
+        show. There are none if no such version was put in force, or if its state is damaged or no
+        longer kept. The newest parts are those of the cell's newest 10 decisions that this version
+        made and for which it embedded the trace, with corrected labels. A part that is both appears
+        once, as a newest part.
     """
     recent = store.decisions.select(HistoryFilter(), N_NAMED)
     newest = list(_newest_marks(recent[-N_NEWEST:], version))

@@ -139,8 +139,9 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
     """Compute how novel the trace of a decision was, by its version's `NoveltyGate`.
 
-    Returns None without a decision, if the decision's reason is not `Reason.NOVEL`, and if the gate
-    cannot be restored.
+    The gate calls a trace novel by its distance from the traces of the training. Returns None
+    without a decision, if the decision's reason is not `Reason.NOVEL`, and if the gate cannot be
+    restored.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -254,10 +255,11 @@ def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None
 
 @dataclass(frozen=True, slots=True)
 class Novelty:
-    """How novel a trace was, in four respects.
+    """How novel a trace was, in four respects: level, texture, distortion and gaps.
 
-    Each is the squared distance to the nearest reference, divided by its limit. A trace is novel if
-    any of the four is above 1.
+    Texture is how rough the signals are, distortion what a faulty sensor or clock would do. Each
+    number is the squared distance to the nearest reference, divided by its limit. A trace is novel
+    if any of the four is above 1.
     """
 
     level: float

@@ -635,22 +635,25 @@ MIN_STRETCH = 20  # decisions of a stretch: a share of fewer jumps
 def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
     """Read the course of a store: counts over time, retrains, safe modes.
 
+    A stretch is a number of consecutive decisions that are counted together.
+
     Parameters
     ----------
     store : SqlStore
     recipe : Recipe
         With the policy's tolerance.
     last : int
-        Number of newest decisions that the picture marks; it is only passed on to `Course`.
+        Number of newest decisions that the picture marks. It is copied to `Course.last` and has no
+        other effect.
     **by
-        `seconds` and `start`, for stretches that are periods of time (see `stretches_query`).
-        Without them each stretch has the same number of decisions, at least 20; the newest may have
-        fewer.
+        `seconds` and `start`, for stretches that are periods of time (see `stretches_query`); only
+        the newest 120 with decisions are returned. Without them all decisions of the cell are split
+        into at most 120 stretches of equal number, at least 20 each; the newest may have fewer.
 
     Returns
     -------
     Course
-        With the newest 120 stretches at most. Its retrains and safe modes are all of the cell.
+        It has all retrains and safe modes of this cell, also those before the first stretch.
     """
     modes = [event for event in store.events.newest() if event.kind in MODES]
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))

@@ -300,7 +300,7 @@ class EngineModel(ABC):
         """
 
     def reset_rule(self, safe_mode: int) -> None:  # noqa: B027  # a default: no rule that learns
-        """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
+        """Reset the rule, so that no outcome counts; it starts in this safe mode, a `SafeMode`.
 
         In a safe mode parts are verified until new outcomes allow decisions again; NONE is no safe
         mode. The default does nothing.

@@ -188,7 +188,7 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     """Return a hashable key, equal for two modules if one compiled module can serve for both.
 
     The key holds the class and the attributes of all submodules; of a tensor it holds only the
-    shape, because `compiled` sets the values. The gate of the force limits is left out. The class
+    shape, because `compiled` sets the values. The module of the force limits is left out. The class
     itself is in the key, not its name: a notebook cell that is run again defines another class.
     """
     parts = [
@@ -202,9 +202,10 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 def _as_key(value: object) -> object:
     """Return the part of `structure_of` for a value; None if the value makes no difference.
 
-    A function stands for itself; its address would not do, since another function may get it later.
-    A list, tuple or dict gives its type and its items: a constant as text, a tensor by its shape.
-    Any other value gives None.
+    A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
+    item is the text of a constant, the shape of a tensor, and else its own `_as_key`. A function is
+    its own key: its address would not do, since another function may get it later. Any other value,
+    and so a constant outside a container, gives None.
     """
     if isinstance(value, FUNCTIONS):
         return value
@@ -365,9 +366,9 @@ class ModelPrediction(EngineModel):
     def effective_recipe(self, recipe: Recipe) -> Recipe:
         """Return a copy of a recipe with the settings that this model really has.
 
-        Radius, alpha, lower bound and interval are taken from the model's classifier, folds (at
-        least 2) and novelty from the model. All else, such as the reducer and the window, stays as
-        in the recipe.
+        Radius, alpha, lower bound and interval are taken from the model's classifier, folds and
+        novelty from the model. For fewer than 2 folds 2 is written, the least that a Recipe takes.
+        All else, such as the reducer and the window, stays as in the recipe.
         """
         classifier = self.classifier
         policy = replace(
@@ -668,7 +669,7 @@ class ModelPrediction(EngineModel):
         self.rule_is_stale = was_stale
 
     def reset_rule(self, safe_mode: int) -> None:
-        """Make the rule forget every outcome and start in a safe mode, a `SafeMode`.
+        """Reset the rule, so that no outcome counts; it starts in this safe mode, a `SafeMode`.
 
         NONE is no safe mode. The rule is reset in place, because the compiled module shares
         its tensors. `rule_is_stale` stays as it is.
@@ -716,14 +717,25 @@ class ModelPrediction(EngineModel):
         )
 
     def decide_one(self, x: Floats, part_hash: int, conditions: DecisionConditions) -> Verdict:
-        """Decide on one raw trace x (C, T), by the decider for these conditions.
+        """Decide on one raw trace x (C, T), in the unit of the sensor, under these conditions.
 
-        The decider is built first if the one that the model keeps is for other conditions.
-        References of the part with this hash are not counted. 0 stands for an unknown part: then
-        references with the same content hash as the trace are not counted. Returns a `Verdict`, the
-        tuple that `Decider.forward` returns, with the scaled embedding (K, d), a point in each of
-        the K spaces. Raises what `build_decider` raises, and RuntimeError if the rule is stale,
-        because an update of it failed; but a trace with a fault is verified all the same.
+        The decider, the module that decides, is built first if the one that the model keeps is for
+        other conditions. References of the part with this hash are not counted. 0 stands for an
+        unknown part: then references with the same content hash as the trace are not counted.
+
+        Returns
+        -------
+        Verdict
+            The tuple that `Decider.forward` returns. Its embedding (K, d) has a point in each of
+            the K spaces, divided by the space's scale.
+
+        Raises
+        ------
+        RuntimeError
+            If the rule is stale, because an update of it failed, and the trace has no fault. A
+            faulty trace is verified without the rule.
+        ValueError, ...
+            As in `build_decider`.
         """
         decider = self.decider(conditions)
         # As `torch.inference_mode`, whose entering costs 3 % of a decision.
@@ -820,11 +832,11 @@ class ModelPrediction(EngineModel):
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
 
-        Trace shape, references and scale are always in it. The names of the arrays of the reducer,
-        the rule and the novelty gate begin with "reducer.", "rule." and "novelty.". A reducer
-        without a state and a disabled gate have no arrays. In place of a stale rule there is
-        "rule_is_stale". Arrays of the scale and the reducer may be views. Raises AttributeError
-        before the first training.
+        Trace shape, references and scale (the divisor of the points in each space) are always in
+        it. The names of the arrays of the reducer, the rule and the novelty gate begin with
+        "reducer.", "rule." and "novelty.". A reducer without a state and a disabled gate have no
+        arrays. In place of a stale rule there is "rule_is_stale". Arrays of the scale and the
+        reducer may be views. Raises AttributeError before the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()

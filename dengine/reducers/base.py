@@ -143,7 +143,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
-        """Fit anew and forget earlier fits. Engines call `train`, which may continue the last fit.
+        """Fit anew and discard earlier fits. Engines call `train`, which may continue the last fit.
 
         Parameters
         ----------
@@ -595,8 +595,9 @@ class LabelFree(_Wrapping):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:
         """Fit a clone of the transformer, `reducer_`, on traces X; labels are ignored.
 
-        X has the shape (n, T) or (n, C, T). Returns self. `dim_` becomes the number of coordinates.
-        Raises what `check_traces` and the transformer raise.
+        X has the shape (n, T) or (n, C, T); a transformer that is no Reducer gets it as rows
+        (n, C * T). Returns self. `dim_` becomes the number of coordinates. Raises what
+        `check_traces` and the transformer raise.
         """
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.as_input(traces))

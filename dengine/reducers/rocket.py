@@ -318,7 +318,7 @@ class RocketReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Draw the kernels anew and fit the classifier heads; earlier fits are forgotten.
+        """Draw the kernels anew and fit the classifier heads; earlier fits are discarded.
 
         Parameters
         ----------
@@ -432,7 +432,7 @@ class RocketReducer(Reducer):
     def _initialize(self, traces: Floats) -> None:
         """Build the module `net_`, with channel scales and kernels from traces (n, C, T).
 
-        No label is read. Earlier fits are forgotten. Raises SettingError for a parameter out of its
+        No label is read. Earlier fits are discarded. Raises SettingError for a parameter out of its
         range or fewer than 2 samples.
         """
         self.build(traces.shape[1], traces.shape[2], averaging(torch.from_numpy(traces)))
@@ -710,8 +710,9 @@ class RocketReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        Afterwards the cache of features is empty and `note_` is "". Raises StoreError if the sizes
-        do not follow from the parameters; the fitted model is lost then.
+        Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
+        Raises StoreError if the sizes do not follow from the parameters; the fitted model is lost
+        then.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
@@ -730,8 +731,9 @@ class RocketReducer(Reducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        Sizes and max_iter are integers of at least 1, except groups (0 to 64); regions are at most
-        16, n_components 1 or 2, folds at least 2, and l2 is above 0.
+        `kernels`, `dilations`, `width` and `max_iter` are integers of at least 1, `regions` is an
+        integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1 or 2, and `folds` at
+        least 2. `l2` is above 0.
         """
         integers = (
             "n_components",

@@ -3,7 +3,7 @@ computes them from raw traces, `compute_raw_features` those of many traces at on
 functions draw the kernels and place them.
 
     x (B, C, T) -> means of a few samples each, channels of one scale            (B, C, L)
-    tower 1     -> F kernels of 9 taps at each of D dilations, at P places       (D, F, P * B)
+    tower 1     -> F kernels of 9 inputs at each of D dilations, at P places     (D, F, P * B)
                 -> a ramp from 0 to 1 around a threshold
                 -> its mean over R regions, plus twice that over all regions     (B, D * F * R)
     tower 2     -> G groups of 8 kernels at each dilation, at Q places of the
@@ -186,9 +186,10 @@ class RocketEncoder(nn.Module):
     def read_taps(self, x: Tensor) -> Tensor:
         """Read the inputs of the kernels from averaged traces (B, C, L): (C, taps, B).
 
-        A tap is an input of a kernel at a place. `taps` has its position: a frame of the trace, a
-        difference of two successive frames, or a 0 for a tap beyond the ends. The batch is the last
-        axis, so that reading a tap copies a row.
+        A tap is an input of a kernel at a place. For each tap, `taps` has an index into a row of L
+        frames (the means of `average` samples), then the L - 1 differences of successive frames,
+        then a 0, which stands for what lies beyond the ends. The batch is the last axis, so that
+        reading a tap copies a row.
         """
         batch = x.size(0)
         differences = x[:, :, 1:] - x[:, :, :-1]
@@ -231,11 +232,12 @@ class RocketEncoder(nn.Module):
     def competition_features(self, windows: Tensor, batch: int) -> Tensor:
         """Compute the features of tower 2: (B, 4D * G * 8).
 
-        `windows` (2D, C * 9, Q * B) are the inputs from `batch` = B traces, see `as_windows`. Each
-        kernel has two features: the root of the share of places at which its output is the largest
-        of its group, and, in the second half of the features, the root of the share of places at
-        which it is the smallest. A place at which the output is less than 1 away from the largest
-        or smallest output counts in part.
+        `windows` (2D, C * 9, Q * B) are the inputs from `batch` = B traces, see `as_windows`: D
+        dilations of the trace, then D of its differences. G groups of 8 kernels compete at each of
+        Q places. The first half of the features tells of each kernel how often its output is the
+        largest of its group, the second half how often it is the smallest. "How often" is the root
+        of the mean over the places of a score: 1 for the winner, 1 - distance for an output that is
+        less than 1 away from it, else 0.
         """
         n_groups = 2 * self.n_dilations * self.n_groups
         size = self.group_size
@@ -364,8 +366,8 @@ def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generato
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
     Each of the N choices is drawn n / N times, rounded up or down, so none twice unless n exceeds
-    N. A kernel reads one to all channels; a small number of channels is more likely. These channels
-    have equal weights, all others 0, and the norm of the whole kernel is 1.
+    N. A kernel reads one to all channels; a small number of channels is more likely. It is the same
+    in all channels that it reads, and 0 in the others. Each row of the result has the norm 1.
     """
     drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
     kernels = choices[torch.from_numpy(drawn)]

@@ -203,7 +203,7 @@ class TorchReducer(Reducer):
         return int(self.folds)
 
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
-        """Train `fit_steps` steps from initial weights; earlier trainings are forgotten.
+        """Train `fit_steps` steps from initial weights; earlier trainings are discarded.
 
         Parameters
         ----------
@@ -286,7 +286,7 @@ class TorchReducer(Reducer):
     def _initialize(self, traces: Floats) -> None:
         """Build preprocessor, networks and `encoder_` anew for traces (n, C, T).
 
-        Earlier trainings are forgotten; no label is read. The scales of the channels are read from
+        Earlier trainings are discarded; no label is read. The scales of the channels are read from
         the traces, the weights from the checkpoint, if one is given. Raises SettingError for a
         parameter out of its range, fewer than 2 samples, a network that does not give
         (B, features), or a checkpoint that cannot be used.
@@ -659,7 +659,8 @@ def draw_batches(
 ) -> Iterator[Tensor]:
     """Yield, for each step, the rows on which each of K networks is trained.
 
-    Network k passes over all rows outside fold k in random order, and then again in another order.
+    Network k passes over all rows outside fold k in random order, and then again in another order;
+    a batch may span two passes.
 
     Parameters
     ----------

@@ -323,10 +323,11 @@ class UmapReducer(Reducer):
         return bool(np.isin(numbers, neighbors.numbers).any())
 
     def _initialize(self, traces: Floats) -> None:
-        """Forget all trainings, draw the seed, and fit the frames to traces (n, C, T).
+        """Discard all trainings, draw the seed, and set up the frames for traces (n, C, T).
 
-        At most 256 of the traces, evenly spaced, are read. An earlier `encoder_` stays until the
-        next layout replaces it.
+        `random_state` gives the seed. The number of frames and their centre and scale come from at
+        most 256 of the traces, evenly spaced. An earlier `encoder_` stays until the next training
+        replaces it.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)

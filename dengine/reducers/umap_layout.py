@@ -329,13 +329,14 @@ def optimize_layout(
     points : Tensor of float32, shape (n, d)
         Points from which the layout starts; the tensor is not changed.
     graph : csr_matrix of float32, shape (n, n)
-        The fuzzy simplicial set.
+        The fuzzy simplicial set: weights of the edges between neighbours, from 0 to 1.
     min_dist : float
-        Distance up to which neighbours are drawn together.
+        Distance below which neighbours hardly attract each other any more.
     n_epochs : int
-        Epochs to take. The learning rate falls from 1 to 0 over them.
+        Epochs to take at most. The learning rate falls from 1 towards 0 over them.
     stop : StopRule
-        Asked before each epoch. After its deadline at most ten more are taken.
+        Asked before each epoch. Its `max_steps` lowers `n_epochs`. After its deadline at most ten
+        more epochs are taken, over which the rate falls quickly.
     generator : torch.Generator
         Draws the negative samples.
 

@@ -190,11 +190,14 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        The same report twice is no error; a report that contradicts an earlier one is 409. But
-        `false` for an accepted part that was confirmed as good before is a late line stop, and
-        corrects the label. An unknown id or part is 404; a part with several decisions that are no
-        rejects is 409. If the request has an author or the token has a name, a new label is also
-        recorded as an event.
+        State either the decision's id or the part; both or neither is 422. An unknown id or part is
+        404. Only the newest 20 decisions on a part are looked at, and rejects count only if there
+        is nothing else; if several decisions count, it is 409. The same report twice is no error; a
+        report that contradicts an earlier one is 409. But `false` for an accepted part that was
+        confirmed as good before is a late line stop, and corrects the label. If the request has an
+        author or the token has a name, a new label is also recorded as an event. The response has
+        the label, whether it was known already, and the retrain that it set off if that is
+        finished.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -366,10 +369,11 @@ class HttpApi:
     async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
         """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
-        With `hours` a stretch is a shift. Without it all decisions are split into at most 120
-        stretches of at least 20 decisions; the newest stretch may have fewer. At most the newest
-        120 stretches are returned, but all retrains and safe modes of the cell. 422: `hours` is
-        shorter than one second and not 0.
+        A stretch is a number of decisions that are counted together. With `hours` a
+        stretch is a shift. Without it all decisions are split into at most 120 stretches of at
+        least 20 decisions; the newest stretch may have fewer. At most the newest 120 stretches are
+        returned, but all retrains and safe modes of the cell. 422: `hours` is shorter than one
+        second and not 0.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,

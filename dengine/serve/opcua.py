@@ -241,13 +241,15 @@ class AddressSpace:
         """Decide on a flat trace: all samples of the first channel, then those of the next.
 
         Returns a list of action (0 verify, 1 accept, 2 reject), id, reason, lower, upper, version.
-        A `request` "" gets a new id, a `part` "" means none.
+        A `request` "" gets a new id, a `part` "" means none. The same request id and trace get the
+        same decision again.
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
         empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises SettingError if the
         trace is empty, if its length is not a multiple of `channels`, or if `channels` is not from
-        1 to `MAX_CHANNELS`. Raises TraceError for a trace, and ReportError for a request id, that
-        the engine does not take.
+        1 to `MAX_CHANNELS`. Raises TraceError for a trace or part that the engine does not take
+        and for an id of another trace, ReportError for an invalid id, and SettingError for a first
+        trace that the settings do not allow.
         """
         if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
             raise SettingError(

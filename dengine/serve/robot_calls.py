@@ -88,7 +88,7 @@ class RobotCalls:
     async def begin(self, request: Any = "") -> str:
         """Begin a new part, and have the recorder wait for its insertion.
 
-        The pieces of its trace that `add` took before are forgotten. Pieces are kept for the newest
+        The pieces of its trace that `add` took before are discarded. Pieces are kept for the newest
         `MAX_PARTS` parts; for an older part call this again. The recorder, which records the force
         of one insertion, works for the newest part alone: the recording of an earlier part that was
         not decided on is dropped. If the recorder fails, that is logged, and `decide_recorded` then
@@ -285,8 +285,10 @@ class RobotCalls:
 
         If the queue is full, or the service or its engine is closed, that is logged, and the struct
         is an unrecorded VERIFY with an id "" and the reason "busy". A request "" gets a new id, a
-        part "" means none. Raises TraceError for a trace, and ReportError for an id, that the
-        engine does not take.
+        part "" means none. The same request id and trace get the same decision again. Raises
+        TraceError for a trace or part that the engine does not take and for an id of another trace,
+        ReportError for an invalid id, and SettingError for a first trace that the settings do not
+        allow.
         """
         id_ = as_id(request) if request != "" else None
         try:
@@ -325,7 +327,7 @@ class RobotCalls:
     async def status(self) -> Struct:
         """Return how the cell is doing, in plain numbers and texts.
 
-        It waits in the queue. No decision waits for the reading of the store, unless that is in
+        It waits in the queue. While the store is read no decision waits, unless the store is in
         memory.
 
         Returns
@@ -333,9 +335,10 @@ class RobotCalls:
         struct
             decisions, accepted, rejected, bad (false accepts): counts so far. verified_share: share
             of verified parts among the newest 500 decisions, 1 if there are none. version: number
-            of the version in force. safe_mode, alarm: the reason as a text, "" if there is none.
-            shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy:
-            numbers of decisions past the deadline and of refused requests since the start.
+            of the version in force. safe_mode, alarm: their reasons as texts, "" if there is none.
+            shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy: since
+            the start, numbers of decisions that the engine had not begun by the service's
+            `deadline`, and of requests refused because the queue was full.
 
         Raises
         ------

@@ -245,7 +245,8 @@ def quick_switches() -> Iterator[None]:
     """Shorten, within the block, the time that a decision can wait for another thread.
 
     For the whole process it shortens the interval after which Python switches threads, and excludes
-    the objects that exist now from garbage collection.
+    the objects that exist now from garbage collection. The end of the block sets the old interval,
+    and lets all objects be collected again, also those that other code froze (`gc.freeze`).
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)

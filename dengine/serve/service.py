@@ -422,10 +422,11 @@ class CellService:
     def _enqueue(self, work: Callable[[DataEngine, bool], T], read_only: bool = False) -> Future[T]:
         """Put work into the queue for the engine's thread, and return a future of its result.
 
-        `work` is called with the engine and with whether the future was cancelled. It runs even if
-        it was, and its result is then dropped. After work that is `read_only`, iterations over
-        `changes` are not woken. Raises BusyError if the service is closing, or if the queue is
-        full; the latter counts in `busy`.
+        `work` is called with the engine and with whether the future was cancelled. A cancelled
+        future does not stop the work, but the result is dropped. After the work every iteration
+        over `changes` (of the clients that wait for news) is woken, unless the work is `read_only`.
+        Raises BusyError if the service is closing, or if the queue is full; only the latter counts
+        in `busy`.
         """
         job = Job(Future(), work, read_only)
         if self._closing or not self._thread.is_alive():

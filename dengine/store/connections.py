@@ -523,10 +523,13 @@ class Database:
         return ""
 
     def check_writable(self) -> None:
-        """Raise a StoreError if the database cannot be written, found by an update of no row."""
+        """Raise a StoreError if the database cannot be written; an update of no row shows this.
+
+        Waiting records are written first (`before_use`).
+        """
         self.write(
             lambda connection: connection.exec_driver_sql(
-                "UPDATE setting SET value = value WHERE 0"
+                "UPDATE setting SET value = value WHERE 1 = 0"
             )
         )
 
@@ -552,7 +555,7 @@ class Database:
             raise
 
     def _take_lease(self, connection: Any, record: Any) -> None:
-        """Lock the cell for a new PostgreSQL connection, until that connection is closed.
+        """Lock the cell (the lease) for a new PostgreSQL connection, until that is closed.
 
         SQLAlchemy calls it for each connection. If another engine has the lock, the connection is
         closed, and the StoreError that is raised names that engine.

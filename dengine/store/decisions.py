@@ -151,7 +151,9 @@ class DecisionTable(CellTable):
         ]
 
     def pending(self, since_version: int = 0) -> list[StoredDecision]:
-        """Return the decisions that asked for a check and have no label, oldest first.
+        """Return the cell's decisions with action VERIFY that have no label, oldest first.
+
+        Accepted decisions are not among them, see `unreported_accepts`.
 
         Parameters
         ----------
@@ -274,7 +276,8 @@ class DecisionTable(CellTable):
     def stretches(self, n: int = 1, **by: Any) -> list[Stretch]:
         """Count the cell's decisions in at most `n` stretches of equal length, oldest first.
 
-        The newest stretch may be shorter. A period of time without decisions has no stretch.
+        A stretch is a run of consecutive decisions, or a period of time. The newest stretch may be
+        shorter. A period of time without decisions has no stretch.
 
         Parameters
         ----------
@@ -297,7 +300,7 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         tally : Tally or None
-            Of all decisions of the cell, if it has been read already; None: it is read.
+            All decisions of the cell counted in groups, if that was read already; None: it is read.
 
         Returns
         -------

@@ -31,7 +31,7 @@ DRAIN_CHUNK = 500  # records that the database takes in one transaction
 
 
 class Drainer:
-    """Takes synced records from a recorder, and commits them to a database.
+    """Commits to a database the records that a `Recorder` has written to the journal.
 
     `start` starts its thread, and `stop` ends it.
 
@@ -41,7 +41,7 @@ class Drainer:
     journal : Journal
     recorder : Recorder
     index : DecisionIndex
-        Forgets the records that the database has.
+        Records that the database has are removed from it.
     limit : float
         Seconds that a call waits at most.
 
@@ -89,9 +89,9 @@ class Drainer:
     def fault(self) -> str:
         """Why the store cannot be written or read at present; "" if it can.
 
-        The reason is a fault of the journal, or the last error of the database, until a later
-        attempt succeeds, or a record that has waited for the database longer than both the `limit`
-        of this drainer and LAG_SECONDS.
+        The first of these is given: a fault of the journal; the last error of the database, until a
+        later attempt succeeds; that the oldest record has waited for the database longer than
+        `limit` and than LAG_SECONDS (1 s).
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
@@ -281,9 +281,9 @@ class Drainer:
         """Copy all records that are on the journal's disk by now to the database.
 
         They go in chunks of at most DRAIN_CHUNK. Later records go with them only if they still fit
-        into the last chunk. The journal's head is synced first. At the end the drainer's last
-        error, which `fault` shows, is cleared. Raise StoreError if the database fails: chunks that
-        were committed stay, and the last error is kept.
+        into the last chunk. The journal's head is synced first. At the end the last error, which
+        `fault` shows, is cleared. Raise StoreError if the database fails: chunks that were
+        committed stay, and the last error is kept.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:

@@ -189,10 +189,10 @@ def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLa
     """Sort labels by what the store does with them; nothing is written.
 
     The first label of a decision is new. A second label that repeats success and source of the
-    first changes nothing. A late stop (`_is_late_stop`) corrects the first label, unless this was
-    corrected to a failure already. Any other second label is a problem. So is a late stop whose
-    first label was forgotten, and a label whose decision is not stored with the same trace and
-    time. `stored` has, by decision, the rows of `CorrectionTable.stored_labels`.
+    first changes nothing. A late stop (`_is_late_stop`) corrects the first label; if this was
+    corrected to a failure already, it changes nothing. Any other second label is a problem. So is a
+    late stop whose first label was forgotten, and a label whose decision is not stored with the
+    same trace and time. `stored` has, by decision, the rows of `CorrectionTable.stored_labels`.
     """
     result = SortedLabels()
     for label in labels:

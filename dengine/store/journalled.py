@@ -342,10 +342,11 @@ class JournalledStore(Outbox):
             self._leave_store(can_close=seconds > 0.0)
 
     def _end_threads(self, seconds: float) -> bool:
-        """Mark this as closed, and end the threads of the recorder and the drainer.
+        """Mark this as closed; end the thread that writes the journal, then the one that drains it.
 
-        Each thread first tries once to write the records that wait for it. Return whether both have
-        ended, each within these seconds.
+        To drain is to copy the journal's records into the database. Each thread first tries once to
+        write the records that wait for it. Return whether both have ended, each within these
+        seconds.
         """
         with self._changed:
             self._closed = True

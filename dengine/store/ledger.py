@@ -173,8 +173,8 @@ def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool =
 def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
     """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
 
-    `digest` is 32 bytes. `chains` is JSON: for each table that an engine reads at its start, a
-    digest over all its rows so far.
+    `digest` is 32 bytes. `chains` is JSON: by the name of each table that an engine reads at its
+    start, the table's chain, a running digest over all rows that it has so far.
     """
     return connection.execute(
         sa.select(*LEDGER.c["number", "digest", "chains"])
@@ -452,7 +452,10 @@ def _find_table_error(
 
 
 def chain_writes(engine: sa.Engine) -> None:
-    """Have an engine call `_chain_statement` before every statement, to chain inserted rows."""
+    """Have an engine call `_chain_statement` before every statement.
+
+    The function gives inserted rows their sums, and adds these to the ledger's next entry.
+    """
     sa.event.listen(engine, "before_execute", _chain_statement, retval=True)
 
 

@@ -111,7 +111,7 @@ class DecisionIndex:
         return bool(entry.decision_id) and self._decisions.get(entry.decision_id) is not entry
 
     def remove_drained(self, entry: Entry) -> None:
-        """Forget a record that the database has now, or that is lost.
+        """Remove a record that the database has now, or that is lost.
 
         The newest N_RECENT decisions stay in memory. If the record is a label, its decision there
         gets the label.

@@ -47,7 +47,10 @@ class Scope:
         )
 
     def cells(self, connection: sa.Connection) -> list[str]:
-        """Return the id of this cell first, then those of its product's other cells, sorted."""
+        """Return the id of this cell first, then those of its product's other cells, sorted.
+
+        Without a product: this cell alone.
+        """
         peers = connection.execute(
             cells_of(self.product or "").order_by(SETTING.c.cell_id)
         ).scalars()

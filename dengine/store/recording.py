@@ -72,7 +72,7 @@ class Recorder:
     Attributes
     ----------
     changed : threading.Condition
-        With a reentrant lock. It guards the recorder, and is notified of every change.
+        With a reentrant lock. It guards this object, and is notified of every change.
     unwritten, synced : deque of Entry
         Records that are not on disk, and those that are, oldest first; who drains the latter takes
         them out.
@@ -160,8 +160,8 @@ class Recorder:
     def sync(self, seconds: float | None = None) -> None:
         """Wait until everything recorded so far is on the disk, at most `seconds`.
 
-        None: the limit of this recorder. Raise NotTakenError if that takes longer, or a write fails
-        meanwhile. The records are not lost then: the thread tries to write them again.
+        None: `limit` seconds. Raise NotTakenError if that takes longer, or a write fails meanwhile.
+        The records are not lost then: the thread tries to write them again.
         """
         limit = self._limit if seconds is None else seconds
         with self.changed:
@@ -233,8 +233,8 @@ class Recorder:
     def _write(self, batch: Sequence[Entry]) -> None:
         """Append a batch to the journal, sync it, and move it from `unwritten` to `synced`.
 
-        A journal of more than 8 MiB is cleared first, if the drainer copies its undrained records
-        to the database within BATCH_SECONDS. If the journal's file was deleted, moved or replaced,
+        A journal of more than 8 MiB is cleared first, if the `Drainer` copies its last records to
+        the database within BATCH_SECONDS. If the journal's file was deleted, moved or replaced,
         it is created again, and an event says so. Raise StoreError if the disk fails; the entries
         then stay in `unwritten`.
         """

@@ -138,10 +138,10 @@ def as_text(text: str) -> str:
 
 
 def check_state(report: RetrainReport, state: Arrays | None) -> State | None:
-    """Check a version's arrays and return copies of them, by name; None if there are none.
+    """Check a version's arrays and return copies of them, by name; None if `state` is None.
 
-    Raise StoreError if `report.accepted` is True and there are no arrays, and for an array of
-    Python objects, which would need a pickle.
+    Raise StoreError if `report.accepted` is True (the version is to be put in force) and `state` is
+    None, and for an array of Python objects, which would need a pickle.
     """
     if state is None and report.accepted:
         raise StoreError(
@@ -370,9 +370,10 @@ def new_event(
 
 
 def open_losses(events: Iterable[Any]) -> list[Any]:
-    """Return the events of kind DATA_LOST after which no event ACKNOWLEDGED came.
+    """Return the events of kind DATA_LOST (records are lost) that no later ACKNOWLEDGED ended.
 
-    `events` are events of a cell, or their rows, oldest first; so is the result.
+    With one ACKNOWLEDGED a person confirms all losses that came before. `events` are events of a
+    cell, or their rows, oldest first; so is the result.
     """
     losses: list[Any] = []
     for event in events:

@@ -153,8 +153,9 @@ def lock(connection: sa.Connection, kind: int, name: str = "") -> None:
 def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     """Create the tables in an empty database, or check that they are those of a store.
 
-    In PostgreSQL the tables of other programs may stand beside them. Columns that an older store
-    lacks are added. The cell is entered if it is new. It does not commit.
+    In PostgreSQL the tables of other programs may stand beside them. Columns that later versions of
+    dengine added (`ADDED`) are added to the tables of an older store. The cell is entered if it is
+    new. It does not commit.
 
     Parameters
     ----------
@@ -167,7 +168,8 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     Raises
     ------
     StoreError
-        For an SQLite file of another program, for another schema, and if a column is missing.
+        For an SQLite file of another program, for another schema, and if a table or any other
+        column is missing.
     """
     lock(connection, TABLES)  # two cells may create them at the same moment
     tables = set(sa.inspect(connection).get_table_names())

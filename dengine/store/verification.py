@@ -98,7 +98,7 @@ class CellHistory:
     entries : int
         Number of entries of its ledger.
     rows : int
-        Number of its rows in the tables that the ledger chains.
+        Number of its rows in the tables whose rows the ledger's hashes cover.
     digest : str
         Of the newest entry, hexadecimal; "" without one.
     waiting : int or None

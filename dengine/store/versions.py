@@ -178,8 +178,8 @@ class VersionTable(CellTable):
         Raises
         ------
         VersionError
-            If no such version was put in force, if its state is not kept (the error names the
-            versions whose states are kept), or if its state is damaged.
+            If no such version was put in force, or if its state, the stored arrays, was deleted
+            since; the error names the versions whose states are kept. Also if its state is damaged.
         """
         retrains = {
             row.version: row.retrain

@@ -239,7 +239,7 @@ def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_st
     if not first:
         learn(range(150))
         assert engine.retrain().accepted
-    engine.decide(X[0])  # it sets the contract
+    engine.decide(X[0])  # it sets the TraceSpec
     engine.close()
     with closing(
         SqlStore(str(tmp_path / "e.db"))

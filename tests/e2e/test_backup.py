@@ -213,7 +213,7 @@ def test_every_cell_of_a_file_is_in_its_backup(tmp_path: Path, data: Dataset) ->
             for name in parts
         ]
         for engine, rows in zip(engines, parts.values(), strict=True):
-            learn(engine, data, rows[:1])  # it sets the contract, which waits for the store
+            learn(engine, data, rows[:1])  # it sets the TraceSpec, which waits for the store
             engine.store.flush()
         other = cells.enter_context(closing(sqlite3.connect(file, isolation_level=None)))
         other.execute("BEGIN IMMEDIATE")

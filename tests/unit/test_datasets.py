@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dengine import load_dataset
-from dengine.datasets import make_dataset
+from dengine.datasets import describe, make_dataset
 from dengine.datasets.units import conversion
 from dengine.errors import DataError
 
@@ -67,6 +67,39 @@ def test_a_damaged_file_or_one_of_objects_is_a_data_error(
         path.write_bytes(content)
     with pytest.raises(DataError, match="Cannot read"):
         load_dataset(path)
+
+
+@pytest.mark.parametrize("arrays", [{}, {"a": 5, "b": 2.0}])
+def test_an_archive_without_traces_is_refused_or_asked_for(saved, arrays) -> None:
+    if arrays:
+        assert "layout" in describe(saved(**arrays)).open_keys
+    else:
+        with pytest.raises(DataError, match=r"recorded.npz: Expected arrays, got none"):
+            describe(saved())
+
+
+def test_what_is_no_file_folder_or_table_is_refused(make_data, saved, monkeypatch) -> None:
+    data = make_data(4)
+    for source in (data, (data.X, data.y), None, "x" * 300, "a\0b"):
+        for read in (describe, lambda source: load_dataset(source, {"files": "*.csv"})):
+            with pytest.raises(
+                DataError, match=r"a file, a folder or a DataFrame.* no description"
+            ):
+                read(source)
+    path = saved(X=data.X, y=data.y)
+    monkeypatch.setattr(Path, "open", lambda *_: path.mkdir())  # which raises an OSError
+    with pytest.raises(DataError, match=r"Cannot read .*recorded.npz: File exists"):
+        load_dataset(path)
+
+
+def test_selected_channels_are_some_and_keep_their_units(make_data) -> None:
+    data = replace(make_data(4, samples=8, channels=3), channels=("a", "b", "c"))
+    units = {"": "", "N, N, mm": "mm, N", ", , mm": "mm, "}
+    for unit, selected in units.items():
+        assert replace(data, unit=unit).select(("c", "a")).unit == selected
+    assert replace(data, unit="N, N, mm").select(("a", "b")).unit == "N"
+    with pytest.raises(DataError, match=r"Expected channels of .*, a, b, c, got \[\]"):
+        data.select(())
 
 
 @pytest.mark.parametrize("channels", [1, 2])

@@ -114,6 +114,17 @@ def read(path: Path, **stated: object) -> Dataset:
     return load_dataset(path, describe(path, {**STATED, **stated}))
 
 
+def test_a_bag_that_cannot_be_opened_is_refused(
+    bag: Bag, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag.write(tmp_path / "a.mcap")
+    description = describe(path, STATED)
+    monkeypatch.setattr(Path, "open", lambda path, *_: path.mkdir())  # which raises an OSError
+    for read in (describe, lambda path: load_dataset(path, description)):
+        with pytest.raises(DataError, match=r"a.mcap: Expected a whole MCAP file.*File exists"):
+            read(path)
+
+
 def listing(bag: Bag, path: Path, first: int = 0) -> None:
     """Write from when to when each part ran, in ISO times; parts have the numbers from first on."""
     times = [bag.stamps[start] for start in bag.starts]

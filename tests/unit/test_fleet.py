@@ -528,7 +528,7 @@ def test_what_decides_the_embedding_must_agree(
         fleet.engine("b", **change)
 
 
-def test_the_first_trace_of_any_cell_sets_the_contract(fleet: Fleet, parts: Dataset) -> None:
+def test_the_first_trace_of_any_cell_sets_the_trace_spec(fleet: Fleet, parts: Dataset) -> None:
     first, second = fleet.engine("a"), fleet.engine("b")
     first.decide(parts.X[0])
     with pytest.raises(TraceError, match="100 samples"):
@@ -665,7 +665,7 @@ def test_a_cell_that_was_given_a_reducer_object_saves_its_settings_again_after_a
     if has_decided:
         cells[1].decide(parts.X[0])
     cells[1].close()
-    cells[0].decide(parts.X[1])  # sets the contract of traces, if the other cell has not
+    cells[0].decide(parts.X[1])  # sets the TraceSpec, if the other cell has not
     second = DataEngine.open(fleet.store("b"), reducer=PCA(n_components=2))
     fleet.opened.append(second)
     second.set_policy(replace(second.policy, alpha=0.1))

@@ -31,7 +31,7 @@ from dengine.datasets.description import (
     TextForm,
     TraceForm,
 )
-from dengine.errors import DataError
+from dengine.errors import DataError, DengineError
 
 WORDS = {0: "NOK", 1: "OK"}
 RATE = 500.0
@@ -381,6 +381,13 @@ def test_equal_samples_under_two_labels_are_faults_and_repeats_are_left_out(tmp_
     assert [fault.source[:6] for fault in data.faults] == ["part_0", "part_1", "part_4"]
 
 
+def test_a_channel_of_an_unknown_unit_does_not_get_that_of_another(tmp_path: Path) -> None:
+    written = write(tmp_path, "files text", *some(), PLAIN)
+    channels = dict(zip(written.description.channels, (Channel("N"), Channel()), strict=True))
+    data = load_dataset(tmp_path, replace(written.description, channels=channels))
+    assert data.spec.units == ("N", "")
+
+
 # Bad input.
 
 
@@ -391,7 +398,7 @@ def test_one_sentence_says_what_to_type(tmp_path: Path) -> None:
     listed = replace(LABEL, listing="list.csv", key="part", column="verdict")
     (empty / "recordings.toml").write_text(d.to_toml())
     cases = {
-        "does not exist": (tmp_path / "none", None),
+        "Expected a file, a folder or": (tmp_path / "none", None),
         f"dengine data {re.escape(str(tmp_path))} --save": (tmp_path, None),
         r"another folder\? See `dengine data": (empty, None),
         "Expected a description in .*none.toml": (tmp_path, tmp_path / "none.toml"),
@@ -460,10 +467,17 @@ def in_files(folder: Path) -> Path:
         ("label.path", "(", "a regular expression with one group"),
         ("label.listing", "x.csv", "label.key"),
         ("text.encoding", "utf-99", "text.encoding"),
+        ("text.encoding", "undefined", "text.encoding"),
+        ("text.encoding", "a\0b", "text.encoding"),
         ("text.delimiter", ";;", "text.delimiter"),
+        ("text.thousands", ".", "two marks in text.decimal and text.thousands"),
+        ("text.thousands", 0, "two marks in text.decimal and text.thousands"),
+        ("time.format", ["s", "ms"], "a format for each of 1 columns"),
+        ("time.zone", "Foo/Bar", "time.zone"),
         ("text.header", 9, "none: 0_NOK.csv, line 9: Expected a header"),
         ("text.data", 500, "line 500: Expected rows of samples"),
         ("files", "/x/*.csv", "patterns below a folder"),
+        ("files", ".", "patterns below a folder"),
     ],
 )
 def test_a_stated_value_that_cannot_be_is_refused(
@@ -471,6 +485,52 @@ def test_a_stated_value_that_cannot_be_is_refused(
 ) -> None:
     with pytest.raises(DataError, match=re.escape(message)):
         describe(in_files(tmp_path), {key: value})
+
+
+def test_stated_sections_are_kept_and_a_question_mark_is_answered(tmp_path: Path) -> None:
+    proposal = describe(in_files(tmp_path), {"traces": {"samples": 7}, "time.rate_hz": "?"})
+    assert (proposal.traces.samples, proposal.time.rate_hz) == (7, 500.0)
+
+
+VALUES = ["?", "\0", "%Y%Y", 0, -1, 1e308, True, None, [], ["a", "b"], {1: 2}, "punycode", "force"]
+STATED = [f"{name}.{f.name}" for name, cls in SECTIONS.items() if cls for f in fields(cls)]
+TOP = [f.name for f in fields(Description)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = in_files(tmp_path_factory.mktemp("stated"))
+    describe(folder).save(folder / "recordings.toml")
+    return folder
+
+
+@settings(QUICK, max_examples=50, derandomize=True)
+@given(st.sampled_from([*TOP, *STATED, "rows.force.keep"]), st.sampled_from(VALUES))
+def test_any_stated_value_is_read_or_refused(folder: Path, key: str, value: Any) -> None:
+    with suppress(DengineError):
+        describe(folder, {key: value})
+    with suppress(DengineError):
+        saved = Description.load(folder / "recordings.toml")
+        load_dataset(folder, saved.with_values({key: value}))
+
+
+@pytest.mark.parametrize("time", ["{:.3f}", "2024-05-01 10:00:00.{:03d}"])
+def test_a_first_row_that_lost_a_sample_is_no_header(tmp_path: Path, time: str) -> None:
+    for i in range(6):
+        times = [time.format(j / 500 if "f" in time else 2 * j) for j in range(40)]
+        rows = [f"{t},{j % 10 and i + j % 7 + 1},k" for j, t in enumerate(times)]
+        text = "\n".join(["time,force,remark", *rows]).replace(",0,", ",,")
+        (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text(text)
+    data = load_dataset(tmp_path, describe(tmp_path))
+    assert (data.channels, data.X.shape) == (("force",), (6, 40))
+    assert np.isnan(data.X[:, ::10]).all()
+
+
+def test_a_long_text_of_wide_characters_is_cut_between_lines(tmp_path: Path) -> None:
+    rows = "".join(f"{i / 500:.3f},{i % 17}.5\n" for i in range(90_000))
+    for word in WORDS.values():
+        (tmp_path / f"1_{word}.csv").write_bytes(f"\ufefftime,force\n{rows}".encode("utf-16-be"))
+    assert "force" in describe(tmp_path, {"layout": "files"}).channels
 
 
 def test_a_cell_that_is_too_long_is_a_fault(tmp_path: Path) -> None:

@@ -153,9 +153,9 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Have a part inserted, wait for it, and return its trace, (T,) or (C, T).
 
         Lost samples are NaN. All samples are NaN if no insertion was seen, for example because its
-        start was lost or the trigger is wrong. Set `last`, and count a trace with missing samples
-        in `incomplete`. Raise CellError if the robot does not answer in time, fails, or its program
-        stops.
+        start was lost or the trigger is wrong. `last` becomes the record of this insertion (trace
+        and missing samples); a trace with missing samples is counted in `incomplete`. Raise
+        CellError if the robot does not answer in time, fails, or its program stops.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong

@@ -216,7 +216,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return self.cut() if row.timestamp > last else record
 
     def cut(self) -> InsertionRecord:
-        """Return the insertion as far as it was received, and forget it.
+        """Return the insertion as far as it was received, and discard it.
 
         Samples that did not come are NaN. All samples are NaN if its start was lost, or if no
         insertion has begun.

@@ -324,7 +324,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         Parameters
         ----------
         values : mapping of str to float, or None
-            By column. None writes nothing, and forgets the newest inputs.
+            By column. None writes nothing, and discards the newest inputs.
         """
         with self._news:
             self._written = values
@@ -375,7 +375,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
 
         If the buffer is full, its oldest package is dropped. At the first package of a new
         connection the newest inputs are written again, if they are less than 10 s old. But if the
-        package shows that the controller was restarted, the inputs are forgotten.
+        package shows that the controller was restarted, the inputs are discarded.
         """
         with self._news:
             if self._newest is not None:

@@ -4,6 +4,7 @@ A value is written only if a rule proves it, with its evidence as a comment; els
 the candidates. `load_dataset` then reads exactly what the description says.
 """
 
+import itertools
 import math
 import re
 from collections import Counter
@@ -17,8 +18,8 @@ from ...errors import DataError, listed
 from ..checks import check_text
 from ..dataset import Fault
 from ..description import UNKNOWN, Description
-from ..read.files import caught, match_files, natural_key, read_file
-from ..read.frames import read_frame, read_npz
+from ..read.files import as_source, caught, match_files, natural_key, read_file
+from ..read.frames import flat, read_frame, read_npz
 from ..read.places import without_suffix
 from ..read.split import table_of
 from ..read.text import read_text
@@ -27,7 +28,7 @@ from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
 from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
-from .text_form import propose_form
+from .text_form import MOST_BYTES, decode, propose_form
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm", ".log", ".prn")
 # The format of files with each suffix; `.gz` may stand behind it.
@@ -47,7 +48,6 @@ NO_RECORDING = re.compile(
 )
 BAG = ".mcap"
 MOST_FILES = 60  # that are read
-MOST_BYTES = 2_000_000  # of all files that are read, and of one
 MOST_ROWS = 50_000
 Names = Sequence[str]
 
@@ -60,8 +60,8 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     source : path or DataFrame
         A folder, a file or a table of recordings.
     stated : mapping, optional
-        Keys whose values are known, like `{"label.column": "verdict"}`. They are kept, and the
-        proposals for the other keys follow from them.
+        Keys whose values are known, like `{"label.column": "verdict"}`, or sections with such keys.
+        They are kept, but for the value `?`, and the proposals for the other keys follow from them.
 
     Returns
     -------
@@ -76,16 +76,18 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         If there is no file, or none that holds samples (a table of results does not). Also if a
         stated value is wrong: an unknown key, a column of times or a channel that does not exist, a
         source of labels that has no words, a malformed pattern of files, or settings in `[text]`
-        that no file can be read with.
+        or `[time]` that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     """
-    p = Proposal(stated or {}, Description().with_values(stated or {}))
+    source = as_source(source)
+    stated = {key: value for key, value in flat("", stated or {}).items() if value != UNKNOWN}
+    p = Proposal(stated, Description().with_values(stated))
     check_text(p.description.text)
-    if hasattr(source, "columns"):
+    if not isinstance(source, Path):
         p.put("format", "frame")
         propose_tables(p, [read_frame(source, "table")])
-    elif choose_files(p, Path(source)):
+    elif choose_files(p, source):
         if p.description.format == "mcap":
             p.put("layout", "mcap")
             propose_bag(p)
@@ -108,8 +110,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
     every = names_in(root, ())
     names = names_in(root, stated) if stated else every
     if not names:
-        state = "it has none" if root.exists() else "it does not exist"
-        raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}; {state}.")
+        raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     likely = likely_suffixes(names)
     if len(likely) > 1 and not stated:
         counts = Counter(map(suffix_of, names))
@@ -149,7 +150,7 @@ def names_in(root: Path, patterns: Names) -> Names:
         return [root.name]
     names = match_files(root, patterns or ["**/*"])
     names = {name for name in names if patterns or suffix_of(name) in SUFFIXES}
-    return sorted((name for name in names if not NO_RECORDING.search(name)), key=natural_key)
+    return sorted(itertools.filterfalse(NO_RECORDING.search, names), key=natural_key)
 
 
 def globs(names: Names) -> list[str]:
@@ -210,7 +211,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
         if p.stated.get("layout") == "npz" or (is_single and has_lists(table)):
             return table
     if kind in ("text", "jsonl") and len(content) > MOST_BYTES:
-        content = content[: content.rfind(b"\n", 0, MOST_BYTES)]
+        encoding = p.description.text.encoding
+        content = decode(content, encoding)[1].rpartition("\n")[0].encode(encoding) or content
         p.is_cut = True
     if kind == "text":
         return read_text(content, name, p.description.text).whole()

@@ -7,8 +7,8 @@ import numpy as np
 
 from ...errors import listed
 from ...records import Floats
-from ..checks import LEAST_RATE_HZ, MOST_RATE_HZ
-from ..dataset import Fault
+from ..checks import check_clock
+from ..dataset import LEAST_RATE_HZ, MOST_RATE_HZ, Fault
 from ..description import UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
@@ -168,8 +168,9 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     more than 10 % of the recordings plus one would be faults because of their times, `time.gap` is
     set to `?`, with a note on the first. If all recordings start after the year 2000, `order` is
     set to `time`. Recordings whose times cannot be read are skipped. Raises DataError if a stated
-    format is no form or unit of times.
+    format is no form or unit of times, and as `check_clock` does.
     """
+    check_clock(p.description.time)
     clocks = list[tuple[Table, Floats]]()
     starts, means = list[float](), list[float]()
     for table in tables:

@@ -92,10 +92,11 @@ def _refuse_results(columns: Iterable[Column]) -> None:
         is_short = min(np.diff(edges), default=LEAST_RUN) < LEAST_RUN
         source = labels.with_meanings(LabelSource(), column.counts if is_short else ())
         if labels.is_plain(source) and source.good and source.bad:
-            actual = f"a row for each result, with its verdict in {column.name}, and no curve"
-            where = column.tables[0].source
-            do = "if the rows of parts are mixed, state part.column and time.sort=true"
-            raise DataError(f"Expected the samples of each part in {where}, got {actual}; {do}.")
+            raise DataError(
+                f"Expected the samples of each part in {column.tables[0].source}, got a row for "
+                f"each result, with its verdict in {column.name}, and no curve; if the rows of "
+                "parts are mixed, state part.column and time.sort=true."
+            )
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:

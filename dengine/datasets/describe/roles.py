@@ -47,7 +47,7 @@ def propose_roles(p: Proposal) -> None:
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
-        expect_one_of([*p.columns, UNKNOWN], name, "the columns")
+        expect_one_of(p.columns, name, "the columns")
     qualify_rows(p)
     propose_clock(p)
     if p.description.layout not in ("long", "columns"):

@@ -21,12 +21,12 @@ from ..table import pattern_of
 from ..units import is_unit
 from .columns import LEAST_RUN, NUMBER, Proposal, Stated
 
-DELIMITERS = (";", "\t", "|", ",", BLANK)
+DELIMITERS = ";\t|, "
 BLANKS_LEAD = 1.15  # by which blanks must be the better delimiter, since cells may hold some
 GROUPS = ("", ".", ",", "'", "’", "\u202f", "\xa0", " ")  # marks between groups of digits
 LIKELY = 0.95  # of the numbers that the marks of a text must read; the others are damaged
 SAME_DIGITS = str.maketrans("23456789", "11111111")  # for numbers of one form
-HEAD_BYTES = 400_000
+MOST_BYTES = 2_000_000  # of a file that are read
 LATIN = "cp1252"
 MOST_LINES = 200  # of a file that are looked at
 MOST_NAMES = 20  # columns without a header that get a name each
@@ -56,27 +56,27 @@ def look(content: bytes, stated: Stated) -> Look | None:
 
     stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
-    encoding, text = decode(content, stated.get("text.encoding", ""))
+    encoding, text = decode(content, str(stated.get("text.encoding", "")))
     lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
     if "\0" in text or not text.strip():
         return None
-    marks = stated.get("text.delimiter", DELIMITERS)
-    share, width, delimiter = max(
-        (*_share_of_numbers(lines[:MOST_LINES], mark), mark) for mark in marks
-    )
+    marks = str(stated.get("text.delimiter", DELIMITERS))
+    head = lines[:MOST_LINES]
+    share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
     if share == 0:  # a single column
         delimiter = ","
         width = 1
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     first = _first_row(rows[:MOST_LINES], width)
-    header, units = _head_lines(rows[:first], width, stated.get("text.header", 0))
+    line = stated.get("text.header")
+    header, units = _head_lines(rows[:first], width, line if isinstance(line, int) else 0)
     data = max(first, header)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
 
 def decode(content: bytes, stated: str) -> tuple[str, str]:
-    """Return the encoding of a text, and the first 400 kB decoded; ("", "") if that fails.
+    """Return the encoding of a text, and the first 2 MB decoded; ("", "") if that fails.
 
     The stated encoding is used if there is one. Otherwise it is UTF-16 if the text begins with a
     byte order mark of it, else UTF-8, or cp1252 if UTF-8 fails.
@@ -85,7 +85,7 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
     encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
     for encoding in [stated] if stated else encodings:
         with suppress(UnicodeError):
-            text = codecs.getincrementaldecoder(encoding)().decode(content[:HEAD_BYTES])
+            text = codecs.getincrementaldecoder(encoding)().decode(content[:MOST_BYTES])
             return encoding, text.removeprefix("\ufeff")
     return "", ""
 
@@ -115,13 +115,17 @@ def _count_numbers(cells: Sequence[str]) -> int:
 def _first_row(rows: Rows, width: int) -> int:
     """Return the first row of samples, from 0; 0 if there is none.
 
-    It is the first of four successive rows that each begin with a number, or have about as many
-    numbers as is usual.
+    It is the first of four successive rows that each have about as many numbers as is usual; or one
+    directly above it, if it begins like the row below, but for the digits: `0.0,,` above `0.1,5,`
+    has lost a sample, but `time,force,` is no row of samples.
     """
-    wide = [row if len(row) == width else [] for row in rows]
-    counts = [_count_numbers(row[:1]) * width or _count_numbers(row) for row in wide]
+    counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
-    return next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
+    first = next((i for i in range(len(rows)) if min(counts[i : i + 4]) >= least), 0)
+    forms = [NUMBER.sub("0", row[0]) if len(row) == width else "" for row in rows]
+    while first and "" < forms[first - 1] == forms[first]:
+        first -= 1
+    return first
 
 
 def _head_lines(rows: Rows, width: int, stated: int) -> tuple[int, int]:

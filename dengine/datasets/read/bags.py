@@ -24,7 +24,6 @@ from .split import signals_of, verdicts_of
 
 SUFFIX = ".mcap"
 STAMP, LOG_TIME = "stamp", "log_time"
-RECOVER = "mcap recover or ros2 bag reindex may save what is whole"
 Message = tuple[str, int, Any]  # topic, nanoseconds of the log, message
 Files = Sequence[tuple[Path, str]]
 Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, data
@@ -34,28 +33,31 @@ def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Messag
     """Yield (topic, time in ns, message) for each message of some topics, as the file has them.
 
     `topics` None means all topics. Raises DataError if the file is not a .mcap file, or if a
-    package that reads such files is not installed. If the file is damaged or was not closed, the
-    whole messages are yielded first; then UnreadableError is raised.
+    package that reads such files is not installed. If the file is damaged, was not closed or cannot
+    be read, the whole messages are yielded first; then UnreadableError is raised.
     """
     if path.suffix.lower() != SUFFIX:
-        do = "`ros2 bag convert` makes them of .db3 files"
-        raise DataError(f"Expected MCAP files in a bag, got {path.name}; {do}.")
+        raise DataError(
+            f"Expected MCAP files in a bag, got {path.name}; `ros2 bag convert` makes them of .db3 "
+            "files."
+        )
     with read_errors(path, "an MCAP file", "mcap_ros2", "mcap"):
         from mcap.exceptions import McapError
         from mcap.reader import NonSeekingReader
         from mcap_ros2.decoder import DecoderFactory
         from zstandard import ZstdError
-    damages: tuple[type[Exception], ...] = (*UNREADABLE, McapError, ZstdError, struct.error)
     n = 0
-    with path.open("rb") as file:
-        try:
+    try:
+        with path.open("rb") as file:
             reader = NonSeekingReader(file, True, [DecoderFactory()])
             messages = reader.iter_decoded_messages(topics, log_time_order=False)
             for n, (_, channel, record, message) in enumerate(messages, 1):  # noqa: B007
                 yield channel.topic, record.log_time, message
-        except damages as error:
-            wanted = f"Expected a whole MCAP file, that was closed, {n} messages are read"
-            raise UnreadableError(f"{wanted}: {error}; {RECOVER}") from error
+    except (*UNREADABLE, McapError, ZstdError, struct.error) as error:  # type: ignore[misc]
+        raise UnreadableError(
+            f"Expected a whole MCAP file, that was closed, {n} messages are read: {error}; "
+            "mcap recover or ros2 bag reindex may save what is whole"
+        ) from error
 
 
 def read_bag(

@@ -39,8 +39,10 @@ def scale_of(unit: str) -> float:
     """
     match = re.fullmatch(r"(\d*\.?\d*)\s*([^\d.]+)", unit.strip())
     if not match or match[2].strip() not in UNITS:
-        wanted = f"a unit of time of {', '.join(UNITS)}, {ISO}, or a form like %d.%m.%Y"
-        raise DataError(f"Expected time.format to be {wanted}, got {unit!r}.")
+        raise DataError(
+            f"Expected time.format to be a unit of time of {', '.join(UNITS)}, {ISO}, or a form "
+            f"like %d.%m.%Y, got {unit!r}."
+        )
     return float(match[1].strip(".") or 1) * UNITS[match[2].strip()]
 
 
@@ -124,7 +126,9 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     if texts.dtype.kind != "M":
         texts = texts.astype(str).str.strip().str.replace(",", ".", regex=False)
     form = unit.replace(",", ".") if "%" in unit else "ISO8601"
-    with instead(UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError):
+    with instead(
+        UnreadableError, f"Expected times of the form {unit}", ValueError, AttributeError, re.error
+    ):
         times = pd.to_datetime(texts, format=form, errors="coerce")
         if times.dt.tz is None:
             zone = ZoneInfo(clock.zone) if clock.zone and has_date else "UTC"
@@ -152,9 +156,12 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     is_bad = (steps < 0) | is_equal | (steps > (most or np.inf))
     if is_bad.any():
         row = int(is_bad.argmax()) + 1
-        wanted = f"Expected a later time, by at most time.gap steps, which are {most:.6g} s"
-        message = f"{wanted}, got {steps[row - 1]:.6g} s before row {row + 1}"
-        raise UnreadableError(message, table.line(row), column)
+        raise UnreadableError(
+            f"Expected a later time, by at most time.gap steps, which are {most:.6g} s, got "
+            f"{steps[row - 1]:.6g} s before row {row + 1}",
+            table.line(row),
+            column,
+        )
     if abs(rate * span - n) > RATE_TOLERANCE * rate * span and rate:
         message = f"Expected {rate:g} Hz as time.rate_hz says, its times give {n / span:.5g} Hz"
         raise UnreadableError(message, column=column)

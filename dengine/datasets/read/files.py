@@ -7,14 +7,15 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from ...errors import DataError, instead
+from ...errors import DataError, instead, shortened
 from ..dataset import Fault
 from ..description import FOLDER_FILE, Description
 from ..table import UnreadableError
 
 GZIP = ".gz"
-BAD = (ValueError, NotImplementedError, OSError)  # what an unusable pattern raises
+BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
 Key = list[tuple[int, int, str]]
 
 
@@ -22,6 +23,24 @@ def natural_key(text: str) -> Key:
     """Return a key that sorts numbers in texts by their size: run_2 before run_10."""
     pieces = re.split(r"([0-9]+)", text)
     return [(1, int(p), "") if p.isascii() and p.isdecimal() else (0, 0, p) for p in pieces if p]
+
+
+def as_source(source: Any) -> Any:
+    """Return a path as a `Path`, and a DataFrame as it is.
+
+    Raises DataError for anything else, and if nothing is at the path, or it cannot be looked up.
+    """
+    if hasattr(source, "columns"):
+        return source
+    with instead(
+        DataError,
+        f"Expected a file, a folder or a DataFrame, got {shortened(str(source))}",
+        TypeError,
+        *BAD,
+        do='"insertion" and arrays in memory need no description',
+    ):
+        Path(source).stat()
+        return Path(source)
 
 
 def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
@@ -44,14 +63,15 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     if root.is_file():
         return [(root, root.name)]
     names = match_files(root, description.files)
-    listings = {source.listing for source in description.labels}
-    names -= {FOLDER_FILE, description.windows.listing, *listings}
+    names -= {source.listing for source in description.labels}
+    names -= {FOLDER_FILE, description.windows.listing}
     for pattern in description.exclude:
         names -= {*fnmatch.filter(names, pattern)}
     if not names:
-        do = f"is it the description of another folder? See `dengine data {root}`"
-        wanted = f"files {', '.join(description.files)} in {root}"
-        raise DataError(f"Expected {wanted}, found none; {do}.")
+        raise DataError(
+            f"Expected files {', '.join(description.files)} in {root}, found none; is it the "
+            f"description of another folder? See `dengine data {root}`."
+        )
     files = [(root / name, name) for name in names]
     return sorted(files, key=lambda item: (natural_key(item[0].name), natural_key(item[1])))
 
@@ -61,7 +81,7 @@ def read_file(path: Path) -> bytes:
 
     Raises UnreadableError if it cannot be read, or changed while it was read.
     """
-    with instead(UnreadableError, f"Cannot read {path.name}", OSError, EOFError, zlib.error):
+    with instead(UnreadableError, f"Cannot read {path.name}", *BAD, EOFError, zlib.error):
         before = path.stat()
         content = path.read_bytes()
         after = path.stat()

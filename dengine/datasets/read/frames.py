@@ -62,7 +62,7 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
     items: dict[str, Any] = {}
     for name, item in value.items():
         is_nested = isinstance(item, Mapping)
-        items |= flat(f"{prefix}{name}.", item) if is_nested else {prefix + name: item}
+        items |= flat(f"{prefix}{name}.", item) if is_nested else {f"{prefix}{name}": item}
     return items
 
 
@@ -136,15 +136,17 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
 
     Of one part, each array becomes columns as in `columns_of`, after axes of length 1 were dropped.
     Of all parts, row i has item i of each array, and there are as many rows as the largest array
-    has items. Raises DataError if the archive is damaged, and UnreadableError if the items of an
-    array are not all alike.
+    has items. Raises DataError if the archive is damaged, and UnreadableError if it has no array,
+    or the items of an array are not all alike.
     """
     arrays, _ = read_archive(content, name=source)
+    if not arrays:
+        raise UnreadableError("Expected arrays, got none")
     if not has_all:
         squeezed = {name: np.atleast_1d(np.squeeze(x)) for name, x in arrays.items()}
         return Table(source, columns_of("", squeezed), [])
-    n = len(max(arrays.values(), key=np.size, default=()))
     columns = {name: np.atleast_1d(x) for name, x in arrays.items()}
+    n = len(max(columns.values(), key=np.size))
     return Table(source, columns, range(1, n + 1))
 
 

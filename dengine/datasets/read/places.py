@@ -160,8 +160,11 @@ class LabelReader:
         line = 0 if source.listing or source.path else table.line(0)
         labels = {self.meaning(word, line) for word in words}
         if len(labels) > 1:
-            message = f"Expected one label for {part or table.path}, got {listed(sorted(words))}"
-            raise UnreadableError(message, line, source.column)
+            raise UnreadableError(
+                f"Expected one label for {part or table.path}, got {listed(sorted(words))}",
+                line,
+                source.column,
+            )
         return labels.pop()
 
     def meaning(self, word: str, line: int = 0) -> int | None:

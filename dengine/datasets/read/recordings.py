@@ -18,7 +18,7 @@ from ...errors import DataError, instead, listed
 from ...records import FITS, Floats
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, lost_note, without_repeats
-from ..dataset import Dataset, Fault, make_dataset
+from ..dataset import Dataset, Fault, make_dataset, unit_text
 from ..description import ANY, Channel, Description, RowWords, TextForm
 from ..table import Cells, Recording, Table, UnreadableError
 from ..units import conversion, unit_in
@@ -193,9 +193,11 @@ def read_recordings(
     recordings, repeats = without_repeats(recordings)
     faults += repeats
     if not recordings:
-        n = f"{len(faults)} have faults, {n_unlabelled} no label"
         why = "".join(f" {fault}." for fault in faults[:1])
-        raise DataError(f"Expected recordings in {name}, none is left: {n}.{why}")
+        raise DataError(
+            f"Expected recordings in {name}, none is left: {len(faults)} have faults, "
+            f"{n_unlabelled} no label.{why}"
+        )
     data = dataset_of(recordings, description)
     n_found = len(data) + len(faults) + n_unlabelled
     n_seen = description.seen.recordings
@@ -219,12 +221,11 @@ def files_of(
         return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
     is_folder = source.is_dir()
     name = source.resolve().name if is_folder else source.stem
-    files = find_files(source, description)
-    if description.layout != "mcap":
-        return name, source if is_folder else source.parent, files
-    title = files[0][1] if len(files) == 1 else name
-    bag = read_bag(files, title, description, faults)
-    return name, source if is_folder else source.parent, [(bag, title)]
+    files: Any = find_files(source, description)
+    if description.layout == "mcap":
+        title = files[0][1] if len(files) == 1 else name
+        files = [(read_bag(files, title, description, faults), title)]
+    return name, source if is_folder else source.parent, files
 
 
 def parts_of(
@@ -263,7 +264,7 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
         np.stack([recording.trace for recording in recordings]),
         labels,
         rate_hz=clock.rate_hz or None,
-        unit=", ".join(channel.unit for channel in channels).strip(", "),
+        unit=unit_text([channel.unit for channel in channels]),
         limit=channels[0].limit or None,
         part=parts if parts.any() else None,
         channels=tuple(description.channels),
@@ -301,8 +302,10 @@ def fitted(
             times = np.arange(about.samples) / rate
             can_fit = bool(times[-1] <= seconds[-1] + (1 + ROUNDING) / rate)
     if not can_fit:
-        message = f"Expected {about.samples} samples, got {n}"
-        raise UnreadableError(f"{message}; see traces.lengths, which is {about.lengths}")
+        raise UnreadableError(
+            f"Expected {about.samples} samples, got {n}; see traces.lengths, which is "
+            f"{about.lengths}"
+        )
     if times is not None and seconds is not None:
         return np.stack([np.interp(times, seconds, row) for row in samples]).astype(np.float32)
     return fit_length(torch.from_numpy(samples.astype(np.float32)), about.samples, kind).numpy()

@@ -83,8 +83,8 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
             text = content.decode("utf-8-sig" if is_utf8 else encoding)
             content = text.encode("utf-8", "replace")
         bad = content.find(b"\0")
-    except UnicodeDecodeError as error:
-        bad = error.start
+    except UnicodeError as error:  # some encodings do not say where
+        bad = getattr(error, "start", 0)
     if bad >= 0:
         message = f"Expected a text in {encoding}, got the byte 0x{content[bad]:02x}"
         line = content.count(b"\n", 0, bad) + 1
@@ -122,7 +122,7 @@ def _header_line(content: bytes, header: int | str) -> int:
     if isinstance(header, int):
         return header
     for i, line in enumerate(io.BytesIO(content), 1):
-        if line.startswith(header.encode()):
+        if line.startswith(header.encode(errors="replace")):
             return i
     raise UnreadableError(f"Expected a header that begins with {header!r}, got none")
 

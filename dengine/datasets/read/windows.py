@@ -58,7 +58,6 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
     previous part is ignored. Raises DataError if the rate is not stated or a signal cannot be read,
     and SettingError for a malformed trigger.
     """
-    samples = description.traces.samples
     rate = description.time.rate_hz
     if not rate:
         raise DataError("Expected time.rate_hz, by which a trigger cuts.")
@@ -71,7 +70,7 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
         start = finder.feed(time, is_on)
         if start is not None and i >= free:
             number += 1
-            free = i + samples
+            free = i + description.traces.samples
             fault = "" if start.seen else "Expected its first sample, which fell into a gap"
             yield str(number), slice(i, free), fault
 

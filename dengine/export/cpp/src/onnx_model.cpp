@@ -27,7 +27,7 @@ class OnnxModel final : public Model {
         const bool golden = !expected.empty();  // earlier files have none
         if (!golden) trace.assign(shape.size(), 0.0F);
         if (trace.size() != shape.size() || (golden && expected.size() != width)) {
-            throw Fault(DENGINE_BAD_MODEL, "its golden trace does not fit its own contract");
+            throw Fault(DENGINE_BAD_MODEL, "its golden trace does not fit its own TraceSpec");
         }
         for (int i = 0; i < WARM_UP; ++i) must_agree(decide(trace, "").embedding, expected);
         bytes_.clear();

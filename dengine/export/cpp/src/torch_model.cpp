@@ -107,7 +107,7 @@ class TorchModel final : public Model {
         std::vector<float> trace = floats(metadata.list("golden.trace"));
         const std::vector<float> expected = floats(metadata.list("golden.embedding"));
         if (trace.size() != shape.size() || expected.size() != width) {
-            throw Fault(DENGINE_BAD_MODEL, "its golden trace does not fit its own contract");
+            throw Fault(DENGINE_BAD_MODEL, "its golden trace does not fit its own TraceSpec");
         }
         const c10::InferenceMode guard;
         // A copy runs the same compiled code, and this module must not learn of the golden trace.
