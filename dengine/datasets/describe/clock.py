@@ -83,8 +83,8 @@ def is_clock(column: Column) -> bool:
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    has_unit = quantity_of(column.unit or unit_in(column.name)) is not None
-    return is_named and not has_unit and is_rising(column)
+    quantity = quantity_of(column.unit or unit_in(column.name))
+    return is_named and not quantity and is_rising(column)
 
 
 def is_coarse(column: Column) -> bool:

@@ -52,7 +52,7 @@ class Look:
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
-    """Return how a text file is written, by its first 400 kB; None if it is empty or no text.
+    """Return how a text file is written, by its first 2 MB; None if it is empty or no text.
 
     stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
@@ -67,10 +67,8 @@ def look(content: bytes, stated: Stated) -> Look | None:
         delimiter = ","
         width = 1
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
-    first = _first_row(rows[:MOST_LINES], width)
-    line = stated.get("text.header")
-    header, units = _head_lines(rows[:first], width, line if isinstance(line, int) else 0)
-    data = max(first, header)
+    data = _first_row(rows[:MOST_LINES], width)
+    header, units = _head_lines(rows[:data], width, stated)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
@@ -128,28 +126,29 @@ def _first_row(rows: Rows, width: int) -> int:
     return first
 
 
-def _head_lines(rows: Rows, width: int, stated: int) -> tuple[int, int]:
+def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
     The header is the last line with at least `width` cells. But if more than half of its words are
     units, and an earlier line is as wide, it is the line of the units, and the earlier one is the
-    header. Raises DataError if the header has a unit among its names, or a name twice, and the line
-    before it has no empty cell: then that may be the header.
+    header. If the header has a unit among its names, or a name twice, and the line before it has no
+    empty cell, that may be the header. Raises DataError then, unless the header is stated.
 
-    rows : the cells of the lines above the samples. stated : the header; 0 if it is not stated.
+    rows : the cells of the lines above the samples.
     """
-    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(row) and i >= stated]
+    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(row)]
     units = 0
-    while len(heads) > 1 and not units:
-        names = [*filter(None, rows[heads[-1] - 1])]
+    for i in heads[:0:-1]:
+        names = [*filter(None, rows[i - 1])]
         n = sum(is_unit(name) or bool(UNIT_WORDS.fullmatch(name)) for name in names)
-        if 2 * n <= len(names):
-            if all(rows[heads[-2] - 1]) and not stated and (n or len({*names}) < len(names)):
-                lines = f"{heads[-2]} and {heads[-1]}"
-                raise DataError(f"Expected one line of names, got {lines}; state text.header.")
+        if 2 * n <= len(names) or units:
+            is_odd = n or len({*names}) < len(names)
+            if is_odd and all(rows[heads[-2] - 1]) and "text.header" not in stated:
+                text = f"got {rows[heads[-2] - 1]} and {rows[i - 1]}"
+                raise DataError(f"Expected one line of names, {text}; state text.header.")
             break
         units = heads.pop()
-    return stated or max(heads, default=0), units
+    return max(heads, default=0), units
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
@@ -166,8 +165,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
         if item := look(content, p.stated):
             groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        where = f"in {listed(p.names)}, found none"
-        raise DataError(f"Expected a text with numbers {where}: is text.encoding right?")
+        raise DataError(f"Expected a text in text.encoding in {listed(p.names)}, found none.")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
@@ -180,7 +178,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     """Set the keys of `[text]` in `p`, as the first of these files is written.
 
-    If the header stands at different lines, `text.header` becomes its text. A note warns if the encoding is guessed.
+    If the header stands at different lines, `text.header` becomes its text. A note warns if the
+    encoding is guessed. The marks in numbers are set by `propose_marks`.
 
     looks : the first lines of files of one form.
     """
@@ -204,20 +203,18 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    The last columns may lack a name. Raises DataError for more names than columns. Without a header the names are `c0`, `c1`, ...; for 20 columns or more it
-    is `x*`, which names all of them. Such a matrix has a part in each row; if its first column has
-    few different whole numbers, it is named `class`.
+    Empty cells behind the last column are left out. Without a header, or if it has more words than
+    there are columns, the names are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names
+    all of them. Such a matrix has a part in each row; if its first column has few different whole
+    numbers, it is named `class`.
 
     usual : the first lines of a typical file.
     """
     width = usual.width
-    if usual.line:
-        line = COMMENT.sub("", usual.line.lstrip())
-        cells = split_line(line, usual.form.delimiter)
-        if any(map(str.strip, cells[width:])):
-            raise DataError(f"Expected {width} names, got {cells}; state text.names.")
-        names = header_names([*cells, *[""] * (width - len(cells))])
-        return names[:width] if len(cells) != width else []
+    line = COMMENT.sub("", usual.line.lstrip())
+    cells = split_line(line, usual.form.delimiter)
+    if line and not any(map(str.strip, cells[width:])):
+        return header_names(cells)[:width] if len(cells) > width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
@@ -236,12 +233,12 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     cells : texts that are numbers with some marks.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
-    n_read = dict[tuple[str, str], int]()
     possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
-    for mark, group in product(possible, GROUPS):
-        if mark != group:
-            pattern = pattern_of(mark, group)
-            n_read[mark, group] = sum(n for cell, n in counts.items() if pattern.fullmatch(cell))
+    n_read = {
+        marks: sum(n for cell, n in counts.items() if pattern_of(*marks).fullmatch(cell))
+        for marks in product(possible, GROUPS)
+        if marks[0] != marks[1]
+    }
     most = max(n_read.values())
     marks, groups = zip(*(key for key, n in n_read.items() if n == most), strict=True)
     p.put("text.decimal", marks[0])

@@ -10,7 +10,6 @@ from ...errors import DataError, instead
 from ...records import Floats
 from ..description import Clock, TextForm
 from ..table import Cells, Table, UnreadableError
-from ..units import bare
 
 UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 UNITS |= {"min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -99,8 +98,6 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
         period = 0.0 if is_date or any(map(has_day, (unit, *clock.format))) else DAY
     else:
         scale = scale_of(unit)
-        if unit in UNITS:
-            scale = UNITS.get(bare(table.units.get(name, "")), scale)
         times: Cells = table.numbers(name, form)
         table.refuse(np.isnan(times), "a time", name)
         with suppress(ValueError, OverflowError):
