@@ -171,16 +171,13 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     format is no form or unit of times, and as `check_clock` does.
     """
     check_clock(p.description.time)
-    clocks = list[tuple[Table, Floats]]()
-    starts, means = list[float](), list[float]()
+    clocks = list[tuple[Table, Floats, float]]()
     for table in tables:
         with suppress(UnreadableError):
-            seconds, start = times_of(table, p.description.time, p.description.text)
-            starts.append(start)
-            steps = np.diff(seconds)
-            clocks += [(table, seconds)] if len(steps) else []
-            means += [float(steps[steps >= 0].mean())] if (steps >= 0).any() else []
-    if min(starts, default=0.0) > YEARS[0]:
+            clocks.append((table, *times_of(table, p.description.time, p.description.text)))
+    steps = [np.diff(seconds) for _, seconds, _ in clocks]
+    means = [item[item >= 0].mean() for item in steps if (item >= 0).any()]
+    if min((start for *_, start in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")
     usual = float(np.median(means or 0.0))
     if not is_rate(usual):
@@ -189,7 +186,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))
     faults = list[Fault]()
-    for table, seconds in clocks:
+    for table, seconds, _ in clocks:
         with caught(faults, table.source):
             check_steps(seconds, p.description.time, table)
     if len(faults) > FEW * len(clocks) + 1:

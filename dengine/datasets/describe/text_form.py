@@ -144,7 +144,7 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
         if 2 * n <= len(names) or units:
             is_odd = n or len({*names}) < len(names)
             if is_odd and all(rows[heads[-2] - 1]) and "text.header" not in stated:
-                text = f"got {rows[heads[-2] - 1]} and {rows[i - 1]}"
+                text = f"lines {heads[-2]} and {i} may be"
                 raise DataError(f"Expected one line of names, {text}; state text.header.")
             break
         units = heads.pop()
