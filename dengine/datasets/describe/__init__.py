@@ -178,7 +178,8 @@ def read_tables(p: Proposal) -> list[Table]:
 
     For text files the keys of `[text]` are set in `p` first, and files of another form move from
     `p.names` to `p.others`. Damaged files are left out, also those with a line that has a wrong
-    number of cells. Raises DataError if all are damaged, or if no text file is a text.
+    number of cells. Raises DataError if all are damaged, if no text file is a text, or if it is not
+    certain which line or which names are the header.
     """
     contents = contents_of(p)
     if p.description.format == "text":

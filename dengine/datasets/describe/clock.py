@@ -13,31 +13,34 @@ from ..description import UNKNOWN
 from ..read.clock import UNITS, check_steps, has_day, scale_of, times_of
 from ..read.files import caught
 from ..table import Table, UnreadableError
+from ..units import quantity_of, unit_in
 from .columns import Column, Proposal, Tables
 
 NAME = re.compile(
     r"time|zeit|stamp|clock|temps|tiempo|tempo|hora|heure|millis|milli?tm|micros|elapsed|epoch"
-    r"|(^|\.)(t|ms|s|us|ns|sec|secs|seconds|date|datum|uhr|x_value|ticks)$|^t[ _/\[(]"
+    r"|(^|\.)(t|ms|us|ns|sec|secs|seconds|date|datum|uhr|x_value|ticks)$|^t[ _/\[(]"
     r"|tijd|czas|时间|時間|時刻|시간",
     re.IGNORECASE,
 )
 UNIT_IN_NAME = re.compile(
-    r"(?:[\[(/_ ]|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|sec))\s*[\])]?$"
+    r"(?:[\[(/_ ]|in )\s*((?:[\d.,]+ ?)?(?:s|ms|us|µs|ns|min|h|[mun]?sec))\s*[\])]?$"
 )
 # Names that are a unit. Whole seconds and nanoseconds may stand in two columns beside each other.
 NAMED_UNIT = re.compile(
-    r"(?i)(?P<ns>(?:^|[^a-z])n(?:ano)?_?se|nsecs?$)|(?P<ms>^milli|^ms$|(?-i:[a-z]Ms$))"
-    r"|(?P<us>^micros)|(?P<s>(?:^|[^n])secs?(?:onds?)?$)"
+    r"(?i)(?P<ns>(?:^|[^a-z])n(?:ano)?_?se|nsecs?$)|(?P<ms>^milli|millis|^ms$|(?-i:[a-z]Ms$))"
+    r"|(?P<us>micros)|(?P<s>(?:^|[^a-z])secs?(?:onds?)?$)"
 )
 # Counts since some day: their unit, the seconds from that day to 1970, and what they are called.
 EPOCHS = (
     *((unit, 0, f"{unit} since 1970") for unit in ("s", "ms", "us", "ns")),
     ("d", 2_209_161_600, "days since 1900, as spreadsheets count them"),
+    ("0.0864 s", 2_209_161_600, "1e-6 days since 1900, as WinCC counts them"),
     ("0.1 us", 11_644_473_600, "0.1 us since 1601"),
     ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
 )
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
-SLOWEST_STEP = 0.04  # of numbers that are taken for seconds because they are small
+# Smaller steps are taken for seconds: as milliseconds they would be of a rate above 50 kHz.
+SLOWEST_STEP = 0.019
 FEW = 0.1  # of the recordings that may have a gap, and of the steps that may fall
 ANSWERS = (  # to a clock that the reader would refuse
     "state the longest time.gap (0: any; with traces.lengths=resample if the clock jitters), or "
@@ -56,7 +59,8 @@ def propose_clock(p: Proposal) -> None:
     clocks = [column for column in p.columns.values() if is_clock(column)]
     if stated:
         clocks = [p.columns[name] for name in stated if name in p.columns]
-    every = p.columns.values() if clocks or "c0" in p.description.text.names else ()
+    is_open = clocks or "c0" in p.description.text.names or "s" in p.columns  # may be the stroke
+    every = p.columns.values() if is_open else ()
     has_days = any(has_day(form) for column in clocks for form in column.forms)
     coarse = [] if has_days else [c for c in p.unused if c.forms or is_coarse(c)]
     names = [c.name for c in every if c in clocks or c in coarse or not clocks]
@@ -79,7 +83,8 @@ def is_clock(column: Column) -> bool:
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
         return not column.fixed
-    return is_named and is_rising(column)
+    quantity = quantity_of(column.unit or unit_in(column.name))
+    return is_named and not quantity and is_rising(column)
 
 
 def is_coarse(column: Column) -> bool:
@@ -104,19 +109,17 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
-    why it is `?`, or which size proves the unit. If day and month can be confused, the form is `?`
-    for a column that alone tells the time or that changes within a recording. Beside a column of
-    times, dates of one day get the first form: the order of day and month does not change the steps
-    between samples.
+    why it is `?`, or which size proves the unit. If day and month can be confused, the form is `?`,
+    unless another column tells the time of day and all recordings have one date.
 
     is_alone : whether no other column tells a part of the time.
     """
     forms = column.forms
-    if len(forms) > 1 and (is_alone or not column.fixed):
+    if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
     for unit in (*forms, column.unit, _unit_in(column.name)):
-        if unit in forms or unit.lstrip("0123456789. ") in UNITS:
+        if unit in forms or unit.replace("sec", "s").lstrip("0123456789. ") in UNITS:
             return unit.replace("sec", "s")
     unit, p.notes["time.format"] = _unit_by_size(column)
     return unit
@@ -168,16 +171,13 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     format is no form or unit of times, and as `check_clock` does.
     """
     check_clock(p.description.time)
-    clocks = list[tuple[Table, Floats]]()
-    starts, means = list[float](), list[float]()
+    clocks = list[tuple[Table, Floats, float]]()
     for table in tables:
         with suppress(UnreadableError):
-            seconds, start = times_of(table, p.description.time, p.description.text)
-            starts.append(start)
-            steps = np.diff(seconds)
-            clocks += [(table, seconds)] if len(steps) else []
-            means += [float(steps[steps >= 0].mean())] if (steps >= 0).any() else []
-    if min(starts, default=0.0) > YEARS[0]:
+            clocks.append((table, *times_of(table, p.description.time, p.description.text)))
+    steps = [np.diff(seconds) for _, seconds, _ in clocks]
+    means = [item[item >= 0].mean() for item in steps if (item >= 0).any()]
+    if min((start for *_, start in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")
     usual = float(np.median(means or 0.0))
     if not is_rate(usual):
@@ -186,7 +186,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))
     faults = list[Fault]()
-    for table, seconds in clocks:
+    for table, seconds, _ in clocks:
         with caught(faults, table.source):
             check_steps(seconds, p.description.time, table)
     if len(faults) > FEW * len(clocks) + 1:

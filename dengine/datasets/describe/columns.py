@@ -74,10 +74,15 @@ class Column:
 
     @cached_property
     def numbers(self) -> list[Floats]:
-        """The numbers of each recording; empty if any cell is not a number as `form` writes it."""
-        with suppress(DataError):
-            return [table.numbers(self.name, self.form) for table in self.tables]
-        return []
+        """The numbers of each recording that has only numbers as `form` writes them.
+
+        Empty if more than 10 % of the recordings have other cells.
+        """
+        numbers = list[Floats]()
+        for table in self.tables:
+            with suppress(DataError):
+                numbers.append(table.numbers(self.name, self.form))
+        return numbers * (len(numbers) >= 0.9 * len(self.tables))
 
     @cached_property
     def steps(self) -> Floats:

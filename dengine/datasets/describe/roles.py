@@ -200,15 +200,16 @@ def find_lost(p: Proposal) -> None:
 
     They are those already there, and the words of `LOST`, in any case of letters, that a channel
     has; "" is an empty cell. If more than 10 % of the cells of a channel are empty, "" is not added
-    for it: these rows belong to another signal. `[rows]` then drops them, with a note, unless it
-    has words of this channel already. A stated `text.missing` stays.
+    for it if there is a clock: these rows belong to another signal. `[rows]` then drops them, with
+    a note, unless it has words of this channel already. A stated `text.missing` stays.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
+    clock = p.description.time.column
     for name in p.description.channels.keys() & p.columns.keys():
         column = p.columns[name]
         lost = {word for word in column.odd if word.lower() in LOST}
-        if column.counts[""] > SPARSE * column.counts.total():
+        if clock and column.counts[""] > SPARSE * column.counts.total():
             lost -= {""}
             rows.setdefault(name, RowWords((ANY,), ("",)))
             p.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"

@@ -33,7 +33,7 @@ MOST_NAMES = 20  # columns without a header that get a name each
 MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
 UNIT_WORDS = re.compile(
-    r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|s|ms|us|ns|min|h)[\])]?"
+    r"(?i)[\[(]?(hh:mm(:ss)?|dd\.mm\.yyyy|[\d.]+ ?[mu]?s|[mun]?s(ecs?)?|min|h)[\])]?"
 )
 Rows = Sequence[Sequence[str]]
 
@@ -52,22 +52,23 @@ class Look:
 
 
 def look(content: bytes, stated: Stated) -> Look | None:
-    """Return how a text file is written, by its first 200 lines; None if it is empty or no text.
+    """Return how a text file is written, by its first 2 MB; None if it is empty or no text.
 
-    stated : keys that the user gave; only `text.encoding` and `text.delimiter` are used.
+    stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
     encoding, text = decode(content, str(stated.get("text.encoding", "")))
-    lines = text.splitlines()[:MOST_LINES]
+    lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
     if "\0" in text or not text.strip():
         return None
     marks = str(stated.get("text.delimiter", DELIMITERS))
-    share, width, delimiter = max((*_share_of_numbers(lines, mark), mark) for mark in marks)
+    head = lines[:MOST_LINES]
+    share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
     if share == 0:  # a single column
         delimiter = ","
         width = 1
-    rows = [split_line(line, delimiter) if line.strip() else [] for line in lines]
-    data = _first_row(rows, width)
-    header, units = _head_lines(rows[:data], width)
+    rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
+    data = _first_row(rows[:MOST_LINES], width)
+    header, units = _head_lines(rows[:data], width, stated)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
@@ -125,20 +126,28 @@ def _first_row(rows: Rows, width: int) -> int:
     return first
 
 
-def _head_lines(rows: Rows, width: int) -> tuple[int, int]:
+def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The header is the last line with at least `width` cells. But if that holds only units, and an
-    earlier line is as wide, it is the line of the units, and the earlier one is the header.
+    The header is the last line with at least `width` cells. But if more than half of its words are
+    units, and an earlier line is as wide, it is the line of the units, and the earlier one is the
+    header. If the header has a unit among its names, or a name twice, and the line before it has no
+    empty cell, that may be the header. Raises DataError then, unless the header is stated.
 
     rows : the cells of the lines above the samples.
     """
-    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(map(str.strip, row))]
+    heads = [i for i, row in enumerate(rows, 1) if len(row) >= width and any(row)]
     units = 0
-    if len(heads) > 1:
-        cells = filter(None, map(str.strip, rows[heads[-1] - 1]))
-        if all(is_unit(cell) or UNIT_WORDS.fullmatch(cell) for cell in cells):
-            units = heads.pop()
+    for i in heads[:0:-1]:
+        names = [*filter(None, rows[i - 1])]
+        n = sum(is_unit(name) or bool(UNIT_WORDS.fullmatch(name)) for name in names)
+        if 2 * n <= len(names) or units:
+            is_odd = n or len({*names}) < len(names)
+            if is_odd and all(rows[heads[-2] - 1]) and "text.header" not in stated:
+                text = f"lines {heads[-2]} and {i} may be"
+                raise DataError(f"Expected one line of names, {text}; state text.header.")
+            break
+        units = heads.pop()
     return max(heads, default=0), units
 
 
@@ -156,7 +165,7 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
         if item := look(content, p.stated):
             groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none.")
+        raise DataError(f"Expected a text in text.encoding in {listed(p.names)}, found none.")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
@@ -184,28 +193,28 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     if any(item.form.encoding == LATIN for item in looks):
         form = replace(form, encoding=LATIN)
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    names = () if p.stated.get("text.header") else tuple(_column_names(usual))
+    names = p.stated.get("text.names") or tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
-    cells = {cell.strip() for item in looks for row in item.rows for cell in row}
+    cells = {cell for item in looks for row in item.rows for cell in row}
     propose_marks(p, [*filter(NUMBER.fullmatch, cells)])
 
 
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    If the header has more names than there are columns, its first names are used. Without a header
-    the names are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names all of them. Such
-    a matrix has a part in each row; if its first column has few different whole numbers, it is
-    named `class`.
+    Empty cells behind the last column are left out. Without a header, or if it has more words than
+    there are columns, the names are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names
+    all of them. Such a matrix has a part in each row; if its first column has few different whole
+    numbers, it is named `class`.
 
     usual : the first lines of a typical file.
     """
     width = usual.width
-    if usual.line:
-        line = COMMENT.sub("", usual.line.lstrip())
-        names = header_names(split_line(line, usual.form.delimiter))
-        return names[:width] if len(names) > width else []
+    line = COMMENT.sub("", usual.line.lstrip())
+    cells = split_line(line, usual.form.delimiter)
+    if line and not any(map(str.strip, cells[width:])):
+        return header_names(cells)[:width] if len(cells) > width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))
@@ -224,12 +233,12 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     cells : texts that are numbers with some marks.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
-    n_read = dict[tuple[str, str], int]()
     possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
-    for mark, group in product(possible, GROUPS):
-        if mark != group:
-            pattern = pattern_of(mark, group)
-            n_read[mark, group] = sum(n for cell, n in counts.items() if pattern.fullmatch(cell))
+    n_read = {
+        marks: sum(n for cell, n in counts.items() if pattern_of(*marks).fullmatch(cell))
+        for marks in product(possible, GROUPS)
+        if marks[0] != marks[1]
+    }
     most = max(n_read.values())
     marks, groups = zip(*(key for key, n in n_read.items() if n == most), strict=True)
     p.put("text.decimal", marks[0])

@@ -203,7 +203,9 @@ def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
         if i in table.lines and line.strip() and not line.startswith(form.drop):
             rows[i] = split_line(line, form.delimiter)
             if len(rows[i]) != n:
-                message = f"Expected {n} cells, as there are columns, got {len(rows[i])}"
+                message = (
+                    f"Expected {n} cells, as there are columns, got {len(rows[i])}; see text.drop"
+                )
                 damage.append(UnreadableError(message, i))
                 rows[i] = [""] * n
     if damage and len(damage) == len(rows):
