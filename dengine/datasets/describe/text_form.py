@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import DataError, listed
+from ..dataset import Fault
 from ..description import UNKNOWN, TextForm
+from ..read.files import caught
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..table import pattern_of
 from ..units import is_unit
@@ -156,16 +158,20 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 
     Those have another delimiter, number of columns or header, and move from `p.names` to
     `p.others`. If two or more of them have samples, at least 8 rows, `exclude` is set to `?`, with
-    a note that asks whether they are recordings. Raises DataError if no file is a text.
+    a note that asks whether they are recordings. Raises DataError if no file is a text whose header
+    is certain.
 
     contents : the contents of the files that are looked at, by name.
     """
     groups = defaultdict[Any, dict[str, Look]](dict)
+    faults = list[Fault]()
     for name, content in contents.items():
-        if item := look(content, p.stated):
-            groups[item.form.delimiter, item.width, item.line][name] = item
+        with caught(faults, name):
+            if item := look(content, p.stated):
+                groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        raise DataError(f"Expected a text in text.encoding in {listed(p.names)}, found none.")
+        reason = listed(faults[:1]) or "is text.encoding right?"
+        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none: {reason}")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
@@ -193,7 +199,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     if any(item.form.encoding == LATIN for item in looks):
         form = replace(form, encoding=LATIN)
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    names = p.stated.get("text.names") or tuple(_column_names(usual))
+    names = () if p.stated.get("text.header") else tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
     cells = {cell for item in looks for row in item.rows for cell in row}
