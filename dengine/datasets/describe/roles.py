@@ -204,11 +204,11 @@ def find_lost(p: Proposal) -> None:
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
-    clock = p.description.time.column
     for name in p.description.channels.keys() & p.columns.keys():
         column = p.columns[name]
         lost = {word for word in column.odd if word.lower() in LOST}
-        if clock and column.counts[""] > SPARSE * column.counts.total():
+        n_empty = column.counts[""] if p.description.time.column else 0
+        if n_empty > SPARSE * column.counts.total():
             lost -= {""}
             rows.setdefault(name, RowWords((ANY,), ("",)))
             p.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"

@@ -30,7 +30,7 @@ LIKELY = 0.95  # of the numbers that the marks of a text must read; the others a
 SAME_DIGITS = str.maketrans("23456789", "11111111")  # for numbers of one form
 MOST_BYTES = 2_000_000  # of a file that are read
 LATIN = "cp1252"
-MOST_LINES = 200  # of a file that are looked at
+MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
@@ -53,15 +53,17 @@ class Look:
     rows: Rows
 
 
-def look(content: bytes, stated: Stated) -> Look | None:
-    """Return how a text file is written, by its first 2 MB; None if it is empty or no text.
+def look(content: bytes, stated: Stated) -> Look:
+    """Return how a text file is written, by its first 2 MB.
+
+    Raises DataError if it is empty or no text, or if the line of its header is not certain.
 
     stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
     encoding, text = decode(content, str(stated.get("text.encoding", "")))
     lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
     if "\0" in text or not text.strip():
-        return None
+        raise DataError("Expected a text in text.encoding.")
     marks = str(stated.get("text.delimiter", DELIMITERS))
     head = lines[:MOST_LINES]
     share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
@@ -167,11 +169,10 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     faults = list[Fault]()
     for name, content in contents.items():
         with caught(faults, name):
-            if item := look(content, p.stated):
-                groups[item.form.delimiter, item.width, item.line][name] = item
+            item = look(content, p.stated)
+            groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        reason = listed(faults[:1]) or "is text.encoding right?"
-        raise DataError(f"Expected a text with numbers in {listed(p.names)}, found none: {reason}")
+        raise DataError(f"Expected a text with numbers, found none: {listed(faults[:1])}.")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
