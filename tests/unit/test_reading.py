@@ -551,6 +551,18 @@ def test_lines_of_json_under_another_suffix_are_refused_until_that_is_stated(
     assert load_dataset(path, describe(path, {"format": "jsonl"})).y.tolist() == [1, 0]
 
 
+@pytest.mark.parametrize("state", ["k", ["k"] * 2])
+def test_a_column_of_rows_that_is_shorter_than_the_samples_is_a_fault(
+    tmp_path: Path, state: str | list[str]
+) -> None:
+    path = tmp_path / "all.jsonl"
+    parts = [{"ok": ok, "force": [ok, 2, 4], "state": state} for ok in (0, 1)]
+    path.write_text("\n".join(map(json.dumps, parts)))
+    proposal = describe(path, {"rows.state.keep": "k", "label.good": 1, "label.bad": 0})
+    with pytest.raises(DataError, match="Expected columns of one length"):
+        load_dataset(path, proposal.with_values({"channels.force": "N", "traces.samples": 3}))
+
+
 def test_stated_checks_and_headers_are_kept(tmp_path: Path) -> None:
     check = {"path": "^(.)", "good": [*"134"], "bad": [*"02"]}
     stated = describe(in_files(tmp_path), {"check": [check], "text.header": "tim"})

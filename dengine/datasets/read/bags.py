@@ -127,8 +127,9 @@ def _rows_of(
     rows: list[Any] = []
     for path, name in files:
         if description.windows.trigger and faults:
-            why = f"since a trigger cuts: {faults[0]}"
-            raise DataError(f"Expected whole files before {name}, {why}")
+            raise DataError(
+                f"Expected whole files before {name}, since a trigger cuts: {faults[0]}"
+            )
         with caught(faults, name), instead(UnreadableError, "Expected a field", AttributeError):
             for topic, logged, message in read_messages(path, {*topics, *events}):
                 if topic in events:

@@ -75,8 +75,9 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     for name, unit in zip(clock.column, clock.format, strict=True):
         relative, first = column_times(table, name, unit, clock, form)
         if len({1, len(seconds), len(relative)}) > 2:
-            message = f"Expected {len(seconds)} times, got {len(relative)}"
-            raise UnreadableError(message, column=name)
+            raise UnreadableError(
+                f"Expected {len(seconds)} times, got {len(relative)}", column=name
+            )
         seconds = seconds + relative
         start += first
     return seconds, start
@@ -160,5 +161,7 @@ def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
             column,
         )
     if abs(rate * span - n) > RATE_TOLERANCE * rate * span and rate:
-        message = f"Expected {rate:g} Hz as time.rate_hz says, its times give {n / span:.5g} Hz"
-        raise UnreadableError(message, column=column)
+        raise UnreadableError(
+            f"Expected {rate:g} Hz as time.rate_hz says, its times give {n / span:.5g} Hz",
+            column=column,
+        )

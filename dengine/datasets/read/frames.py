@@ -43,8 +43,7 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
         items = value if isinstance(value, list) else [value]
         for item in items:
             if not isinstance(item, Mapping):
-                message = f"Expected an object of JSON, got {shortened(item)}"
-                raise UnreadableError(message, number)
+                raise UnreadableError(f"Expected an object of JSON, got {shortened(item)}", number)
             rows.append(flat("", item))
         numbers += [number] * len(items)
     if not rows:

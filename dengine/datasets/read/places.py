@@ -177,8 +177,11 @@ class LabelReader:
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
         meanings |= dict.fromkeys(source.bad, 0) | dict.fromkeys(source.good, 1)
         if word not in meanings:
-            message = f"Expected a label among {listed(meanings)}, got {shortened(word)}"
-            raise UnreadableError(message, line, source.column)
+            raise UnreadableError(
+                f"Expected a label among {listed(meanings)}, got {shortened(word)}",
+                line,
+                source.column,
+            )
         return meanings[word]
 
     def unused_note(self) -> str:

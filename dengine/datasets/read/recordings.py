@@ -59,8 +59,7 @@ def recording_of(
     """
     clock = description.time
     form = description.text
-    with instead(UnreadableError, "Expected columns of one length", IndexError):
-        table, is_lost = kept_rows(table.whole(), description.rows)
+    table, is_lost = kept_rows(table.whole(), description.rows)
     seconds = None
     start = np.nan
     if clock.column:
@@ -89,10 +88,12 @@ def recording_of(
     return Recording(table.source, trace, label, part, lengths[0], start, rank)
 
 
+@instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
     """Return the rows of a table that are samples, and which of these are lost, (rows,) bool.
 
-    Raises UnreadableError for a word whose meaning is not stated, or a column that is missing.
+    Raises UnreadableError for a word whose meaning is not stated, or a column that is missing or of
+    another length.
 
     rows : for each column, which of its words keep a row, drop it, or mark its samples as lost.
     """
@@ -141,9 +142,11 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
         if other != label:
-            message = f"Expected labels that agree, [label] says {WORDS[label]}"
-            message = f"{message}, [[check]] {i} says {WORDS[other]}"
-            raise UnreadableError(message, column=labels[i].source.column)
+            raise UnreadableError(
+                f"Expected labels that agree, [label] says {WORDS[label]}, [[check]] {i} says "
+                f"{WORDS[other]}",
+                column=labels[i].source.column,
+            )
     return label
 
 

@@ -86,9 +86,11 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
     except UnicodeError as error:  # some encodings do not say where
         bad = getattr(error, "start", 0)
     if bad >= 0:
-        message = f"Expected a text in {encoding}, got the byte 0x{content[bad]:02x}"
-        line = content.count(b"\n", 0, bad) + 1
-        raise UnreadableError(f"{message}; state text.encoding", line)
+        raise UnreadableError(
+            f"Expected a text in {encoding}, got the byte 0x{content[bad]:02x}; state "
+            "text.encoding",
+            line=content.count(b"\n", 0, bad) + 1,
+        )
     return content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
 
 
