@@ -678,7 +678,7 @@ def test_one_number_with_another_decimal_mark_is_a_fault_or_asked_for_if_it_may_
     for i in range(10):
         rows = [f"{j / 100:.2f};{1 + i + j / 7:.{digits}f}" for j in range(60)]
         rows[30] = rows[30].replace(".", "," if i == 3 else ".")
-        text = "\n".join(["s;F", *rows]) + "\n"
+        text = "\n".join(["t;F", *rows]) + "\n"
         (tmp_path / f"{i}_{WORDS[i % 2]}.csv").write_text(text, encoding="utf-8")
     proposal = describe(tmp_path, {"channels.F": "N"})
     assert ("text.thousands" in proposal.open_keys) == is_open

@@ -119,8 +119,9 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
     for unit in (*forms, column.unit, _unit_in(column.name)):
-        if unit in forms or unit.replace("sec", "s").lstrip("0123456789. ") in UNITS:
-            return unit.replace("sec", "s")
+        unit = unit.replace("sec", "s")
+        if unit in forms or unit.lstrip("0123456789. ") in UNITS:
+            return unit
     unit, p.notes["time.format"] = _unit_by_size(column)
     return unit
 
@@ -175,11 +176,10 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     for table in tables:
         with suppress(UnreadableError):
             clocks.append((table, *times_of(table, p.description.time, p.description.text)))
-    steps = [np.diff(seconds) for _, seconds, _ in clocks]
-    means = [item[item >= 0].mean() for item in steps if (item >= 0).any()]
+    rising = [steps[steps >= 0] for steps in (np.diff(seconds) for _, seconds, _ in clocks)]
     if min((start for *_, start in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")
-    usual = float(np.median(means or 0.0))
+    usual = float(np.median([steps.mean() for steps in rising if len(steps)] or 0.0))
     if not is_rate(usual):
         text = f"steps of {usual:.6g} s are of no force: is time.format right?"
         p.put("time.rate_hz", UNKNOWN, text)

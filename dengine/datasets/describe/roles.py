@@ -16,7 +16,7 @@ from ..read.recordings import kept_rows
 from ..table import Table
 from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
-from .clock import is_rising, propose_clock, propose_rate
+from .clock import is_clock, propose_clock, propose_rate
 from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import lines_of, part_words, propose_label, row_of, with_meanings
 from .layout import PART_NAME
@@ -188,8 +188,7 @@ def _units(p: Proposal) -> dict[str, str]:
         n = column.counts.total()
         strange = [w for w, k in odd.items() if w.lower() not in LOST and k > STRANGE * n]
         is_number = len(column.counts) - len(odd) > 1 and odd.total() <= MOST_FREQUENT * n
-        is_clock = CLOCK_NAME.search(name) and is_rising(column)
-        is_other = is_clock or COUNTER_NAME.fullmatch(name) or column.fixed
+        is_other = is_clock(column) or COUNTER_NAME.fullmatch(name) or column.fixed
         if is_number and not strange and not is_other:
             units[name] = column.unit or unit_in(name.rstrip(ANY))
     return units
@@ -205,11 +204,11 @@ def find_lost(p: Proposal) -> None:
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
-    clock = p.description.time.column
     for name in p.description.channels.keys() & p.columns.keys():
         column = p.columns[name]
         lost = {word for word in column.odd if word.lower() in LOST}
-        if clock and column.counts[""] > SPARSE * column.counts.total():
+        n_empty = column.counts[""] if p.description.time.column else 0
+        if n_empty > SPARSE * column.counts.total():
             lost -= {""}
             rows.setdefault(name, RowWords((ANY,), ("",)))
             p.notes[f"rows.{name}.drop"] = "rows without a value are no samples of it"

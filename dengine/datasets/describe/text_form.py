@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 
 from ...errors import DataError, listed
+from ..dataset import Fault
 from ..description import UNKNOWN, TextForm
+from ..read.files import caught
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..table import pattern_of
 from ..units import is_unit
@@ -28,7 +30,7 @@ LIKELY = 0.95  # of the numbers that the marks of a text must read; the others a
 SAME_DIGITS = str.maketrans("23456789", "11111111")  # for numbers of one form
 MOST_BYTES = 2_000_000  # of a file that are read
 LATIN = "cp1252"
-MOST_LINES = 200  # of a file that are looked at
+MOST_LINES = 200  # by which the delimiter and the first row of samples are found
 MOST_NAMES = 20  # columns without a header that get a name each
 MOST_CLASSES = 12  # whole numbers in the first column of a matrix that are its classes
 WHOLE = re.compile(r"-?\d+(\.0*)?(e\+00)?")
@@ -51,15 +53,17 @@ class Look:
     rows: Rows
 
 
-def look(content: bytes, stated: Stated) -> Look | None:
-    """Return how a text file is written, by its first 2 MB; None if it is empty or no text.
+def look(content: bytes, stated: Stated) -> Look:
+    """Return how a text file is written, by its first 2 MB.
+
+    Raises DataError if it is empty or no text, or if the line of its header is not certain.
 
     stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
     encoding, text = decode(content, str(stated.get("text.encoding", "")))
     lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
     if "\0" in text or not text.strip():
-        return None
+        raise DataError("Expected a text in text.encoding.")
     marks = str(stated.get("text.delimiter", DELIMITERS))
     head = lines[:MOST_LINES]
     share, width, delimiter = max((*_share_of_numbers(head, mark), mark) for mark in marks)
@@ -156,16 +160,19 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 
     Those have another delimiter, number of columns or header, and move from `p.names` to
     `p.others`. If two or more of them have samples, at least 8 rows, `exclude` is set to `?`, with
-    a note that asks whether they are recordings. Raises DataError if no file is a text.
+    a note that asks whether they are recordings. Raises DataError if no file is a text whose header
+    is certain.
 
     contents : the contents of the files that are looked at, by name.
     """
     groups = defaultdict[Any, dict[str, Look]](dict)
+    faults = list[Fault]()
     for name, content in contents.items():
-        if item := look(content, p.stated):
+        with caught(faults, name):
+            item = look(content, p.stated)
             groups[item.form.delimiter, item.width, item.line][name] = item
     if not groups:
-        raise DataError(f"Expected a text in text.encoding in {listed(p.names)}, found none.")
+        raise DataError(f"Expected a text with numbers, found none: {listed(faults[:1])}.")
     same = groups.pop(max(groups, key=lambda key: len(groups[key])))
     odd = {name: item for group in groups.values() for name, item in group.items()}
     p.others = [*p.others, *odd]
@@ -193,7 +200,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     if any(item.form.encoding == LATIN for item in looks):
         form = replace(form, encoding=LATIN)
         p.notes["text.encoding"] = f"{LATIN} reads any text: look at the letters below"
-    names = p.stated.get("text.names") or tuple(_column_names(usual))
+    names = () if p.stated.get("text.header") else tuple(_column_names(usual))
     for key, value in asdict(replace(form, names=names)).items():
         p.put(f"text.{key}", value)
     cells = {cell for item in looks for row in item.rows for cell in row}
