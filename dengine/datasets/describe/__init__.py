@@ -13,6 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...errors import DataError, listed
 from ..checks import check_text
 from ..dataset import Fault
@@ -49,6 +51,7 @@ BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_BYTES = 2_000_000  # of all files that are read, and of one
 MOST_ROWS = 50_000
+MOST_DAMAGED = 0.1  # of the lines of a single file
 Names = Sequence[str]
 
 
@@ -200,7 +203,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
     is stated, if it is the only file and its arrays hold curves. Of a text or jsonl file of more
     than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is
-    damaged, or if a line of a text file has a wrong number of cells.
+    damaged, or if a line of a text file has a wrong number of cells; but if the only file has few
+    such lines, these are left out.
     """
     kind = p.description.format
     if kind == "npz":
@@ -212,7 +216,11 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
         content = content[: content.rfind(b"\n", 0, MOST_BYTES)]
         p.is_cut = True
     if kind == "text":
-        return read_text(content, name, p.description.text).whole()
+        table = read_text(content, name, p.description.text)
+        damaged = np.searchsorted(table.lines, [error.line for error in table.damage])
+        if len(p.names) > 1 or len(damaged) > MOST_DAMAGED * len(table.lines):
+            return table.whole()
+        return replace(table.take(np.delete(np.arange(len(table.lines)), damaged)), damage=[])
     return table_of(content, name, replace(p.description, layout="files"))
 
 
@@ -229,7 +237,8 @@ def propose_tables(p: Proposal, files: Tables) -> None:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(0, MOST_ROWS)) for table in files]
-    p.put("layout", layout_of(p, files))
+    if "layout" not in p.stated or p.description.layout == "long":
+        p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"
         return

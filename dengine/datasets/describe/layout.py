@@ -19,6 +19,7 @@ PART_NAME = re.compile(
     r"(?i)part|serial|episode|teil|werkst|barcode|dmc|trial|piece|sample_?id"
     r"|^(id|run|sn|cycle|shot|nr|no)$|_(id|run|cycle|sn|nr)$"
 )
+NUMBER = re.compile(r"\d+(\.\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
 MOST_PARTS = 240
 
@@ -70,8 +71,11 @@ def may_tell_parts(column: Column) -> bool:
 
 
 def numbered_columns(table: Table) -> list[str]:
-    """Return a pattern like `x*` for each name, as in `x0`, `x1`, that 20 columns or more share."""
-    counts = Counter(re.sub(r"\d+$", ANY, name) for name in table.columns)
+    """Return a pattern like `x*` for each name, as in `x0`, `x1`, that 20 columns or more share.
+
+    The number may be a fraction, and a bracket or a unit in brackets may stand behind it.
+    """
+    counts = Counter(NUMBER.sub(ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
 
 

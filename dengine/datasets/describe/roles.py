@@ -13,6 +13,7 @@ from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
 from ..read.recordings import kept_rows
+from ..read.split import numbered
 from ..table import Table
 from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
@@ -117,7 +118,7 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 words, and each recording several rows. A column that is named like a
+    It must have at most 12 words, and a cell for each of several rows of a recording. A column that is named like a
     status (`Status`, `valid`) may have numbers, and also just one word. Any other must have texts
     that change within a recording, and no name like a clock. A column of labels with a known word
     is none.
@@ -127,7 +128,10 @@ def qualifies(column: Column) -> bool:
     is_named = QUALIFIER_NAME.search(name) is not None
     is_text = any(column.odd) and not CLOCK_NAME.search(name)
     varies = not column.fixed or (is_named and len(words) == 1)
-    has_rows = all(len(cells) > 1 for cells in column.words)
+    has_rows = all(
+        len(cells) == max(map(len, table.columns.values())) > 1
+        for cells, table in zip(column.words, column.tables, strict=True)
+    )
     if not (is_named or is_text) or not varies or not has_rows or len(words) > MOST_WORDS:
         return False
     source = with_meanings(LabelSource(column=name), words)
@@ -166,12 +170,26 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     named = [[*filter(pattern.search, units)] for pattern in FORCES]
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
     others = listed(name for name in units if [name] != best)
-    if len(best) == 1:
+    gaps = ", ".join(filter(None, (_gap_in(p, name) for name in best)))
+    if gaps:
+        p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), f"{gaps}; state channels")
+    elif len(best) == 1:
         p.description = replace(p.description, channels={best[0]: Channel(units[best[0]])})
         p.notes |= {f"channels.{best[0]}": f"others: {others}"} if others else {}
     else:
         text = f"one or several of: {others}" if units else "no column has numbers that change"
         p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), text)
+
+
+def _gap_in(p: Proposal, name: str) -> str:
+    """Return a sentence if the numbers of numbered columns, like `x*`, have unequal steps."""
+    columns = numbered(name, p.tables[0].origin.get(name, ()))
+    steps = np.diff([numbers[-1] for numbers in columns.values()])
+    odd = np.abs(steps - np.median(steps)) > np.median(steps) / 2 if len(steps) else steps
+    if not odd.any():
+        return ""
+    before, after = [*columns][int(odd.argmax()) :][:2]
+    return f"{name} has {len(columns)} samples, but {after} follows {before}"
 
 
 def _units(p: Proposal) -> dict[str, str]:

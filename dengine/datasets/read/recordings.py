@@ -59,8 +59,7 @@ def recording_of(
     """
     clock = description.time
     form = description.text
-    with instead(UnreadableError, "Expected columns of one length", IndexError):
-        table, is_lost = kept_rows(table.whole(), description.rows)
+    table, is_lost = kept_rows(table.whole(), description.rows)
     seconds = None
     start = np.nan
     if clock.column:
@@ -92,7 +91,8 @@ def recording_of(
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
     """Return the rows of a table that are samples, and which of these are lost, (rows,) bool.
 
-    Raises UnreadableError for a word whose meaning is not stated, or a column that is missing.
+    Raises UnreadableError for a word whose meaning is not stated, a column that is missing, or
+    columns of several lengths.
 
     rows : for each column, which of its words keep a row, drop it, or mark its samples as lost.
     """
@@ -106,8 +106,9 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
         kind = np.array([kind_of.get(word, other) for word in words], dtype=object)
         table.refuse(kind == "", f"one of the words {listed(sorted(kind_of))}", column)
         is_kept = kind != "drop"
-        is_lost = (is_lost | (kind == "invalid"))[is_kept]
-        table = table.take(is_kept)
+        with instead(UnreadableError, "Expected columns of one length", IndexError, ValueError):
+            is_lost = (is_lost | (kind == "invalid"))[is_kept]
+            table = table.take(is_kept)
     return table, is_lost
 
 
