@@ -118,10 +118,10 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 words, and a cell for each of several rows of a recording. A column that is named like a
-    status (`Status`, `valid`) may have numbers, and also just one word. Any other must have texts
-    that change within a recording, and no name like a clock. A column of labels with a known word
-    is none.
+    It must have at most 12 words, and a cell for each of several rows of a recording. A column that
+    is named like a status (`Status`, `valid`) may have numbers, and also just one word. Any other
+    must have texts that change within a recording, and no name like a clock. A column of labels
+    with a known word is none.
     """
     name = column.name
     words = column.counts
