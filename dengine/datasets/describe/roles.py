@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
 from .clock import is_rising, propose_clock, propose_rate
 from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import lines_of, part_words, propose_label, row_of, with_meanings
+from .labels import is_verdict, lines_of, part_words, propose_label, with_meanings
 from .layout import PART_NAME
 
 MOST_FREQUENT = 0.9  # of the rows, if the others are of another signal
@@ -135,7 +136,7 @@ def qualifies(column: Column) -> bool:
     if not (is_named or is_text) or not varies or not has_rows or len(words) > MOST_WORDS:
         return False
     source = with_meanings(LabelSource(column=name), words)
-    return not row_of(column) or not {*source.good, *source.bad} - {UNKNOWN}
+    return not is_verdict(column) or not {*source.good, *source.bad} - {UNKNOWN}
 
 
 def propose_part(p: Proposal) -> None:
@@ -145,7 +146,7 @@ def propose_part(p: Proposal) -> None:
     recordings. If several qualify, only a note lists them. A stated source stays.
     """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
-    sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
+    sources += [PartSource(line=line) for line in filter(PART_LINE.search, lines_of(p))]
     least = len(p.tables) / 2
     sources = [s for s in sources if len({*part_words(s, p.tables).values()}) > least]
     if len(sources) > 1:
@@ -183,7 +184,7 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
 def _gap_in(p: Proposal, name: str) -> str:
     """Return a sentence if the numbers of numbered columns, like `x*`, have unequal steps."""
-    columns = numbered(name, p.tables[0].origin.get(name, ()))
+    columns = numbered(name, chain(*(table.origin.get(name, ()) for table in p.tables[:1])))
     steps = np.diff([numbers[-1] for numbers in columns.values()])
     odd = np.abs(steps - np.median(steps)) > np.median(steps) / 2 if len(steps) else steps
     if not odd.any():

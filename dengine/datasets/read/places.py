@@ -47,13 +47,13 @@ def path_word(path: str, pattern: str) -> str:
 def line_word(lines: Sequence[str], beginning: str) -> str:
     """Return the cell that follows a text with which a line above the header begins.
 
-    The first such line is used; comment marks before the text are skipped. Raises UnreadableError
-    if no line begins with it.
+    The first such line is used, but one with no more letters in its first cell comes before it.
+    Comment marks before the text are skipped. Raises UnreadableError if no line begins with it.
     """
-    for line in lines:
-        text = line.lstrip(f"#%*{MARKS}")
-        if text.startswith(beginning):
-            return re.split(r"[;\t,]", text[len(beginning) :].strip(MARKS))[0].strip(MARKS)
+    texts = [line.lstrip(f"#%*{MARKS}") for line in lines]
+    texts = [text[len(beginning) :] for text in texts if text.startswith(beginning)]
+    for text in sorted(texts, key=lambda text: re.match(r"[\"' ]*([;:=\t,]|  |$)", text) is None):
+        return re.split(r"[;\t,]", text.strip(MARKS))[0].strip(MARKS)
     raise UnreadableError(f"Expected a line above the header that begins with {beginning}")
 
 
