@@ -27,6 +27,7 @@ from ..read.text import read_text
 from ..table import Table, UnreadableError
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
+from .labels import IN_PATHS
 from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import propose_form
@@ -114,9 +115,12 @@ def choose_files(p: Proposal, root: Path) -> bool:
         state = "it has none" if root.exists() else "it does not exist"
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}; {state}.")
     likely = likely_suffixes(names)
-    if len(likely) > 1 and not stated:
+    endings = signals_in(names) if len(likely) == 1 else ()
+    if len(likely) + len(endings) > 1 and not stated:
         counts = Counter(map(suffix_of, names))
         text = listed(f"*{suffix} ({n} files)" for suffix, n in counts.items())
+        if endings:
+            text = f"**/*{', **/*'.join(endings)}, or **/*: each part has {len(endings)} files"
         p.put("files", UNKNOWN, f"one of {text}")
         p.notes["channels"] = "they follow from files"
         return False
@@ -132,6 +136,20 @@ def likely_suffixes(names: Names) -> Names:
     """Return the suffixes that several files have, and `.mcap` if one file has it; or else all."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
+
+
+def signals_in(names: Names) -> Names:
+    """Return the endings of names like `1_Kraft.csv`, if each part has a file with each of them.
+
+    An ending is the last word, which has no number and is no verdict. Empty for any other names.
+    """
+    words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
+    endings = sorted({name[-1] for name in words})
+    heads = {name[0] for name in words}
+    is_word = not any(re.search(r"\d", without_suffix(word)) for word in endings)
+    is_verdict = {without_suffix(word).lower() for word in endings} & {*IN_PATHS}
+    is_full = len(heads) * len(endings) == len(names) and len(heads) > 1 < len(endings)
+    return endings if is_full and is_word and not is_verdict else ()
 
 
 def suffix_of(name: str) -> str:

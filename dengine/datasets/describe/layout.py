@@ -16,8 +16,8 @@ from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
 PART_NAME = re.compile(
-    r"(?i)part|serial|episode|teil|werkst|barcode|dmc|trial|piece|sample_?id"
-    r"|^(id|run|sn|cycle|shot|nr|no)$|_(id|run|cycle|sn|nr)$"
+    r"(?i)part|serial|episode|teil|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece|sample_?id"
+    r"|^(id|run|sn|cycle|shot|nr|no)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
 NUMBER = re.compile(r"\d+(\.\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
@@ -45,8 +45,11 @@ def layout_of(p: Proposal, files: Tables) -> str:
     stated = p.description.part.column
     if runs or any(len(columns[name].counts) > 1 for name in stated if name in columns):
         named = [*filter(PART_NAME.search, columns)]
-        likely = [name for name in runs if name in named]
-        note = f"one of {listed(dict.fromkeys([*named, *runs]))}"
+        likely = [name for name in runs if name in named and not is_repeated(columns[name])]
+        long = [name for name, column in columns.items() if has_long_runs(column)]
+        note = f"one of {listed(dict.fromkeys([*named, *long]))}, or several"
+        if any(is_repeated(columns[name]) for name in runs):
+            note = f"{note}; the same number stands in several files"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
     if len(files) > 1:
@@ -56,18 +59,37 @@ def layout_of(p: Proposal, files: Tables) -> str:
     return UNKNOWN
 
 
-def may_tell_parts(column: Column) -> bool:
-    """Return whether each word of a column stands in consecutive rows, in the mean 8 or more.
+def runs_in(column: Column) -> int:
+    """Return how often successive rows of a table begin with another word, first rows included."""
+    return sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
 
-    It is False for a column with only one word in each table or with an empty cell, and for a
-    column of times, unless it is named like a part.
+
+def has_long_runs(column: Column) -> bool:
+    """Return whether the words of a column stand in 8 or more successive rows, in the mean.
+
+    It is False for a column with only one word in each table or with an empty cell.
     """
-    n_runs = sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
-    is_long = column.counts.total() >= LEAST_RUN * n_runs
-    if column.fixed or not is_long or len(column.counts) < n_runs or "" in column.counts:
+    is_long = column.counts.total() >= LEAST_RUN * runs_in(column)
+    return not column.fixed and is_long and "" not in column.counts
+
+
+def is_repeated(column: Column) -> bool:
+    """Return whether a word of a column stands in several tables."""
+    return sum(len({*words}) for words in column.words) > len(column.counts)
+
+
+def may_tell_parts(column: Column) -> bool:
+    """Return whether the words of a column have long runs, and each has one.
+
+    If it is named like a part, a word may have a run in each table. It is False for a column of
+    times, unless it is named like a part.
+    """
+    if not has_long_runs(column):
         return False
+    if PART_NAME.search(column.name):
+        return sum(len({*words}) for words in column.words) == runs_in(column)
     is_clock = CLOCK_NAME.search(column.name) is not None or bool(column.forms)
-    return not is_clock or PART_NAME.search(column.name) is not None
+    return not is_clock and len(column.counts) == runs_in(column)
 
 
 def numbered_columns(table: Table) -> list[str]:

@@ -3,6 +3,7 @@ nothing.
 """
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -31,6 +32,7 @@ QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 LOADS = ("force", "torque")
+SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|max|min|limit)")
 FORCES = (
     re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
     re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
@@ -168,22 +170,30 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     if p.description.channels:
         return
     forces = [name for name, unit in units.items() if (quantity_of(unit) or ("",))[0] in LOADS]
-    named = [[*filter(pattern.search, units)] for pattern in FORCES]
+    likely = [name for name, unit in units.items() if not unit or name in forces]
+    named = [[*filter(pattern.search, likely)] for pattern in FORCES]
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
-    others = listed(name for name in units if [name] != best)
-    gaps = ", ".join(filter(None, (_gap_in(p, name) for name in best)))
-    if gaps:
-        p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), f"{gaps}; state channels")
-    elif len(best) == 1:
+    doubts = "; ".join(filter(None, (_doubt_on(p, name) for name in best)))
+    others = listed(name for name in units if doubts or [name] != best)
+    if len(best) == 1 and not doubts:
         p.description = replace(p.description, channels={best[0]: Channel(units[best[0]])})
         p.notes |= {f"channels.{best[0]}": f"others: {others}"} if others else {}
     else:
         text = f"one or several of: {others}" if units else "no column has numbers that change"
+        text = f"{text}; {doubts}" if doubts else text
         p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), text)
 
 
-def _gap_in(p: Proposal, name: str) -> str:
-    """Return a sentence if the numbers of numbered columns, like `x*`, have unequal steps."""
+def _doubt_on(p: Proposal, name: str) -> str:
+    """Return why a column may not be the channel that its name or unit promises; "" if it may.
+
+    Its name is one of a set value, some of its cells are words, or the numbers of columns like `x*`
+    have unequal steps.
+    """
+    if SET_VALUE.search(name):
+        return f"{name} may be a set value"
+    if name in p.columns and (words := _strange_in(p.columns[name])):
+        return f"{name} has words, {counts_of(words)}: do they mean a lost sample, text.missing?"
     columns = numbered(name, chain(*(table.origin.get(name, ()) for table in p.tables[:1])))
     steps = np.diff([numbers[-1] for numbers in columns.values()])
     odd = np.abs(steps - np.median(steps)) > np.median(steps) / 2 if len(steps) else steps
@@ -193,24 +203,31 @@ def _gap_in(p: Proposal, name: str) -> str:
     return f"{name} has {len(columns)} samples, but {after} follows {before}"
 
 
+def _strange_in(column: Column) -> Counter[str]:
+    """Return the texts in more than 1 % of the cells, except for one that means a lost sample."""
+    least = STRANGE * column.counts.total()
+    odd = column.odd.items()
+    return Counter({word: n for word, n in odd if word.lower() not in LOST and n > least})
+
+
 def _units(p: Proposal) -> dict[str, str]:
     """Return the unused columns that may be channels, with their units; "" for no unit.
 
-    Such a column has at least two different numbers. At most 90 % of its cells are no numbers, and
-    no text, except one for a lost sample, is in more than 1 % of them. Times, counters of rows and
-    columns that are constant in each recording are left out.
+    Such a column has at least three different numbers. At most 90 % of its cells are no numbers, or
+    10 % if a text that is not one for a lost sample is in more than 1 % of them. Times, counters of
+    rows and columns that are constant in each recording are left out.
     """
     units = dict[str, str]()
     for column in p.unused:
         name = column.name
         odd = column.odd
         n = column.counts.total()
-        strange = [w for w, k in odd.items() if w.lower() not in LOST and k > STRANGE * n]
-        is_number = len(column.counts) - len(odd) > 1 and odd.total() <= MOST_FREQUENT * n
+        most = SPARSE if _strange_in(column) else MOST_FREQUENT
+        is_number = len(column.counts) - len(odd) > 2 and odd.total() <= most * n
         is_clock = CLOCK_NAME.search(name) and is_rising(column)
         is_other = is_clock or COUNTER_NAME.fullmatch(name) or column.fixed
-        if is_number and not strange and not is_other:
-            units[name] = column.unit or unit_in(name.rstrip(ANY))
+        if is_number and not is_other:
+            units[name] = column.unit or unit_in(re.sub(r"\.\d+$|\*$", "", name))
     return units
 
 
