@@ -27,7 +27,7 @@ from ..read.text import read_text
 from ..table import Table, UnreadableError
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
-from .labels import IN_PATHS
+from .labels import WORD
 from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import propose_form
@@ -52,7 +52,6 @@ BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_BYTES = 2_000_000  # of all files that are read, and of one
 MOST_ROWS = 50_000
-MOST_DAMAGED = 0.1  # of the lines of a single file
 Names = Sequence[str]
 
 
@@ -118,9 +117,12 @@ def choose_files(p: Proposal, root: Path) -> bool:
     endings = signals_in(names) if len(likely) == 1 else ()
     if len(likely) + len(endings) > 1 and not stated:
         counts = Counter(map(suffix_of, names))
-        text = listed(f"*{suffix} ({n} files)" for suffix, n in counts.items())
-        if endings:
-            text = f"**/*{', **/*'.join(endings)}, or **/*: each part has {len(endings)} files"
+        choices = (
+            [*endings, *likely]
+            if endings
+            else (f"{suffix} ({n} files)" for suffix, n in counts.items())
+        )
+        text = listed(f"**/*{choice}" for choice in choices)
         p.put("files", UNKNOWN, f"one of {text}")
         p.notes["channels"] = "they follow from files"
         return False
@@ -145,11 +147,9 @@ def signals_in(names: Names) -> Names:
     """
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     endings = sorted({name[-1] for name in words})
-    heads = {name[0] for name in words}
-    is_word = not any(re.search(r"\d", without_suffix(word)) for word in endings)
-    is_verdict = {without_suffix(word).lower() for word in endings} & {*IN_PATHS}
-    is_full = len(heads) * len(endings) == len(names) and len(heads) > 1 < len(endings)
-    return endings if is_full and is_word and not is_verdict else ()
+    n = len({name[0] for name in words})
+    is_word = not re.search(rf"(?i)\d|\b({WORD})\.", " ".join(endings))
+    return endings if n * len(endings) == len(names) and n > 1 and is_word else ()
 
 
 def suffix_of(name: str) -> str:
@@ -221,8 +221,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
     is stated, if it is the only file and its arrays hold curves. Of a text or jsonl file of more
     than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is
-    damaged, or if a line of a text file has a wrong number of cells; but if the only file has few
-    such lines, these are left out.
+    damaged, or if a line of a text file has a wrong number of cells; but such
+    lines of the only file are left out.
     """
     kind = p.description.format
     if kind == "npz":
@@ -236,7 +236,7 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     if kind == "text":
         table = read_text(content, name, p.description.text)
         damaged = np.searchsorted(table.lines, [error.line for error in table.damage])
-        if len(p.names) > 1 or len(damaged) > MOST_DAMAGED * len(table.lines):
+        if len(p.names) > 1:
             return table.whole()
         return replace(table.take(np.delete(np.arange(len(table.lines)), damaged)), damage=[])
     return table_of(content, name, replace(p.description, layout="files"))

@@ -47,9 +47,10 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
-PLACES = (  # of any words: the folders, and the words of a file's name, counted from the end
-    *(f"([^/]+){i * '/[^/]*'}$" for i in range(1, 6)),
-    *(f"([^-_ /]+){i * '[-_ ][^-_ /]*'}$" for i in range(6)),
+PLACES = (  # of any words: folders, and the words of a file's name, counted from the end
+    *("([^/]+)/[^/]*$", "([^/]+)/[^/]*/[^/]*$", "([^/]+)/[^/]*/[^/]*/[^/]*$"),
+    *("([^-_ /]+)$", "([^-_ /]+)[-_ ][^-_ /]*$", "([^-_ /]+)[-_ ][^-_ /]*[-_ ][^-_ /]*$"),
+    *("([^-_ /]+)(?:[-_ ][^-_ /]*){3}$", "(?:^|/)([^-_ /]+)[^/]*$"),
 )
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 KINDS = ("listing", "key", "column", "path", "line")
@@ -116,10 +117,10 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
     """
     words = [*words]
     n = len({*words})
-    if is_named(source):
-        source = with_meanings(source, words)
-        return n <= MOST_WORDS and (n > 1 or bool({*source.good, *source.bad} - {UNKNOWN}))
-    return 1 < n <= min(MOST_WORDS, len(words) / 2)
+    about = with_meanings(source, words)
+    is_known = bool({*about.good, *about.bad} - {UNKNOWN})
+    least, most = (2 - is_known, MOST_WORDS) if is_named(source) else (2, len(words) / 2)
+    return least <= n <= min(most, MOST_WORDS)
 
 
 def row_of(column: Column) -> Literal["", "same", "last", "first"]:

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
-from itertools import chain
 
 import numpy as np
 
@@ -194,13 +193,11 @@ def _doubt_on(p: Proposal, name: str) -> str:
         return f"{name} may be a set value"
     if name in p.columns and (words := _strange_in(p.columns[name])):
         return f"{name} has words, {counts_of(words)}: do they mean a lost sample, text.missing?"
-    columns = numbered(name, chain(*(table.origin.get(name, ()) for table in p.tables[:1])))
-    steps = np.diff([numbers[-1] for numbers in columns.values()])
-    odd = np.abs(steps - np.median(steps)) > np.median(steps) / 2 if len(steps) else steps
-    if not odd.any():
-        return ""
-    before, after = [*columns][int(odd.argmax()) :][:2]
-    return f"{name} has {len(columns)} samples, but {after} follows {before}"
+    origin = p.tables[0].origin.get(name, ()) if ANY in name else ()
+    columns = numbered(name, origin)
+    steps = np.diff([float(match[1]) for match in columns])
+    odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
+    return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
 
 
 def _strange_in(column: Column) -> Counter[str]:

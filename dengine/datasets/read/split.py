@@ -135,7 +135,11 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     """Yield each row as a part, with samples from numbered columns or from lists in its cells."""
-    groups = {key: [*numbered(key, table.columns)] for key in description.channels if ANY in key}
+    groups = {
+        key: [match[0] for match in numbered(key, table.columns)]
+        for key in description.channels
+        if ANY in key
+    }
     groups = {key: names for key, names in groups.items() if names}
     curves = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     used = {*chain(*groups.values())}
@@ -164,15 +168,13 @@ def _row_of(table: Table, i: int) -> Table:
         return replace(part, columns={}, damage=[error])
 
 
-def numbered(key: str, columns: Iterable[str]) -> dict[str, list[float]]:
-    """Return the columns that match a channel's pattern with a number for each `*`, in order.
+def numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
+    """Return the columns that match a channel's pattern, with a number for `*`, in their order.
 
-    They are in the order of these numbers, which the dict has: `F_0.002` stands before `F_0.1`.
+    `F_0.002` stands before `F_0.1`. The groups of a match are the numbers.
     """
-    pattern = pattern_of(key, NUMBERED)
-    matches = filter(None, map(pattern.fullmatch, columns))
-    numbers = {match[0]: [*map(float, match.groups())] for match in matches}
-    return dict(sorted(numbers.items(), key=lambda item: item[1]))
+    matches = filter(None, map(pattern_of(key, NUMBERED).fullmatch, columns))
+    return sorted(matches, key=lambda match: [*map(float, match.groups())])
 
 
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
