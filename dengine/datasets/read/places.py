@@ -145,7 +145,9 @@ class LabelReader:
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
         if not keys:
-            raise UnreadableError(f"Expected {part or name} in {source.listing}, it is not listed")
+            others = f"it has {listed(sorted(self.listing)[:2])}"
+            message = f"Expected {part or name} in {source.listing}, it is not listed; {others}"
+            raise UnreadableError(message)
         self.used.add(keys[0])
         return self.listing[keys[0]]
 
@@ -186,7 +188,12 @@ class LabelReader:
 
 
 def as_key(word: str) -> str:
-    """Return a word as a key of a listing: without leading zeros in a number, with / in a path."""
+    """Return a word as a key of a listing: without leading zeros in a number, with / in a path.
+
+    Excel writes a text as `="0012"`. The names of files are compared in small letters.
+    """
+    word = word.removeprefix("=").strip('"')
+    word = word.lower() if SUFFIX.search(word) else word
     return word.lstrip("0") or "0" if word.isdecimal() else word.replace("\\", "/")
 
 
