@@ -235,10 +235,10 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
         p.is_cut = True
     if kind == "text":
         table = read_text(content, name, p.description.text)
-        damaged = np.searchsorted(table.lines, [error.line for error in table.damage])
         if len(p.names) > 1:
             return table.whole()
-        return replace(table.take(np.delete(np.arange(len(table.lines)), damaged)), damage=[])
+        is_damaged = np.isin(table.lines, [error.line for error in table.damage])
+        return replace(table.take(~is_damaged), damage=[])
     return table_of(content, name, replace(p.description, layout="files"))
 
 

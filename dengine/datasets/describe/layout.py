@@ -45,10 +45,14 @@ def layout_of(p: Proposal, files: Tables) -> str:
     stated = p.description.part.column
     if runs or any(len(columns[name].counts) > 1 for name in stated if name in columns):
         named = [*filter(PART_NAME.search, columns)]
-        likely = [name for name in runs if name in named and not is_repeated(columns[name])]
+        likely = [
+            name
+            for name in runs
+            if name in named and words_in(columns[name]) == len(columns[name].counts)
+        ]
         long = [name for name, column in columns.items() if has_long_runs(column)]
         note = f"one of {listed(dict.fromkeys([*named, *long]))}, or several"
-        if any(is_repeated(columns[name]) for name in runs):
+        if len(likely) < len({*runs} & {*named}):
             note = f"{note}; the same number stands in several files"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
@@ -73,9 +77,9 @@ def has_long_runs(column: Column) -> bool:
     return not column.fixed and is_long and "" not in column.counts
 
 
-def is_repeated(column: Column) -> bool:
-    """Return whether a word of a column stands in several tables."""
-    return sum(len({*words}) for words in column.words) > len(column.counts)
+def words_in(column: Column) -> int:
+    """Return how many different words the tables have, added up."""
+    return sum(len({*words}) for words in column.words)
 
 
 def may_tell_parts(column: Column) -> bool:
@@ -87,7 +91,7 @@ def may_tell_parts(column: Column) -> bool:
     if not has_long_runs(column):
         return False
     if PART_NAME.search(column.name):
-        return sum(len({*words}) for words in column.words) == runs_in(column)
+        return words_in(column) == runs_in(column)
     is_clock = CLOCK_NAME.search(column.name) is not None or bool(column.forms)
     return not is_clock and len(column.counts) == runs_in(column)
 
