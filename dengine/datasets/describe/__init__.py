@@ -149,7 +149,7 @@ def signals_in(names: Names) -> Names:
     endings = sorted({name[-1] for name in words})
     n = len({name[0] for name in words})
     is_word = not re.search(rf"(?i)\d|\b({WORD})\.", " ".join(endings))
-    return endings if n * len(endings) == len(names) and n > 1 and is_word else ()
+    return endings if n * len(endings) == len(names) and n > 1 < len(endings) and is_word else ()
 
 
 def suffix_of(name: str) -> str:
