@@ -14,6 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...errors import DataError, listed
 from ..checks import check_text
 from ..dataset import Fault
@@ -26,6 +28,7 @@ from ..read.text import read_text
 from ..table import Table, UnreadableError
 from .bags import propose_bag
 from .columns import Proposal, Stated, Tables
+from .labels import WORD
 from .layout import has_lists, layout_of, parts_of
 from .roles import propose_roles
 from .text_form import MOST_BYTES, decode, propose_form
@@ -112,9 +115,15 @@ def choose_files(p: Proposal, root: Path) -> bool:
     if not names:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     likely = likely_suffixes(names)
-    if len(likely) > 1 and not stated:
+    endings = signals_in(names) if len(likely) == 1 else ()
+    if len(likely) + len(endings) > 1 and not stated:
         counts = Counter(map(suffix_of, names))
-        text = listed(f"*{suffix} ({n} files)" for suffix, n in counts.items())
+        choices = (
+            [*endings, *likely]
+            if endings
+            else (f"{suffix} ({n} files)" for suffix, n in counts.items())
+        )
+        text = listed(f"**/*{choice}" for choice in choices)
         p.put("files", UNKNOWN, f"one of {text}")
         p.notes["channels"] = "they follow from files"
         return False
@@ -130,6 +139,18 @@ def likely_suffixes(names: Names) -> Names:
     """Return the suffixes that several files have, and `.mcap` if one file has it; or else all."""
     counts = Counter(map(suffix_of, names))
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
+
+
+def signals_in(names: Names) -> Names:
+    """Return the endings of names like `1_Kraft.csv`, if each part has a file with each of them.
+
+    An ending is the last word, which has no number and is no verdict. Empty for any other names.
+    """
+    words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
+    endings = sorted({name[-1] for name in words})
+    n = len({name[0] for name in words})
+    is_word = not re.search(rf"(?i)\d|\b({WORD})\.", " ".join(endings))
+    return endings if n * len(endings) == len(names) and n > 1 < len(endings) and is_word else ()
 
 
 def suffix_of(name: str) -> str:
@@ -202,7 +223,8 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
     An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
     is stated, if it is the only file and its arrays hold curves. Of a text or jsonl file of more
     than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is
-    damaged, or if a line of a text file has a wrong number of cells.
+    damaged, or if a line of a text file has a wrong number of cells; but such
+    lines of the only file are left out.
     """
     kind = p.description.format
     if kind == "npz":
@@ -215,7 +237,11 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
         content = decode(content, encoding)[1].rpartition("\n")[0].encode(encoding) or content
         p.is_cut = True
     if kind == "text":
-        return read_text(content, name, p.description.text).whole()
+        table = read_text(content, name, p.description.text)
+        if len(p.names) > 1:
+            return table.whole()
+        is_damaged = np.isin(table.lines, [error.line for error in table.damage])
+        return replace(table.take(~is_damaged), damage=[])
     return table_of(content, name, replace(p.description, layout="files"))
 
 
@@ -232,7 +258,8 @@ def propose_tables(p: Proposal, files: Tables) -> None:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")
     p.is_cut |= any(len(table.lines) > MOST_ROWS for table in files)
     files = [table.take(slice(0, MOST_ROWS)) for table in files]
-    p.put("layout", layout_of(p, files))
+    if "layout" not in p.stated or p.description.layout == "long":
+        p.put("layout", layout_of(p, files))
     if UNKNOWN in (p.description.layout, *p.description.part.column):
         p.notes["channels"] = "they follow from layout and part.column"
         return

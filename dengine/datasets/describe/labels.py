@@ -1,8 +1,8 @@
 """Every place that may hold the labels, counted, and whether those places agree.
 
 A word means good or bad only if it is one of a short list of plain verdicts, and stands by itself:
-at the end or beginning of a file's name, as a folder, or in a column or line whose name says that
-it holds a verdict.
+at the end or beginning of a file's name, as a folder, or in a column or line whose whole name says
+that it holds a verdict. Any other place with few words is a candidate, if nothing is certain.
 """
 
 import re
@@ -29,10 +29,12 @@ BAD = (
 UNCHECKED = ("", "-", "--", "pending", "open", "offen", "unchecked", "not checked", "n/a")
 YES = ("1", "true", "yes", "ja")
 NO = ("0", "false", "no", "nein")
-NAME = re.compile(
-    r"(?i)result|verdict|ergebnis|bewertung|outcome|判定|(^|[^a-z])(label|success|quality|n?i?ok|nio"
-    r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)([^a-z]|$)"
+VERDICT = (
+    r"(r[eé]sult(s|at)?|verdict|ergebnis|bewertung|outcome|判定|label|success|quality|n?i?ok|nio"
+    r"|pass(ed)?|class|target|y|status|urteil|accept(ed)?|judg?e?ment)"
 )
+WHOLE = "(total|overall|final|part|teil|gesamt)"
+NAME = re.compile(rf"(?i)(({WHOLE}|test|{VERDICT})[-_ ./]?)?{VERDICT}([-_ .]?{WHOLE})?")
 GOOD_NAME = re.compile(r"(?i)(.*[./])?(label|y|success|ok|io|pass(ed)?|accept(ed)?|good)")
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
@@ -45,7 +47,11 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|[-_ ./(=+\[])({WORD})[-_ \d()\]]*$",
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
-FOLDER = "([^/]+)/[^/]*$"  # of a recording
+PLACES = (  # of any words: folders, and the words of a file's name, counted from the end
+    *("([^/]+)/[^/]*$", "([^/]+)/[^/]*/[^/]*$", "([^/]+)/[^/]*/[^/]*/[^/]*$"),
+    *("([^-_ /]+)$", "([^-_ /]+)[-_ ][^-_ /]*$", "([^-_ /]+)[-_ ][^-_ /]*[-_ ][^-_ /]*$"),
+    *("([^-_ /]+)(?:[-_ ][^-_ /]*){3}$", "(?:^|/)([^-_ /]+)[^/]*$"),
+)
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 KINDS = ("listing", "key", "column", "path", "line")
 Names = Iterable[str]
@@ -98,35 +104,53 @@ def in_paths(paths: Names) -> list[str]:
     return patterns
 
 
-def is_verdict(name: str, words: Names) -> bool:
-    """Return whether a column has the name of a verdict, and at most 12 words.
+def is_named(source: LabelSource) -> bool:
+    """Return whether the name of a place is that of a verdict; a path must have known words."""
+    name = source.column or source.line
+    return "([^" not in source.path and (not name or NAME.fullmatch(name) is not None)
 
-    If it has only one word, that must be a verdict whose meaning is known.
+
+def may_be_labels(source: LabelSource, words: Names) -> bool:
+    """Return whether a place has few words: 2 to 12, each for two recordings in the mean.
+
+    In a place that is named like a verdict 12 words are few, and so is one of known meaning.
     """
-    words = {*words}
-    is_label = len(words) > 1 or is_plain(with_meanings(LabelSource(column=name), words))
-    return NAME.search(name) is not None and is_label and len(words) <= MOST_WORDS
+    words = [*words]
+    n = len({*words})
+    about = with_meanings(source, words)
+    is_known = bool({*about.good, *about.bad} - {UNKNOWN})
+    least, most = (2 - is_known, MOST_WORDS) if is_named(source) else (2, len(words) / 2)
+    return least <= n <= min(most, MOST_WORDS)
 
 
-def row_of(column: Column) -> Literal["", "same", "last"]:
-    """Return which row of a recording has the label in this column; "" if it holds no labels.
+def row_of(column: Column) -> Literal["", "same", "last", "first"]:
+    """Return which row of a recording has the label, if this column holds it; "" for none.
 
-    "same": each recording has one word in all rows. "last": the last row has the label, and all
-    rows above have the same word or a word for unchecked. The column must pass `is_verdict`.
+    "same": each recording has one word in all rows. "last" and "first": this row has the label, and
+    all others have the same word or a word for unchecked.
     """
-    last = [str(words[-1]) for words in column.words if len(words)]
-    above = {word.lower() for words in column.words for word in {*words} - {*words[-1:]}}
-    row: Literal["same", "last"] = "same" if column.fixed else "last"
-    return row if above <= {*UNCHECKED} and is_verdict(column.name, last) else ""
+    if column.fixed:
+        return "same"
+    rows: Sequence[tuple[Literal["last", "first"], int]] = (("last", -1), ("first", 0))
+    for row, i in rows:
+        above = {word.lower() for words in column.words for word in {*words} - {*words[i:][:1]}}
+        if above <= {*UNCHECKED}:
+            return row
+    return ""
 
 
-def lines_of(p: Proposal, pattern: re.Pattern[str]) -> list[str]:
-    """Return how lines above the header begin, up to the first `; : = , tab`, if a pattern fits.
+def is_verdict(column: Column) -> bool:
+    """Return whether a column has the name of a verdict, and one row of a recording its label."""
+    return NAME.fullmatch(column.name) is not None and row_of(column) != ""
+
+
+def lines_of(p: Proposal) -> list[str]:
+    """Return how lines above the header begin, up to the first `; : = , tab` or two blanks.
 
     Only the first table is looked at.
     """
-    lines = [re.split(r"[;:=\t,]", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
-    return [*filter(pattern.search, (line.strip(" \"'") for line in lines))]
+    lines = [re.split(r"[;:=\t,]|  ", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
+    return [*filter(None, dict.fromkeys(line.strip(" \"'") for line in lines))]
 
 
 def part_words(source: PartSource, tables: Tables) -> Words:
@@ -156,14 +180,16 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
         with suppress(DataError, ValueError):
             table = listing_table(p.base / name, p.description.text)
             for key, column in permutations(table.columns, 2):
-                if is_verdict(column, table.words(column)):
-                    yield replace(label, listing=name, key=key, column=column)
+                if len({*table.words(key)}) > len(table.lines) / 2:
+                    source = replace(label, listing=name, key=key, column=column)
+                    if may_be_labels(source, table.words(column)):
+                        yield source
     if p.description.layout in ("files", "columns"):
-        yield from (replace(label, path=path) for path in in_paths(paths))
+        yield from (replace(label, path=path) for path in (*in_paths(paths), *PLACES))
     for unused in p.unused:
         if row := row_of(unused):
             yield replace(label, column=unused.name, at=row)
-    yield from (replace(label, line=line) for line in lines_of(p, NAME))
+    yield from (replace(label, line=line) for line in lines_of(p))
 
 
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
@@ -175,29 +201,37 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
     """
     words = dict[str, str]()
     is_stated = source == p.description.label
+    why = ""
     with suppress(*([] if is_stated else [DataError])):
         reader = read_labels(p.base, source, p.description.text)
         for table in tables:
-            with suppress(UnreadableError):
+            try:
                 words[table.source] = reader.words(table, parts.get(table.source, ""))[0]
+            except UnreadableError as error:
+                why = why or str(error).rstrip(".")
     if is_stated and not words:
-        raise DataError("Expected words where [label] says they stand, found none.")
+        raise DataError(f"Expected words where [label] says they stand, found none. {why}.")
     return words
 
 
 def title_of(source: LabelSource, words: Words) -> str:
     """Return the settings that state a source, like `label.column=result`, with the word counts."""
-    stated = [f"label.{kind}={getattr(source, kind)}" for kind in KINDS if getattr(source, kind)]
+    values = {kind: getattr(source, kind) for kind in (*KINDS, "at")}
+    stated = [
+        f"label.{kind}={value}" for kind, value in values.items() if value not in ("", "same")
+    ]
     return f"{' '.join(stated)} ({counts_of(words.values())})"
 
 
 def count_sources(p: Proposal) -> dict[LabelSource, Words]:
     """Return the possible sources of labels, each with the word of every recording that has one.
 
-    If the user stated a source, only that one is returned. Otherwise it is each source that has
-    words for more than half of the recordings. For listings and paths all recordings count, since
-    their names are enough; for columns and lines only those whose tables were read. The meanings of
-    the words are set as in `with_meanings`. Raises DataError if the stated source has no words.
+    If the user stated a source, only that one is returned. Otherwise it is each source that
+    `may_be_labels` and has words for more than half of the recordings; the same words in a further
+    place count only if it is named like a verdict. For listings and paths all recordings count,
+    since their names are enough; for columns and lines only those whose tables were read. The
+    meanings of the words are set as in `with_meanings`. Raises DataError if the stated source has
+    no words.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
@@ -207,7 +241,9 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
     for source in sources_of(p, [table.path for table in tables]):
         words = words_of(p, source, tables, parts)
         n = len(tables if source.listing or source.path else p.tables)
-        if len(words) > n / 2 or source == p.description.label:
+        is_new = words not in counted.values() or is_named(source)
+        is_likely = len(words) > n / 2 and is_new and may_be_labels(source, words.values())
+        if is_likely or source == p.description.label:
             counted[with_meanings(source, words.values())] = words
     return counted
 
@@ -225,25 +261,31 @@ def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
 def propose_label(p: Proposal) -> None:
     """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
-    A source is certain if all its words have a known meaning. If a certain source contradicts the
-    first certain one, `label.column` is `?`, with a note that lists all sources. So too if no
-    source is certain; but if there is only one source, it becomes the label, with `?` for its
-    words. Otherwise the first certain source is the label. The other certain ones that have a word
-    for each of its recordings become checks, unless checks are stated. Raises DataError if a stated
-    source has no words.
+    A source is certain if it is named like a verdict, all its words have a known meaning, no other
+    source contradicts it, and it has words for good and bad or there is no other source. If no
+    source is certain, `label.column` is `?`, with a note that lists all; but if only one is named
+    like a verdict, it becomes the label, with `?` for its words. Other sources that would be
+    certain and have a word for each of its recordings become checks, unless checks are stated.
+    Raises DataError if a stated source has no words.
     """
     counted = count_sources(p)
-    certain = [source for source, words in counted.items() if sides_of(source, words)]
-    doubt = _disagreement([sides_of(source, counted[source]) for source in certain])
-    if doubt or not (certain or len(counted) == 1):
+    sides = {source: sides_of(source, words) for source, words in counted.items()}
+    is_stated = any(getattr(p.description.label, kind) for kind in KINDS)
+    named = [source for source in counted if is_stated or is_named(source)]
+    certain = [source for source in named if sides[source]]
+    doubt = _disagreement([sides[source] for source in [*certain[:1], *counted]])
+    several = len({*sides[certain[0]].values()} - {0}) > 1 if certain else len(named) == 1
+    if doubt or not (several or (certain and len(counted) == len(certain))):
         titles = map(title_of, counted, counted.values())
-        p.put("label.column", UNKNOWN, "; ".join([*titles, *_few_words(p), doubt or NO_LABEL]))
+        p.put("label.column", UNKNOWN, "; ".join([*titles, doubt or NO_LABEL]))
         return
-    best, *others = certain or counted
-    words = counted.pop(best)
+    best, *others = certain or named
+    words = counted[best]
     checks = tuple(source for source in others if counted[source].keys() >= words.keys())
     p.description = replace(p.description, label=best, check=p.description.check or checks)
-    _note_words(p, best, words, [*map(title_of, counted, counted.values())])
+    _note_words(
+        p, best, words, [title_of(other, counted[other]) for other in named if other != best]
+    )
 
 
 def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
@@ -271,18 +313,3 @@ def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
         if n := sum(side * other.get(name, 0) < 0 for name, side in sides[0].items()):
             return f"two of these disagree on {n:,} of {len(sides[0]):,} recordings"
     return ""
-
-
-def _few_words(p: Proposal) -> list[str]:
-    """Return a text on each possible source of labels that may have an unusual name.
-
-    These are the unused columns with one word in each recording, and the folders of the files, if
-    there are 2 to 12 different words.
-    """
-    few = {column.name: column.fixed for column in p.unused}
-    few[f"label.path={FOLDER}"] = [name.split("/")[-2] for name in p.names if "/" in name]
-    return [
-        f"{name} has few words ({counts_of(words)})"
-        for name, words in few.items()
-        if 1 < len({*words}) <= MOST_WORDS
-    ]

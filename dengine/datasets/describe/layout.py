@@ -16,9 +16,10 @@ from .clock import NAME as CLOCK_NAME
 from .columns import LEAST_RUN, Column, Proposal, Tables, columns_of
 
 PART_NAME = re.compile(
-    r"(?i)part|serial|episode|teil|werkst|barcode|dmc|trial|piece|sample_?id"
-    r"|^(id|run|sn|cycle|shot|nr|no)$|_(id|run|cycle|sn|nr)$"
+    r"(?i)part|serial|episode|teil|werkst(?!.*tr(ä|ae?)ger)|barcode|dmc|trial|piece|sample_?id"
+    r"|^(id|run|sn|cycle|shot|nr|no)$|(?<!order)(?<!batch)(?<!shift)(?<!lot)_(id|run|cycle|sn|nr)$"
 )
+NUMBER = re.compile(r"\d+(\.\d+)?(?=[\])]?( ?[\[(][^\d\[(]+[\])])?$)")  # as in `F_0.5 [N]`
 LEAST_NUMBERED = 20  # columns with numbers behind one name that are the samples of a part
 MOST_PARTS = 240
 
@@ -44,8 +45,15 @@ def layout_of(p: Proposal, files: Tables) -> str:
     stated = p.description.part.column
     if runs or any(len(columns[name].counts) > 1 for name in stated if name in columns):
         named = [*filter(PART_NAME.search, columns)]
-        likely = [name for name in runs if name in named]
-        note = f"one of {listed(dict.fromkeys([*named, *runs]))}"
+        likely = [
+            name
+            for name in runs
+            if name in named and words_in(columns[name]) == len(columns[name].counts)
+        ]
+        long = [name for name, column in columns.items() if has_long_runs(column)]
+        note = f"one of {listed(dict.fromkeys([*named, *long]))}, or several"
+        if len(likely) < len({*runs} & {*named}):
+            note = f"{note}; the same number stands in several files"
         p.put("part.column", *(likely if len(likely) == 1 else (UNKNOWN, note)))
         return "long"
     if len(files) > 1:
@@ -55,23 +63,45 @@ def layout_of(p: Proposal, files: Tables) -> str:
     return UNKNOWN
 
 
-def may_tell_parts(column: Column) -> bool:
-    """Return whether each word of a column stands in consecutive rows, in the mean 8 or more.
+def runs_in(column: Column) -> int:
+    """Return how often successive rows of a table begin with another word, first rows included."""
+    return sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
 
-    It is False for a column with only one word in each table or with an empty cell, and for a
-    column of times, unless it is named like a part.
+
+def has_long_runs(column: Column) -> bool:
+    """Return whether the words of a column stand in 8 or more successive rows, in the mean.
+
+    It is False for a column with only one word in each table or with an empty cell.
     """
-    n_runs = sum(int((words[1:] != words[:-1]).sum()) + 1 for words in column.words)
-    is_long = column.counts.total() >= LEAST_RUN * n_runs
-    if column.fixed or not is_long or len(column.counts) < n_runs or "" in column.counts:
+    is_long = column.counts.total() >= LEAST_RUN * runs_in(column)
+    return not column.fixed and is_long and "" not in column.counts
+
+
+def words_in(column: Column) -> int:
+    """Return how many different words the tables have, added up."""
+    return sum(len({*words}) for words in column.words)
+
+
+def may_tell_parts(column: Column) -> bool:
+    """Return whether the words of a column have long runs, and each has one.
+
+    If it is named like a part, a word may have a run in each table. It is False for a column of
+    times, unless it is named like a part.
+    """
+    if not has_long_runs(column):
         return False
+    if PART_NAME.search(column.name):
+        return words_in(column) == runs_in(column)
     is_clock = CLOCK_NAME.search(column.name) is not None or bool(column.forms)
-    return not is_clock or PART_NAME.search(column.name) is not None
+    return not is_clock and len(column.counts) == runs_in(column)
 
 
 def numbered_columns(table: Table) -> list[str]:
-    """Return a pattern like `x*` for each name, as in `x0`, `x1`, that 20 columns or more share."""
-    counts = Counter(re.sub(r"\d+$", ANY, name) for name in table.columns)
+    """Return a pattern like `x*` for each name, as in `x0`, `x1`, that 20 columns or more share.
+
+    The number may be a fraction, and a bracket or a unit in brackets may stand behind it.
+    """
+    counts = Counter(NUMBER.sub(ANY, name) for name in table.columns)
     return [pattern for pattern, n in counts.items() if n >= LEAST_NUMBERED]
 
 

@@ -3,6 +3,7 @@ nothing.
 """
 
 import re
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -13,12 +14,13 @@ from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
 from ..read.recordings import kept_rows
+from ..read.split import numbered
 from ..table import Table
 from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
 from .clock import is_clock, propose_clock, propose_rate
 from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
-from .labels import lines_of, part_words, propose_label, row_of, with_meanings
+from .labels import is_verdict, lines_of, part_words, propose_label, with_meanings
 from .layout import PART_NAME
 
 MOST_FREQUENT = 0.9  # of the rows, if the others are of another signal
@@ -29,6 +31,7 @@ QUALIFIER_NAME = re.compile(r"(?i)status|valid|quality|flag|error|state")
 COUNTER_NAME = re.compile(r"(?i)(index|row|sample|n|i|punkt|point|count|nr|no|line)s?")
 LOST = ("nan", "null", "none", "n/a", "na", "-", "--", "---", "#n/a", "")
 LOADS = ("force", "torque")
+SET_VALUE = re.compile(r"(?i)(^|[^a-z])(set|soll|max|min|limit)")
 FORCES = (
     re.compile(r"(?i)(^|[^a-z])f_?z(?![a-z])|(force|kraft|wrench)[^a-z]*z|force_2$"),
     re.compile(r"(?i)force|kraft|fuerza|forza|load|torque|drehmoment|thrust|effort|last\b|力|荷重"),
@@ -117,21 +120,24 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 words, and each recording several rows. A column that is named like a
-    status (`Status`, `valid`) may have numbers, and also just one word. Any other must have texts
-    that change within a recording, and no name like a clock. A column of labels with a known word
-    is none.
+    It must have at most 12 words, and a cell for each of several rows of a recording. A column that
+    is named like a status (`Status`, `valid`) may have numbers, and also just one word. Any other
+    must have texts that change within a recording, and no name like a clock. A column of labels
+    with a known word is none.
     """
     name = column.name
     words = column.counts
     is_named = QUALIFIER_NAME.search(name) is not None
     is_text = any(column.odd) and not CLOCK_NAME.search(name)
     varies = not column.fixed or (is_named and len(words) == 1)
-    has_rows = all(len(cells) > 1 for cells in column.words)
+    has_rows = all(
+        len(cells) == max(map(len, table.columns.values())) > 1
+        for cells, table in zip(column.words, column.tables, strict=True)
+    )
     if not (is_named or is_text) or not varies or not has_rows or len(words) > MOST_WORDS:
         return False
     source = with_meanings(LabelSource(column=name), words)
-    return not row_of(column) or not {*source.good, *source.bad} - {UNKNOWN}
+    return not is_verdict(column) or not {*source.good, *source.bad} - {UNKNOWN}
 
 
 def propose_part(p: Proposal) -> None:
@@ -141,7 +147,7 @@ def propose_part(p: Proposal) -> None:
     recordings. If several qualify, only a note lists them. A stated source stays.
     """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
-    sources += [PartSource(line=line) for line in lines_of(p, PART_LINE)]
+    sources += [PartSource(line=line) for line in filter(PART_LINE.search, lines_of(p))]
     least = len(p.tables) / 2
     sources = [s for s in sources if len({*part_words(s, p.tables).values()}) > least]
     if len(sources) > 1:
@@ -163,34 +169,61 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
     if p.description.channels:
         return
     forces = [name for name, unit in units.items() if (quantity_of(unit) or ("",))[0] in LOADS]
-    named = [[*filter(pattern.search, units)] for pattern in FORCES]
+    likely = [name for name, unit in units.items() if not unit or name in forces]
+    named = [[*filter(pattern.search, likely)] for pattern in FORCES]
     best = next(filter(None, (*named[:2], forces, named[2], [*units])), [])
-    others = listed(name for name in units if [name] != best)
-    if len(best) == 1:
+    doubts = "; ".join(filter(None, (_doubt_on(p, name) for name in best)))
+    others = listed(name for name in units if doubts or [name] != best)
+    if len(best) == 1 and not doubts:
         p.description = replace(p.description, channels={best[0]: Channel(units[best[0]])})
         p.notes |= {f"channels.{best[0]}": f"others: {others}"} if others else {}
     else:
         text = f"one or several of: {others}" if units else "no column has numbers that change"
+        text = f"{text}; {doubts}" if doubts else text
         p.notes |= dict.fromkeys(("channels", f"channels.{UNKNOWN}"), text)
+
+
+def _doubt_on(p: Proposal, name: str) -> str:
+    """Return why a column may not be the channel that its name or unit promises; "" if it may.
+
+    Its name is one of a set value, some of its cells are words, or the numbers of columns like `x*`
+    have unequal steps.
+    """
+    if SET_VALUE.search(name):
+        return f"{name} may be a set value"
+    if name in p.columns and (words := _strange_in(p.columns[name])):
+        return f"{name} has words, {counts_of(words)}: do they mean a lost sample, text.missing?"
+    origin = p.tables[0].origin.get(name, ()) if ANY in name else ()
+    columns = numbered(name, origin)
+    steps = np.diff([float(match[1]) for match in columns])
+    odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
+    return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""
+
+
+def _strange_in(column: Column) -> Counter[str]:
+    """Return the texts in more than 1 % of the cells, except for one that means a lost sample."""
+    least = STRANGE * column.counts.total()
+    odd = column.odd.items()
+    return Counter({word: n for word, n in odd if word.lower() not in LOST and n > least})
 
 
 def _units(p: Proposal) -> dict[str, str]:
     """Return the unused columns that may be channels, with their units; "" for no unit.
 
-    Such a column has at least two different numbers. At most 90 % of its cells are no numbers, and
-    no text, except one for a lost sample, is in more than 1 % of them. Times, counters of rows and
-    columns that are constant in each recording are left out.
+    Such a column has at least three different numbers. At most 90 % of its cells are no numbers, or
+    10 % if a text that is not one for a lost sample is in more than 1 % of them. Times, counters of
+    rows and columns that are constant in each recording are left out.
     """
     units = dict[str, str]()
     for column in p.unused:
         name = column.name
         odd = column.odd
         n = column.counts.total()
-        strange = [w for w, k in odd.items() if w.lower() not in LOST and k > STRANGE * n]
-        is_number = len(column.counts) - len(odd) > 1 and odd.total() <= MOST_FREQUENT * n
+        most = SPARSE if _strange_in(column) else MOST_FREQUENT
+        is_number = len(column.counts) - len(odd) > 2 and odd.total() <= most * n
         is_other = is_clock(column) or COUNTER_NAME.fullmatch(name) or column.fixed
-        if is_number and not strange and not is_other:
-            units[name] = column.unit or unit_in(name.rstrip(ANY))
+        if is_number and not is_other:
+            units[name] = column.unit or unit_in(re.sub(r"\.\d+$|\*$", "", name))
     return units
 
 

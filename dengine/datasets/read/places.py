@@ -47,13 +47,13 @@ def path_word(path: str, pattern: str) -> str:
 def line_word(lines: Sequence[str], beginning: str) -> str:
     """Return the cell that follows a text with which a line above the header begins.
 
-    The first such line is used; comment marks before the text are skipped. Raises UnreadableError
-    if no line begins with it.
+    The first such line is used, but one with no more letters in its first cell comes before it.
+    Comment marks before the text are skipped. Raises UnreadableError if no line begins with it.
     """
-    for line in lines:
-        text = line.lstrip(f"#%*{MARKS}")
-        if text.startswith(beginning):
-            return re.split(r"[;\t,]", text[len(beginning) :].strip(MARKS))[0].strip(MARKS)
+    texts = [line.lstrip(f"#%*{MARKS}") for line in lines]
+    texts = [text[len(beginning) :] for text in texts if text.startswith(beginning)]
+    for text in sorted(texts, key=lambda text: re.match(r"[\"' ]*([;:=\t,]|  |$)", text) is None):
+        return re.split(r"[;\t,]", text.strip(MARKS))[0].strip(MARKS)
     raise UnreadableError(f"Expected a line above the header that begins with {beginning}")
 
 
@@ -145,7 +145,9 @@ class LabelReader:
         names = filter(None, (part, path, name, without_suffix(path), without_suffix(name)))
         keys = [key for key in map(as_key, names) if key in self.listing]
         if not keys:
-            raise UnreadableError(f"Expected {part or name} in {source.listing}, it is not listed")
+            others = f"it has {listed(sorted(self.listing)[:2])}"
+            message = f"Expected {part or name} in {source.listing}, it is not listed; {others}"
+            raise UnreadableError(message)
         self.used.add(keys[0])
         return self.listing[keys[0]]
 
@@ -192,7 +194,12 @@ class LabelReader:
 
 
 def as_key(word: str) -> str:
-    """Return a word as a key of a listing: without leading zeros in a number, with / in a path."""
+    """Return a word as a key of a listing: without leading zeros in a number, with / in a path.
+
+    Excel writes a text as `="0012"`. The names of files are compared in small letters.
+    """
+    word = word.removeprefix("=").strip('"')
+    word = word.lower() if SUFFIX.search(word) else word
     return word.lstrip("0") or "0" if word.isdecimal() else word.replace("\\", "/")
 
 

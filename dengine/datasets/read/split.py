@@ -1,7 +1,7 @@
 """Split what a file holds into one table for each part, by its layout."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -13,10 +13,9 @@ from ..table import Cells, Table, UnreadableError, as_word
 from ..triggers import as_trigger
 from . import frames
 from .clock import is_dated
-from .files import natural_key
 from .text import NUMBER, WORD, Kind, read_text
 
-DIGITS = r"\d[\d.]*"  # for which `*` stands in a wide table: `F*` is not `Fmax`
+NUMBERED = r"(\d+(?:\.\d+)?)"  # for which `*` stands in a wide table: `F*` is not `Fmax`
 OBJECTS = ("json", "jsonl", "ts")
 
 
@@ -136,7 +135,11 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     """Yield each row as a part, with samples from numbered columns or from lists in its cells."""
-    groups = {key: _numbered(key, table) for key in description.channels if ANY in key}
+    groups = {
+        key: [match[0] for match in numbered(key, table.columns)]
+        for key in description.channels
+        if ANY in key
+    }
     groups = {key: names for key, names in groups.items() if names}
     curves = {key: np.stack([*map(table.column, names)], axis=1) for key, names in groups.items()}
     used = {*chain(*groups.values())}
@@ -165,9 +168,13 @@ def _row_of(table: Table, i: int) -> Table:
         return replace(part, columns={}, damage=[error])
 
 
-def _numbered(key: str, table: Table) -> list[str]:
-    """Return the columns that match a channel's pattern with a number for `*`, by that number."""
-    return sorted(filter(pattern_of(key, DIGITS).fullmatch, table.columns), key=natural_key)
+def numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
+    """Return the columns that match a channel's pattern, with a number for `*`, in their order.
+
+    `F_0.002` stands before `F_0.1`. The groups of a match are the numbers.
+    """
+    matches = filter(None, map(pattern_of(key, NUMBERED).fullmatch, columns))
+    return sorted(matches, key=lambda match: [*map(float, match.groups())])
 
 
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
