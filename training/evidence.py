@@ -32,6 +32,7 @@ import torch
 from common import options
 from evidence_page import CONDITION, LABELS_PER_POINT, METHODS, POLICIES, VARIANTS, write_results
 from evidence_sets import GENERATORS, SETS, load_set
+from published import PUBLISHED
 
 import dengine
 from dengine import Dataset, Replay
@@ -130,7 +131,10 @@ class Condition(NamedTuple):
 
     def contender(self) -> Contender:
         """Return who plays the replay."""
-        return Contender.load(self.method).with_policy(
+        contender = Contender.load("knn" if self.method in PUBLISHED else self.method)
+        if self.method in PUBLISHED:  # in the loop of any baseline
+            contender = replace(contender, name=self.method, baseline=PUBLISHED[self.method])
+        return contender.with_policy(
             interval=self.interval, alpha=self.alpha, lower_bound=self.lower_bound
         )
 

@@ -28,6 +28,7 @@ from evidence_sets import SETS
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from paper import INTERVALS, findings, paper_table
+from published import METHODS as PUBLISHED_METHODS
 from scipy.stats import t as student_t
 
 from dengine.experiments.baselines import BASELINES
@@ -321,7 +322,8 @@ def page_lines(replays: pd.DataFrame, differences: pd.DataFrame) -> list[str]:
 
 def introduction_lines() -> list[str]:
     """Return the paragraphs that say what a replay is and how to read an entry."""
-    titles = [(method, BASELINES[method].title) for method in METHODS if method in BASELINES]
+    kinds = BASELINES | PUBLISHED_METHODS
+    titles = [(method, kinds[method].title) for method in METHODS if method in kinds]
     baselines = ", ".join(f"`{method}` ({title})" for method, title in titles)
     return [
         "`python training/evidence.py` played the replays and wrote this page from them. "

@@ -29,7 +29,7 @@ from ..errors import DataError, SettingError, expect
 from ..files import FilePath, read_archive, read_errors, write_output
 from ..records import RetrainReport
 from ..reducers import reducer_class
-from .baselines import require_baseline
+from .baselines import baseline_class
 from .replay import Contender, Replay, replay
 from .tables import frame_of
 
@@ -305,7 +305,7 @@ def iterate_replays(
     missing = [i for i in range(len(tasks)) if i not in finished]
     missing.sort(key=lambda i: tasks[i].seed)
     for name in sorted({tasks[i].contender.baseline or "" for i in missing} - {""}):
-        require_baseline(name)
+        baseline_class(name)
     parallel = Parallel(n_jobs=n_jobs, return_as="generator_unordered")
     callback = on_cycle if n_jobs == 1 else None
     for i, played in parallel(delayed(_play)(data, i, tasks[i], callback) for i in missing):

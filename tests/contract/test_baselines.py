@@ -14,12 +14,11 @@ from dengine.errors import SettingError
 from dengine.experiments.baselines import (
     BASELINES,
     Baseline,
-    guaranteed_threshold,
     make_baseline,
-    risk_bound,
 )
 from dengine.model import Model
 from dengine.records import Reason
+from training.published import PUBLISHED, guaranteed_threshold, risk_bound
 
 LOOSE = Policy(alpha=0.5, lower_bound=0.8)
 QUICK: dict[str, dict[str, Any]] = {
@@ -28,16 +27,16 @@ QUICK: dict[str, dict[str, Any]] = {
 }
 LEARN_AT_ONCE = ("knn", "wskde")  # those that take labels in between two trainings
 
-every_baseline = pytest.mark.parametrize("name", BASELINES)
+every_baseline = pytest.mark.parametrize("name", [*BASELINES, *PUBLISHED])
 learning_baseline = pytest.mark.parametrize(
-    "name", [name for name in BASELINES if name not in ("always", "never")]
+    "name", [name for name in [*BASELINES, *PUBLISHED] if name not in ("always", "never")]
 )
 
 
 def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Baseline:
-    if BASELINES[name].library:
-        pytest.importorskip(BASELINES[name].library)
-    return make_baseline(name, policy, seed, **QUICK.get(name, {}) | params)
+    if name == "minirocket":
+        pytest.importorskip("aeon")
+    return make_baseline(PUBLISHED.get(name, name), policy, seed, **QUICK.get(name, {}) | params)
 
 
 @pytest.fixture
@@ -108,7 +107,8 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
 @pytest.mark.parametrize(
     ("name", "params", "words"),
     [
-        ("nope", {}, "baseline among knn, wskde"),
+        ("nope", {}, "baseline among knn, always"),
+        ("training.published:Nope", {}, "module:Class that can be imported here"),
         ("knn", {"n": 3}, "baseline knn has no parameter n; it has k"),
         ("knn", {"k": 0}, "k to be an integer of at least 1, got 0"),
         ("wskde", {"bandwidth": -1.0}, "bandwidth to be a number above 0, got -1.0"),
@@ -116,10 +116,8 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
     ],
 )
 def test_a_wrong_setting_is_named(name: str, params: dict[str, Any], words: str) -> None:
-    if name in BASELINES and BASELINES[name].library:
-        pytest.importorskip(BASELINES[name].library)
     with pytest.raises(SettingError, match=words):
-        make_baseline(name, LOOSE, 0, **params)
+        make_baseline(PUBLISHED.get(name, name), LOOSE, 0, **params)
 
 
 def test_neighbours_decide_only_where_all_k_agree() -> None:

@@ -100,14 +100,12 @@ def test_a_grid_that_is_run_again_plays_nothing_again(data: Dataset, tmp_path: P
     assert len(files) == len(first) == 8
 
 
-def test_a_baseline_without_its_library_is_refused_before_anything_is_played(
-    data, tmp_path: Path, monkeypatch
+def test_a_baseline_that_cannot_be_imported_is_refused_before_anything_is_played(
+    data, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(BASELINES["always"], "library", "no_such_library")
-    with pytest.raises(
-        SettingError, match=r'always needs no_such_library.*pip install "dengine\[baselines\]"'
-    ):
-        run_grid(data, [RECIPE, "always"], **GRID, n_jobs=1, keep=tmp_path)
+    absent = replace(Contender.load("always"), baseline="no_such_module:Baseline")
+    with pytest.raises(SettingError, match="no_such_module:Baseline"):
+        run_grid(data, [RECIPE, absent], **GRID, n_jobs=1, keep=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
