@@ -18,6 +18,7 @@ from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
+from dengine.engine.trainer import Limits
 from tests.support.command_line import dengine, document, example_of, line_of, succeed, well
 from tests.support.driving import easy_parts
 from tests.support.exports import cell_journal
@@ -195,6 +196,44 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(
         assert words in text
     with DataEngine.open(trained) as engine:
         assert engine.decide(easy_parts(1, 0).X[0]).predicted != "verify"
+
+
+def test_training_goes_on_after_retrains_without_a_step(tmp_path: Path, monkeypatch) -> None:
+    easy = easy_parts(20, 0)
+    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
+    words = ["train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db"]
+    deadline = Limits.deadline
+    with monkeypatch.context() as busy:
+        # The attribute `data` of `dengine.cli` is the verb, not the module.
+        busy.setattr(sys.modules["dengine.cli.data"], "MOST_EMPTY_RETRAINS", 2)
+        busy.setattr(Limits, "deadline", lambda limits, begin: begin - 1.0)
+        failed = dengine(*words, "--reducer", "conv")
+        assert failed.exit_code == 1
+        text = " ".join(failed.stderr.split())
+        assert "60 training steps are missing: 2 retrains in a row had no time" in text
+        assert "If the machine is busy, repeat the command later" in text
+        assert "It was accepted; 60 steps to go;" in line_of("retrain", tmp_path / "e.db")
+    begun = []
+
+    def late_at_first(limits: Limits, begin: float) -> float:
+        begun.append(begin)
+        return begin - 1.0 if len(begun) == 1 else deadline(limits, begin)
+
+    monkeypatch.setattr(Limits, "deadline", late_at_first)
+    again = document(*words)  # nothing is new, and all steps are missing
+    assert (again["import"]["imported"], again["retrain"]["accepted"]) == (0, True)
+    assert len(begun) > 1
+    n_retrains = len(begun)
+    assert "nothing was done" in line_of(*words)
+    assert len(begun) == n_retrains
+
+
+def test_training_on_too_few_labels_says_so(tmp_path: Path) -> None:
+    easy = easy_parts(10, 0)
+    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
+    failed = dengine("train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db")
+    assert failed.exit_code == 1
+    assert "Expected at least 20 traces, got 10" in failed.stderr
 
 
 def test_a_store_goes_on_with_a_reducer_of_this_folder(
