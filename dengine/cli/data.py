@@ -48,7 +48,7 @@ SIGNIFICANT = 0.01  # p-values below it are called drift
     help="Write the description, recordings.toml in a folder or FILE.toml beside a file.",
 )
 @click.option("--check", is_flag=True, help="End with exit code 1 if there is any fault.")
-@options.out_option
+@options.out_option("data.png")
 @click.pass_context
 def data(
     context: click.Context,

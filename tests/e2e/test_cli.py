@@ -372,13 +372,46 @@ def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder:
 
 def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_folder: Path) -> None:
     words = f"run --cell replay --data {data} --cycles 160 --store e.db --reducer his:Interrupting"
-    result = dengine(*words.split(), "--lower-bound", 0.99)
+    result = dengine(*words.split(), "--lower-bound", 0.99, "--out", "out")
     assert result.exit_code == INTERRUPTED
     done = int(re.search(r"Interrupted: (\d+) of 160 cycles were done", result.stderr)[1])
     rest = f"Everything up to cycle {done} is in e.db; the same command with --cycles {160 - done}"
     assert rest in result.stderr
+    assert f"{rest} and another folder for --out continues there." in result.stderr
     assert f"1 to {done}" in result.stdout
     assert document("status", "e.db")["ever"]["decisions"] == done > 0
+    rest = f"run --data {data} --cycles {160 - done} --store e.db --allow-import --out".split()
+    refused = dengine(*rest, "out")
+    assert (refused.exit_code, refused.stdout) == (1, "")
+    assert "run.csv exists" in refused.stderr
+    assert document("status", "e.db")["ever"]["decisions"] == done  # no part was played
+    succeed(*rest, "rest")
+    n_rows = [
+        len((own_folder / name / "run.csv").read_text().splitlines()) - 1
+        for name in ("out", "rest")
+    ]
+    assert n_rows == [done, 160 - done]
+
+
+@pytest.mark.parametrize("file", ["replays.csv", "curves.png"])
+def test_a_file_in_the_way_of_an_interrupted_grid_is_refused_before_the_first_replay(
+    file: str, data: Path, own_folder: Path
+) -> None:
+    words = f"compare --data {data} --reducers his:Interrupting --cycles 60 --repeats 3".split()
+    words += [*POLICY, "--keep", "kept", "--out", "out"]
+    assert dengine(*words).exit_code == INTERRUPTED
+    n_kept = len(list((own_folder / "kept").rglob("*.npz")))
+    assert n_kept
+    for path in (own_folder / "out").iterdir():
+        if path.name != file:
+            path.unlink()
+    refused = dengine(*words)
+    assert (refused.exit_code, refused.stdout) == (1, "")
+    assert f"{file} exists" in refused.stderr
+    assert "--force" in refused.stderr
+    assert len(list((own_folder / "kept").rglob("*.npz"))) == n_kept
+    assert document(*words, "--force")["costs"]["kept"] == n_kept
+    assert len((own_folder / "out" / "replays.csv").read_text().splitlines()) == 4
 
 
 WRONG = """
