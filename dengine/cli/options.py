@@ -731,19 +731,35 @@ force_option = click.option(
 )
 
 
-def _out_option(kind: click.Path, text: str) -> Option:
+def out_option(
+    *names: str,
+    kind: click.Path = FOLDER,
+    text: str = "Folder for the CSV and the pictures; created if it is missing.",
+) -> Option:
     """Return a decorator that adds `--out` and `--force`.
 
     They are handed on as one `Out`, the subcommand's argument `out`, which is None without `--out`.
+    If a file of these names must not be written into `--out`, OutputError is raised before the
+    subcommand begins, so that no work is lost.
     """
+
+    def make_out(out: Path | None, force: bool) -> Out | None:
+        """Check the files, and return the `Out`."""
+        from ..files import check_output
+
+        if out is None:
+            return None
+        for name in names:
+            check_output(out / name, force)
+        return Out(out, force)
+
     options = {"out": click.option("--out", type=kind, help=text), "force": force_option}
-    return bundle_options(
-        "out", lambda out, force: None if out is None else Out(out, force), options
-    )
+    return bundle_options("out", make_out, options)
 
 
-out_option = _out_option(FOLDER, "Folder for the CSV and the pictures; created if it is missing.")
-picture_option = _out_option(FILE, "Draw a picture into this file, .png, .pdf or .svg.")
+picture_option = out_option(
+    "", kind=FILE, text="Draw a picture into this file, .png, .pdf or .svg."
+)
 seed_option = click.option(
     "--seed",
     type=click.IntRange(0),

@@ -237,7 +237,7 @@ POLICY_LISTS = GRID_LISTS | {
 @stream_options(30, 1, 1, _SHUFFLES)
 @options.check_option
 @explain_option
-@options.out_option
+@options.out_option("replays.csv", "curves.png")
 def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
@@ -277,7 +277,7 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
 @stream_options(30, 1, 1, _SHUFFLES)
 @options.check_option
 @explain_option
-@options.out_option
+@options.out_option("replays.csv", "curves.png")
 def compare(
     names: Sequence[str],
     settings: Options,
@@ -510,7 +510,7 @@ PRICES = {
     "Number of shuffles that the last two policies play; earlier shuffles choose these policies.",
 )
 @explain_option
-@options.out_option
+@options.out_option("costs.csv", "costs.png")
 def costs(
     choice: RecipeChoice,
     part_prices: dict[str, float],

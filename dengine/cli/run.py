@@ -98,7 +98,7 @@ class DrivenRun(NamedTuple):
 @options.allow_import_option
 @options.verify_all_option
 @explain_option
-@options.out_option
+@options.out_option("run.csv", "run.png")
 def run(
     choice: RecipeChoice,
     kind: str,
@@ -164,9 +164,11 @@ def run(
     n_left = cycles - n_done
     kept = "Nothing was stored: --store FILE keeps a run, so that it can be continued."
     if store is not None:
+        # The files of the cycles that were done cannot be made again.
+        new_folder = " and another folder for --out" if out and n_done else ""
         kept = (
             f"Everything up to cycle {n_done} is in {store}; the same command with --cycles "
-            f"{n_left} continues there."
+            f"{n_left}{new_folder} continues there."
         )
     if driven.failure is not None:
         raise CellError(

@@ -233,9 +233,10 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels with all corrections.
 
-    An event records it. The new version replaces a pinned one, too. If the new version fails its
-    tests, it is dropped, the previous version stays in use, and the exit code is 1. The subcommand
-    is refused while an engine runs on the cell.
+    An event records it. The new version replaces a pinned one, too. If the recipe's time budget
+    ends before the training does, the output says how many steps are to go, and the next retrain
+    continues. If the new version fails its tests, it is dropped, the previous version stays in use,
+    and the exit code is 1. The subcommand is refused while an engine runs on the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -250,9 +251,10 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
             author,
         )
     answers = f"Version {report.version} answers." if report.version else "No version answers yet."
+    remark = f" It was {report.reason}." if report.accepted else ""
     print_result(
         {"store": store, "author": author, "retrain": report},
-        f"{answers} {retrain_line([report])}",
+        f"{answers} {retrain_line([report])}{remark}",
     )
     if not report.accepted:
         raise click.ClickException(f"The retrain was {report.reason}.")

@@ -18,6 +18,7 @@ from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
 from dengine.datasets.importing import import_labelled
+from dengine.engine.trainer import Limits
 from tests.support.command_line import dengine, document, example_of, line_of, succeed, well
 from tests.support.driving import easy_parts
 from tests.support.exports import cell_journal
@@ -197,6 +198,44 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(
         assert engine.decide(easy_parts(1, 0).X[0]).predicted != "verify"
 
 
+def test_training_goes_on_after_retrains_without_a_step(tmp_path: Path, monkeypatch) -> None:
+    easy = easy_parts(20, 0)
+    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
+    words = ["train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db"]
+    deadline = Limits.deadline
+    with monkeypatch.context() as busy:
+        # The attribute `data` of `dengine.cli` is the verb, not the module.
+        busy.setattr(sys.modules["dengine.cli.data"], "MOST_EMPTY_RETRAINS", 2)
+        busy.setattr(Limits, "deadline", lambda limits, begin: begin - 1.0)
+        failed = dengine(*words, "--reducer", "conv")
+        assert failed.exit_code == 1
+        text = " ".join(failed.stderr.split())
+        assert "60 training steps are missing: 2 retrains in a row had no time" in text
+        assert "If the machine is busy, repeat the command later" in text
+        assert "It was accepted; 60 steps to go;" in line_of("retrain", tmp_path / "e.db")
+    begun = []
+
+    def late_at_first(limits: Limits, begin: float) -> float:
+        begun.append(begin)
+        return begin - 1.0 if len(begun) == 1 else deadline(limits, begin)
+
+    monkeypatch.setattr(Limits, "deadline", late_at_first)
+    again = document(*words)  # nothing is new, and all steps are missing
+    assert (again["import"]["imported"], again["retrain"]["accepted"]) == (0, True)
+    assert len(begun) > 1
+    n_retrains = len(begun)
+    assert "nothing was done" in line_of(*words)
+    assert len(begun) == n_retrains
+
+
+def test_training_on_too_few_labels_says_so(tmp_path: Path) -> None:
+    easy = easy_parts(10, 0)
+    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
+    failed = dengine("train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db")
+    assert failed.exit_code == 1
+    assert "Expected at least 20 traces, got 10" in failed.stderr
+
+
 def test_a_store_goes_on_with_a_reducer_of_this_folder(
     data: Path, own_folder: Path, monkeypatch
 ) -> None:
@@ -333,13 +372,46 @@ def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder:
 
 def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_folder: Path) -> None:
     words = f"run --cell replay --data {data} --cycles 160 --store e.db --reducer his:Interrupting"
-    result = dengine(*words.split(), "--lower-bound", 0.99)
+    result = dengine(*words.split(), "--lower-bound", 0.99, "--out", "out")
     assert result.exit_code == INTERRUPTED
     done = int(re.search(r"Interrupted: (\d+) of 160 cycles were done", result.stderr)[1])
     rest = f"Everything up to cycle {done} is in e.db; the same command with --cycles {160 - done}"
     assert rest in result.stderr
+    assert f"{rest} and another folder for --out continues there." in result.stderr
     assert f"1 to {done}" in result.stdout
     assert document("status", "e.db")["ever"]["decisions"] == done > 0
+    rest = f"run --data {data} --cycles {160 - done} --store e.db --allow-import --out".split()
+    refused = dengine(*rest, "out")
+    assert (refused.exit_code, refused.stdout) == (1, "")
+    assert "run.csv exists" in refused.stderr
+    assert document("status", "e.db")["ever"]["decisions"] == done  # no part was played
+    succeed(*rest, "rest")
+    n_rows = [
+        len((own_folder / name / "run.csv").read_text().splitlines()) - 1
+        for name in ("out", "rest")
+    ]
+    assert n_rows == [done, 160 - done]
+
+
+@pytest.mark.parametrize("file", ["replays.csv", "curves.png"])
+def test_a_file_in_the_way_of_an_interrupted_grid_is_refused_before_the_first_replay(
+    file: str, data: Path, own_folder: Path
+) -> None:
+    words = f"compare --data {data} --reducers his:Interrupting --cycles 60 --repeats 3".split()
+    words += [*POLICY, "--keep", "kept", "--out", "out"]
+    assert dengine(*words).exit_code == INTERRUPTED
+    n_kept = len(list((own_folder / "kept").rglob("*.npz")))
+    assert n_kept
+    for path in (own_folder / "out").iterdir():
+        if path.name != file:
+            path.unlink()
+    refused = dengine(*words)
+    assert (refused.exit_code, refused.stdout) == (1, "")
+    assert f"{file} exists" in refused.stderr
+    assert "--force" in refused.stderr
+    assert len(list((own_folder / "kept").rglob("*.npz"))) == n_kept
+    assert document(*words, "--force")["costs"]["kept"] == n_kept
+    assert len((own_folder / "out" / "replays.csv").read_text().splitlines()) == 4
 
 
 WRONG = """

@@ -150,16 +150,17 @@ def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(
     assert {file.name for file in tmp_path.iterdir()} == {"model.ts", "model.ts.sha256"}
 
 
-def test_a_folder_with_somebody_elses_table_keeps_it_and_the_tables_are_shown(
+def test_a_folder_with_somebody_elses_picture_keeps_it_and_the_tables_are_shown(
     tmp_path: Path,
 ) -> None:
-    for name in ("data.png", "replays.csv"):
+    # Pictures are named after the recipes, and only those that are drawn are in the way.
+    for name in ("data.png", "map_pca.png"):
         (tmp_path / name).write_bytes(TEXT)
     words = ["replay", "--repeats", "1", "--cycles", "60", "--reducer", "pca", "--out", tmp_path]
     done = dengine(*words)
     assert done.exit_code == 1
     assert "was left as it was" in " ".join(done.output.split())
-    assert (tmp_path / "replays.csv").read_bytes() == TEXT
+    assert (tmp_path / "map_pca.png").read_bytes() == TEXT
     assert not (tmp_path / "manifest.json").exists()
     assert "certain" in done.output  # what took long is shown all the same
     assert dengine(*words, "--force").exit_code == 0
