@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import percent
+from ..errors import outward, percent
 from . import options
 from .options import verb
 from .output import (
@@ -192,6 +192,7 @@ def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
     basis = ""
     if estimate.n_known:
         basis = f"{estimate.n_wrong:,} of {estimate.n_known:,} by {estimate.basis}: "
-    interval = f"{100 * estimate.lower:.1f} to {percent(estimate.upper)}"
+    lower, upper = outward(estimate.lower, estimate.upper, 3)
+    interval = f"{100 * lower:.1f} to {percent(upper)}"
     verdict = f"{VERDICTS[estimate.verdict]} {percent(estimate.tolerance, 'g')}"
     return f"{stops}{basis}{interval}, {verdict}"
