@@ -192,7 +192,7 @@ def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
     basis = ""
     if estimate.n_known:
         basis = f"{estimate.n_wrong:,} of {estimate.n_known:,} by {estimate.basis}: "
-    lower, upper = outward(estimate.lower, estimate.upper, 3)
-    interval = f"{100 * lower:.1f} to {percent(upper)}"
+    ends = outward(100 * estimate.lower, 100 * estimate.upper, 1)
+    interval = "{:.1f} to {:.1f} %".format(*ends)
     verdict = f"{VERDICTS[estimate.verdict]} {percent(estimate.tolerance, 'g')}"
     return f"{stops}{basis}{interval}, {verdict}"
