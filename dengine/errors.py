@@ -86,6 +86,12 @@ def percent(share: float, form: str = ".1f") -> str:
     return "-" if math.isnan(share) else f"{100 * share:{form}} %"
 
 
+def outward(lower: float, upper: float, digits: int) -> tuple[float, float]:
+    """Return an interval rounded outward: a bound that misses a threshold never shows as it."""
+    scale = 10**digits
+    return math.floor(round(lower * scale, 9)) / scale, math.ceil(round(upper * scale, 9)) / scale
+
+
 def counted(n: int, noun: str) -> str:
     """Return a number with its noun, of which the plural ends in s: "1 part", "1,200 parts"."""
     return f"{n:,} {noun}{'' if n == 1 else 's'}"

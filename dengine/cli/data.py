@@ -39,7 +39,7 @@ SIGNIFICANT = 0.01  # p-values below it are called drift
     is_flag=True,
     help=(
         "First write recordings to try it on into DATA, a new or an empty folder: "
-        "200 files of the bundled set, three of them broken."
+        "200 files of the bundled set, one of them broken."
     ),
 )
 @click.option(

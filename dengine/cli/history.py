@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import percent
+from ..errors import outward, percent
 from . import options
 from .options import NameChoice, verb
 from .output import (
@@ -146,9 +146,11 @@ def _model_text(stored: StoredDecision) -> str:
 
 
 def _bound_text(stored: StoredDecision) -> str:
-    """Return the interval of the success rate as text, "-" if there is none."""
-    text = f"{stored.decision.lower:.2f}-{stored.decision.upper:.2f}"
-    return text.replace("nan-nan", "-")
+    """Return the interval of the success rate as text, rounded outward, "-" if there is none."""
+    decision = stored.decision
+    if math.isnan(decision.lower):
+        return "-"
+    return "{:.2f}-{:.2f}".format(*outward(decision.lower, decision.upper, 2))
 
 
 # Alignment ("<" or ">") and title of a column -> its text.

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import percent
+from ..errors import outward, percent
 from . import options
 from .options import verb
 from .output import (
@@ -192,6 +192,7 @@ def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
     basis = ""
     if estimate.n_known:
         basis = f"{estimate.n_wrong:,} of {estimate.n_known:,} by {estimate.basis}: "
-    interval = f"{100 * estimate.lower:.1f} to {percent(estimate.upper)}"
+    ends = outward(100 * estimate.lower, 100 * estimate.upper, 1)
+    interval = "{:.1f} to {:.1f} %".format(*ends)
     verdict = f"{VERDICTS[estimate.verdict]} {percent(estimate.tolerance, 'g')}"
     return f"{stops}{basis}{interval}, {verdict}"

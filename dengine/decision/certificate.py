@@ -368,7 +368,7 @@ class Certificate:
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""
         if group.n == 0:
-            return f"Nothing can be said yet: no part was {which}."
+            return f"Nothing can be said yet: no part was {verb}ed without a check."
         if group.propensity == 0.0:
             return f"Of {parts} {which} nothing can be said{but}, for {unknown}."
         if group.shadowed:

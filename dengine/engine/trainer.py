@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..decision.scripting import reason_of
-from ..errors import DengineError, SettingError, log
+from ..errors import DengineError, SettingError, counted, log
 from ..model.base import EngineModel
 from ..records import TRAINED, Ints, TraceArray
 from ..reducers.base import StopRule
@@ -320,7 +320,7 @@ class Retrainer:
             return False
         data = self.window.snapshot()
         if not self._began:
-            log.info("the first retrain begins, on %d labels", len(data.seq))
+            log.info("the first retrain begins, on %s", counted(len(data.seq), "label"))
         arguments = (current.successor(), data, self._limits(), self.clock)
         try:
             self.future = executor.submit(train_candidate, *arguments)

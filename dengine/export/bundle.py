@@ -146,10 +146,7 @@ def prepare_export(
         problem = "The rule has missed what became of a part"
         raise ExportError(f"{problem}; open the engine's store again, then export.")
     if encoder is None:
-        raise ExportError(
-            f"{model.name} cannot be exported, for it has no module: give it `module()`, which "
-            "returns the embedding as an nn.Module (see `Reducer.module`)."
-        )
+        raise ExportError(f"{model.name} cannot be exported, for {model.spaces.why_no_module}.")
     conditions = DecisionConditions(
         source.trace, source.force_limits, source.audit_rate, source.seed
     )

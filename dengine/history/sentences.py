@@ -14,6 +14,7 @@ import torch
 from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
 from ..decision.members import CLOSED
 from ..decision.policy import RULES, Policy
+from ..errors import outward
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceArray, TraceSpec
 from ..store.records import StoredDecision
@@ -220,7 +221,7 @@ def _bound_sentences(
     bounds.
     """
     n = decision.n_success + decision.n_failure
-    interval = f"{decision.lower:.3f} to {decision.upper:.3f}"
+    interval = "{:.3f} to {:.3f}".format(*outward(decision.lower, decision.upper, 3))
     if circumstances.baseline:
         counts = f"{decision.n_success} successes, {decision.n_failure} failures"
         yield f"{circumstances.baseline} gives {counts}, bound {interval}."
@@ -232,7 +233,7 @@ def _bound_sentences(
     )
     if _is_score(policy, decision):
         yield (
-            f"{counts}; the heads give it {decision.lower:.3f}, the mean of what each says "
+            f"{counts}; the heads give it {decision.lower:.6g}, the mean of what each says "
             "of its success."
         )
     else:
@@ -256,4 +257,4 @@ def _bound_sentences(
         if threshold is None:
             yield f"To {action}: no level held, so nothing could be {action}ed."
         else:
-            yield f"To {action}, {condition} {threshold:.4g} ({bound.origin})."
+            yield f"To {action}, {condition} {threshold:.6g} ({bound.origin})."

@@ -132,6 +132,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         is True, the embedding is first scaled to a root mean square radius of 1.
     default_retrain_every : int
         New labels between two retrains, if a recipe names none.
+    why_no_module : str or None
+        Why `module` returns None, for the error of an export; None if that is not known yet.
     """
 
     uses_labels = False
@@ -140,6 +142,10 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     min_traces = 1
     default_radius = 0.3
     default_retrain_every = 50
+    why_no_module: str | None = (
+        "it has no module: give it `module()`, which returns the embedding as an nn.Module (see "
+        "`Reducer.module`)"
+    )
 
     @abstractmethod
     def fit(self, X: ArrayLike, y: ArrayLike | None = None) -> Self:

@@ -1,7 +1,7 @@
 """`TorchReducer`: train any PyTorch network on the CPU, a few steps at every retrain. The file also
-holds `Augmentation`, which changes the traces of a batch, `draw_batches`, and `can_compile`, which
-says whether a network can be exported. `conv` is a subclass with a network of its own, whose logit
-it averages with that of `rocket`.
+holds `Augmentation`, which changes the traces of a batch, `draw_batches`, and `compile_fault`,
+which says why a network cannot be exported. `conv` is a subclass with a network of its own, whose
+logit it averages with that of `rocket`.
 
     >>> reducer = TorchReducer(network=MyNetwork)  # MyNetwork(channels, samples) is an nn.Module
     >>> DataEngine(reducer=reducer)
@@ -43,7 +43,7 @@ from ..decision.scripting import (
     restore,
     script,
 )
-from ..errors import SettingError, expect, log
+from ..errors import SettingError, counted, expect, log
 from ..records import Arrays, State, is_number, is_whole
 from .base import (
     SAME_POINTS,
@@ -321,7 +321,7 @@ class TorchReducer(Reducer):
             self.members_ = Members(self.network, *shape, self.folds)
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
-        self.can_compile_: bool | None = None  # until it was tried
+        self.why_no_module = None  # until it was tried
         self.is_initialized_ = False  # until scales and checkpoint are read
         self.n_steps_ = 0
         self.n_steps_left_ = 0
@@ -533,14 +533,14 @@ class TorchReducer(Reducer):
 
         It is the present `encoder_`, which later trainings replace and do not change. None if
         TorchScript cannot compile the network: the first call finds this out, and logs a warning,
-        unless a warning for this network and shape was logged before (`can_compile`). Raises
+        unless a warning for this network and shape was logged before (`compile_fault`). Raises
         NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
-        if self.can_compile_ is None:  # copies of the reducer, which an engine trains, keep it
-            self.can_compile_ = can_compile(self.network, *shape)
-        return self.encoder_ if self.can_compile_ else None
+        if self.why_no_module is None:  # copies of the reducer, which an engine trains, keep it
+            self.why_no_module = compile_fault(self.network, *shape)
+        return None if self.why_no_module else self.encoder_
 
     @property
     def report(self) -> FitReport:
@@ -552,7 +552,7 @@ class TorchReducer(Reducer):
         """
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
-        left = f"{self.n_steps_left_} steps to go" if self.n_steps_left_ else ""
+        left = f"{counted(self.n_steps_left_, 'step')} to go" if self.n_steps_left_ else ""
         note = ", ".join(filter(None, (note, left)))
         return FitReport(self.n_new_steps_, note, self.n_steps_left_)
 
@@ -715,8 +715,8 @@ def standard_normal(rng: np.random.Generator, *shape: int) -> Tensor:
 
 
 @lru_cache(maxsize=32)
-def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
-    """Return whether TorchScript compiles a network; log a warning if it does not.
+def compile_fault(network: NetworkFactory, channels: int, samples: int) -> str:
+    """Return why TorchScript cannot compile a network, and log it as a warning; "" if it can.
 
     A user's network may hold Python that TorchScript does not support. To find out, two copies of
     it are built, compiled and run. A process keeps the answers for the last 32 networks and shapes,
@@ -729,10 +729,7 @@ def can_compile(network: NetworkFactory, channels: int, samples: int) -> bool:
             script(fold_batch_norms(members))(torch.zeros(1, 2, channels, samples))
     except Exception as error:
         name = getattr(network, "__qualname__", repr(network))
-        reason = reason_of(error)
-        message = (
-            "%s cannot be compiled by TorchScript, so it answers in Python and is not exported: %s"
-        )
-        log.warning(message, name, reason)
-        return False
-    return True
+        fault = f"{name} cannot be compiled by TorchScript: {reason_of(error)}"
+        log.warning("%s. So it answers in Python and is not exported.", fault)
+        return fault
+    return ""

@@ -449,9 +449,9 @@ class CellService:
         # Decisions and reports are in the store: only a retrain needs a line of the log.
         if isinstance(response, RetrainReport):
             log.info(
-                "version %d answers after a retrain of %.2f s: %s",
-                response.version,
+                "a retrain of %.2f s left version %d in force (0: none): %s",
                 response.seconds,
+                response.version,
                 response.reason,
             )
         for observe in self.observers:

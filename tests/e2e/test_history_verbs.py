@@ -13,6 +13,7 @@ import pytest
 from dengine import Action, DataEngine, Dataset, Policy, ReplayCell
 from dengine.cli.history import TABLE_WIDTH
 from dengine.decision.intervals import wilson_interval
+from dengine.errors import outward
 from dengine.history.status import bad_accepts
 from dengine.store.records import Outcomes
 from tests.support.command_line import dengine, document, line_of, succeed
@@ -44,6 +45,24 @@ def test_a_history_fits_120_columns_and_its_newest_line_is_the_newest_decision(
     assert sum("  * retrain to version" in line for line in shown) >= 5
     assert any("  * safe mode ended:" in line for line in shown)
     assert len([line for line in shown if decisions[-1]["id"][:12] in line]) == 400
+
+
+def test_a_bound_that_misses_a_threshold_is_not_shown_as_the_threshold(
+    store: Path, decisions: list[dict]
+) -> None:
+    of_id = {item["id"]: item for item in decisions}
+    n_rounded = 0
+    for line in succeed("history", store, "--last", 700).splitlines():
+        ends = re.search(r" (\d\.\d\d)-(\d\.\d\d) ", line)
+        if ends is not None:
+            decision = next(of_id[word] for word in line.split() if word in of_id)
+            lower, upper = map(float, ends.groups())
+            assert decision["lower"] - 0.01 < lower <= decision["lower"] + 1e-9
+            assert decision["upper"] - 1e-9 <= upper < decision["upper"] + 0.01
+            n_rounded += lower != decision["lower"]
+    assert n_rounded > 100
+    assert outward(0.8958, 0.9999, 2) == (0.89, 1.0)
+    assert outward(0.07, 0.29, 2) == (0.07, 0.29)  # 100 times these is not a whole number
 
 
 def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:

@@ -578,7 +578,7 @@ def test_a_listing_names_parts_once_and_is_no_recording(tmp_path: Path) -> None:
     data = load_dataset(tmp_path, replace(written.description, label=label))
     assert data.part.tolist() == ["0", "1", "4"]
     assert [fault.source for fault in data.faults] == ["part_2_OK.csv", "part_3_OK.csv"]
-    assert "1 of 5 rows of part_list.csv name no recording: 9." in data.notes
+    assert "1 of 5 rows of part_list.csv name no recording that was read: 9." in data.notes
 
 
 # Descriptions.

@@ -181,7 +181,10 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
         p.put("order", "time")
     usual = float(np.median([steps.mean() for steps in rising if len(steps)] or 0.0))
     if not is_rate(usual):
-        text = f"steps of {usual:.6g} s are of no force: is time.format right?"
+        text = (
+            f"steps of {usual:.6g} s are of no force: is time.format right? A footer is left out "
+            "with text.drop, the words that it begins with"
+        )
         p.put("time.rate_hz", UNKNOWN, text)
         return
     p.put("time.rate_hz", float(f"{1 / usual:.5g}"))

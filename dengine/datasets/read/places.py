@@ -146,8 +146,10 @@ class LabelReader:
         keys = [key for key in map(as_key, names) if key in self.listing]
         if not keys:
             others = f"it has {listed(sorted(self.listing)[:2])}"
-            message = f"Expected {part or name} in {source.listing}, it is not listed; {others}"
-            raise UnreadableError(message)
+            raise UnreadableError(
+                f"Expected {part or name} in {source.listing}, it is not listed; {others}; if its "
+                "name contains the key, state part.path"
+            )
         self.used.add(keys[0])
         return self.listing[keys[0]]
 
@@ -187,10 +189,10 @@ class LabelReader:
         return meanings[word]
 
     def unused_note(self) -> str:
-        """Return a note on the rows of the listing that name no recording; "" if all do."""
+        """Return a note on the rows of the listing whose recording was not read, or ""."""
         unused = sorted(self.listing.keys() - self.used, key=natural_key)
         n = f"{len(unused)} of {len(self.listing)} rows of {self.source.listing}"
-        return f"{n} name no recording: {listed(unused)}." if unused else ""
+        return f"{n} name no recording that was read: {listed(unused)}." if unused else ""
 
 
 def as_key(word: str) -> str:

@@ -1,6 +1,6 @@
 // Charts: traces and the course of decisions with uPlot, bounds and the map as SVG. Each has a caption that says the same in words.
 
-import { capital, el, labelOf, labelWord, nameOf, number, partAddress, percent, svg } from "./dom.js";
+import { capital, el, interval, labelOf, labelWord, nameOf, number, partAddress, percent, svg } from "./dom.js";
 
 const CHANNELS = 3; // channels drawn: those farthest outside the band
 const HEIGHTS = [151, 80, 64]; // of each chart inside its axes, by the number of charts: the figures below stay above the fold
@@ -229,17 +229,17 @@ export function boundChart(bound) {
     zones.push([bound.accept_threshold, 1, "accept"]);
     marks.push(["✓ ≥", bound.accept_threshold]);
   }
-  const caption = `The success rate lies between ${percent(bound.lower, 1)} and ${percent(bound.upper, 1)}. Accepted from ${percent(bound.accept_threshold, 1)} on, rejected up to ${percent(bound.reject_threshold, 1)}.`;
-  return interval(1, bound.lower, bound.upper, zones, marks, caption);
+  const caption = `The success rate lies between ${interval(bound.lower, bound.upper, 1).join(" and ")}. Accepted from ${percent(bound.accept_threshold, 1)} on, rejected up to ${percent(bound.reject_threshold, 1)}.`;
+  return intervalBar(1, bound.lower, bound.upper, zones, marks, caption);
 }
 
 export function judgedChart(judged) {
   const most = Math.min(1, Math.max(0.02, 2 * judged.tolerance, 1.1 * judged.upper));
-  const caption = `The share of wrong ones lies between ${percent(judged.lower, 1)} and ${percent(judged.upper, 1)}; the tolerance is ${percent(judged.tolerance, 1)}.`;
-  return interval(most, judged.lower, judged.upper, [[0, judged.tolerance, "accept"]], [["≤", judged.tolerance]], caption);
+  const caption = `The share of wrong ones lies between ${interval(judged.lower, judged.upper, 1).join(" and ")}; the tolerance is ${percent(judged.tolerance, 1)}.`;
+  return intervalBar(most, judged.lower, judged.upper, [[0, judged.tolerance, "accept"]], [["≤", judged.tolerance]], caption);
 }
 
-function interval(most, lower, upper, zones, marks, caption) {
+function intervalBar(most, lower, upper, zones, marks, caption) {
   const [begin, end, middle] = [16, 464, 42];
   const x = (value) => begin + (Math.min(value, most) / most) * (end - begin);
   const bar = (low, high, half, least, kind) =>

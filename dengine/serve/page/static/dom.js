@@ -34,6 +34,14 @@ export function number(value, digits = 0) {
 
 export const percent = (share, digits = 0) => (share === null || share === undefined ? "–" : `${number(100 * share, digits)}\u202f%`);
 
+// The ends of an interval as texts, rounded outward: a bound that misses a threshold is never shown as the threshold.
+export function interval(lower, upper, digits = 0) {
+  if (lower === null || lower === undefined) return ["–", "–"];
+  const scale = 100 * 10 ** digits;
+  const rounded = (end, round) => percent(round(Number((end * scale).toFixed(9))) / scale, digits);
+  return [rounded(lower, Math.floor), rounded(upper, Math.ceil)];
+}
+
 export function duration(seconds) {
   if (Math.abs(seconds) < 120) return `${number(seconds)} s`;
   return Math.abs(seconds) < 7200 ? `${number(seconds / 60)} min` : `${number(seconds / 3600, 1)} h`;

@@ -3,7 +3,7 @@
 import * as act from "./actions.js";
 import { boundChart, courseChart, isForce, judgedChart, mapChart, traceCharts, traceLegend } from "./charts.js";
 import {
-  ACTIONS, LABEL_NAMES, REASON_NAMES, capital, chip, clock, duration, el, icon, label, labelOf, labelWord, moment, nameOf, number,
+  ACTIONS, LABEL_NAMES, REASON_NAMES, capital, chip, clock, duration, el, icon, interval, label, labelOf, labelWord, moment, nameOf, number,
   partAddress, percent, reasonOf, sourceOf, table,
 } from "./dom.js";
 
@@ -74,7 +74,7 @@ function badAccepts(status) {
   const bad = status.ever.bad_accepts;
   return el("section", { class: "card tile wide", id: "bad", "data-part": true }, el("h2", {}, "Bad accepted parts"),
     knownBad(status.ever), verdict(bad, VERDICT[bad.verdict]), judgedChart(bad),
-    el("p", {}, `${percent(bad.lower, 1)} to ${percent(bad.upper, 1)}, tolerance ${percent(bad.tolerance, 1)}`),
+    el("p", {}, `${interval(bad.lower, bad.upper, 1).join(" to ")}, tolerance ${percent(bad.tolerance, 1)}`),
     small(BASIS[bad.basis](bad, status.ever.false_accepts)), el("p", { id: "claim" }, status.claim));
 }
 
@@ -84,13 +84,13 @@ function wouldHave(status) {
   return el("section", { class: "card tile wide", id: "would", "data-part": true }, el("h2", {}, "Predicted in shadow mode"),
     big(`${number(certain)} of ${number(checked)} verified parts`),
     el("p", {}, `${number(accepts.n)} accepted, ${number(accepts.n_wrong)} of them bad; ${number(rejects.n)} rejected, ${number(rejects.n_wrong)} of them good; ${duration(certain * status.check_seconds)} saved.`),
-    judgedChart(accepts), small(`Bad among those it would have accepted: ${percent(accepts.lower, 1)} to ${percent(accepts.upper, 1)}; ${VERDICT[accepts.verdict].toLowerCase()} (${percent(accepts.tolerance, 1)}).`));
+    judgedChart(accepts), small(`Bad among those it would have accepted: ${interval(accepts.lower, accepts.upper, 1).join(" to ")}; ${VERDICT[accepts.verdict].toLowerCase()} (${percent(accepts.tolerance, 1)}).`));
 }
 
 // One part
 
 const bound = (explanation) => explanation.bound
-  ? [big(`${percent(explanation.bound.lower, 1)} – ${percent(explanation.bound.upper, 1)}`), boundChart(explanation.bound)]
+  ? [big(interval(explanation.bound.lower, explanation.bound.upper, 1).join(" – ")), boundChart(explanation.bound)]
   : big("–");
 
 const counts = (decision) => el("p", { class: "counts" },
@@ -178,7 +178,7 @@ async function now(get, _, status) {
   const bad = status.ever.bad_accepts;
   const figures = [
     verified(status), accepted(status),
-    figure("bad", "Bad accepted parts", knownBad(status.ever), verdict(bad, `${percent(bad.lower, 1)} – ${percent(bad.upper, 1)}`), small(`${VERDICT[bad.verdict]} (${percent(bad.tolerance)})`)),
+    figure("bad", "Bad accepted parts", knownBad(status.ever), verdict(bad, interval(bad.lower, bad.upper, 1).join(" – ")), small(`${VERDICT[bad.verdict]} (${percent(bad.tolerance)})`)),
     pace(decisions), saved(status),
   ];
   const layout = el("div", { class: "now" }, card_,
@@ -285,7 +285,7 @@ async function history(get, query) {
   const rows = decisions.map((each) => [
     el("time", {}, el("span", { class: "more" }, moment(each.time)), el("span", { class: "less" }, clock(each.time))),
     el("a", { href: partAddress(each.id) }, nameOf(each.part, each.id)), chip(each.action), reasonOf(each.reason), label(each.success),
-    `${percent(each.lower)} – ${percent(each.upper)}`, `${number(each.n_success)} / ${number(each.n_failure)}`, number(each.model_version),
+    interval(each.lower, each.upper).join(" – "), `${number(each.n_success)} / ${number(each.n_failure)}`, number(each.model_version),
   ]);
   const next = new URLSearchParams(given);
   if (older) next.set("before", older);
