@@ -146,7 +146,7 @@ def prepare_export(
         problem = "The rule has missed what became of a part"
         raise ExportError(f"{problem}; open the engine's store again, then export.")
     if encoder is None:
-        raise ExportError(f"{model.name} cannot be exported, for {model.spaces.why_no_module}.")
+        raise ExportError(f"{model.name} cannot be exported, for {model.spaces.why_no_module_}.")
     conditions = DecisionConditions(
         source.trace, source.force_limits, source.audit_rate, source.seed
     )

@@ -132,7 +132,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         is True, the embedding is first scaled to a root mean square radius of 1.
     default_retrain_every : int
         New labels between two retrains, if a recipe names none.
-    why_no_module : str or None
+    why_no_module_ : str or None
         Why `module` returns None, for the error of an export; None if that is not known yet.
     """
 
@@ -142,7 +142,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     min_traces = 1
     default_radius = 0.3
     default_retrain_every = 50
-    why_no_module: str | None = (
+    why_no_module_: str | None = (
         "it has no module: give it `module()`, which returns the embedding as an nn.Module (see "
         "`Reducer.module`)"
     )

@@ -321,7 +321,7 @@ class TorchReducer(Reducer):
             self.members_ = Members(self.network, *shape, self.folds)
         self.averaged_members_ = copy.deepcopy(self.members_)
         self.optimizer_state_: dict[int, dict[str, Tensor]] = {}
-        self.why_no_module = None  # until it was tried
+        self.why_no_module_ = None  # until it was tried
         self.is_initialized_ = False  # until scales and checkpoint are read
         self.n_steps_ = 0
         self.n_steps_left_ = 0
@@ -538,9 +538,9 @@ class TorchReducer(Reducer):
         """
         check_is_fitted(self, "encoder_")
         shape = self.preprocessor_.channels, self.preprocessor_.samples
-        if self.why_no_module is None:  # copies of the reducer, which an engine trains, keep it
-            self.why_no_module = compile_fault(self.network, *shape)
-        return None if self.why_no_module else self.encoder_
+        if self.why_no_module_ is None:  # copies of the reducer, which an engine trains, keep it
+            self.why_no_module_ = compile_fault(self.network, *shape)
+        return None if self.why_no_module_ else self.encoder_
 
     @property
     def report(self) -> FitReport:
