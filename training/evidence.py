@@ -131,9 +131,10 @@ class Condition(NamedTuple):
 
     def contender(self) -> Contender:
         """Return who plays the replay."""
-        contender = Contender.load("knn" if self.method in PUBLISHED else self.method)
-        if self.method in PUBLISHED:  # in the loop of any baseline
-            contender = replace(contender, name=self.method, baseline=PUBLISHED[self.method])
+        path = PUBLISHED.get(self.method)
+        contender = Contender.load("knn" if path else self.method)
+        if path:  # in the loop of any baseline
+            contender = replace(contender, name=self.method, baseline=path)
         return contender.with_policy(
             interval=self.interval, alpha=self.alpha, lower_bound=self.lower_bound
         )

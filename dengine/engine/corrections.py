@@ -353,7 +353,9 @@ class Corrections:
         self._learner.set_policy(policy if starts_anew else None, evidence, event)
         self._settings.change(settings)
         self._feedback.begin_policy()
-        return self._finish_change(event, "the rule of the new policy has no safe mode")
+        return self._finish_change(
+            event, reason_ended="the rule of the new policy has no safe mode"
+        )
 
     def _bring_up_to_date(self) -> None:
         """Finish what is under way: a correction comes after everything that was known before it.
@@ -392,23 +394,26 @@ class Corrections:
         done. Raises StoreError if the store does not answer; a change that is stored by then is
         applied with the next one, or when the store is opened again.
         """
-        self._store.corrections.apply(change)
+        number = self._store.corrections.apply(change)
         for id_ in change.decisions:
             self._outbox.evict_decision(id_)
-        self._learner.apply_corrections()
-        return self._finish_change(change)
+        self._learner.apply_corrections()  # which may add an event: a model is trained anew
+        return self._finish_change(change, number)
 
     def _finish_change(
-        self, change: Change, reason_ended: str = "the corrected outcomes keep the tolerance"
+        self,
+        change: Change,
+        number: int | None = None,
+        reason_ended: str = "the corrected outcomes keep the tolerance",
     ) -> Changed:
         """Return what a stored change did; also announce a safe mode that it began or ended.
 
-        The event of the change must be in the store already. The announcement is an event and a
-        call of `on_safe_mode`; if it fails, that is logged. `reason_ended` is the reason recorded
-        for an end.
+        `number` is that of the change's event; None means that it is the store's newest event. The
+        announcement is an event and a call of `on_safe_mode`; if it fails, that is logged.
+        `reason_ended` is the reason recorded for an end.
         """
-        newest = self._store.events.newest(100)  # a refitted model is an event of its own
-        number = max(event.number for event in newest if event.kind == change.kind)
+        if number is None:
+            number = self._store.events.newest(1)[0].number
         self._feedback.announce_safe_mode(reason_ended)
         return Changed(change.kind, _sentence(f"{change.text}."), number, self._live.version)
 

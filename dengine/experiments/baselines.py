@@ -21,7 +21,6 @@ from ..imports import import_class
 from ..records import ACTIONS, Floats, Ints, is_whole
 from ..traces import as_traces
 
-Counts = Ints
 Labels = NDArray[np.bool_]
 Traces = NDArray[np.float32]
 
@@ -39,8 +38,8 @@ class BaselinePrediction(NamedTuple):
 
     lower: Floats
     upper: Floats
-    n_success: Counts | int = 0
-    n_failure: Counts | int = 0
+    n_success: Ints | int = 0
+    n_failure: Ints | int = 0
 
 
 @dataclass(eq=False)
@@ -105,7 +104,7 @@ class Baseline(ABC):
             self._add(as_traces(np.asarray(x)[None]), bool(y == 1))
         return self
 
-    def count(self, X: ArrayLike) -> tuple[Counts, Counts]:
+    def count(self, X: ArrayLike) -> tuple[Ints, Ints]:
         """Return (n_success, n_failure), each (n,): the labels behind each prediction.
 
         They are 0 if the method counts none.

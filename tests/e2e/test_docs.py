@@ -190,7 +190,7 @@ def type_in(command: str, desk: Path) -> None:
 
 
 def snippet(block: Block, desk: Path) -> None:
-    """A block of Python: saved where it has a file's name, run where it has none, with fewer parts."""
+    """A block of Python, with fewer parts: saved if it has a file's name, otherwise run."""
     text = re.sub(r"(range\(|cycles=)[4-9]00\b", r"\g<1>100", block.text)
     (desk / (block.title or "snippet.py")).write_text(text, encoding="utf-8")
     # A cell's program is started again.

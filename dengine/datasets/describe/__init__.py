@@ -148,9 +148,10 @@ def signals_in(names: Names) -> Names:
     """
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     endings = sorted({name[-1] for name in words})
-    n = len({name[0] for name in words})
-    is_word = not re.search(rf"(?i)\d|\b({WORD})\.", " ".join(endings))
-    return endings if n * len(endings) == len(names) and n > 1 < len(endings) and is_word else ()
+    n_parts = len({name[0] for name in words})
+    has_all = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
+    is_other = re.search(rf"(?i)\d|\b({WORD})\.", " ".join(endings)) is not None
+    return endings if has_all and not is_other else ()
 
 
 def suffix_of(name: str) -> str:

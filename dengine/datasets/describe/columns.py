@@ -82,11 +82,11 @@ class Column:
         for table in self.tables:
             with suppress(DataError):
                 numbers.append(table.numbers(self.name, self.form))
-        return numbers * (len(numbers) >= 0.9 * len(self.tables))
+        return numbers if len(numbers) >= 0.9 * len(self.tables) else []
 
     @cached_property
     def steps(self) -> Floats:
-        """The differences of successive numbers in each recording; empty if a cell is no number."""
+        """The differences of successive `numbers` in each recording, one after the other."""
         return np.concatenate([np.empty(0), *map(np.diff, self.numbers)])
 
     @cached_property

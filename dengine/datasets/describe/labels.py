@@ -48,9 +48,14 @@ PATHS = (  # of verdicts in folders, and at the end or beginning of names
     rf"(?:^|/)({WORD})(?=[-_ ][^/]*$)",
 )
 PLACES = (  # of any words: folders, and the words of a file's name, counted from the end
-    *("([^/]+)/[^/]*$", "([^/]+)/[^/]*/[^/]*$", "([^/]+)/[^/]*/[^/]*/[^/]*$"),
-    *("([^-_ /]+)$", "([^-_ /]+)[-_ ][^-_ /]*$", "([^-_ /]+)[-_ ][^-_ /]*[-_ ][^-_ /]*$"),
-    *("([^-_ /]+)(?:[-_ ][^-_ /]*){3}$", "(?:^|/)([^-_ /]+)[^/]*$"),
+    "([^/]+)/[^/]*$",
+    "([^/]+)/[^/]*/[^/]*$",
+    "([^/]+)/[^/]*/[^/]*/[^/]*$",
+    "([^-_ /]+)$",
+    "([^-_ /]+)[-_ ][^-_ /]*$",
+    "([^-_ /]+)[-_ ][^-_ /]*[-_ ][^-_ /]*$",
+    "([^-_ /]+)(?:[-_ ][^-_ /]*){3}$",
+    "(?:^|/)([^-_ /]+)[^/]*$",
 )
 NO_LABEL = "none was found that is certain: state label.column, path, line or listing"
 KINDS = ("listing", "key", "column", "path", "line")
