@@ -87,7 +87,11 @@ def percent(share: float, form: str = ".1f") -> str:
 
 
 def outward(lower: float, upper: float, digits: int) -> tuple[float, float]:
-    """Return an interval rounded outward: a bound that misses a threshold never shows as it."""
+    """Return an interval with the lower end rounded down and the upper end rounded up.
+
+    So 0.8999 is shown as 0.89, and does not seem to reach a threshold of 0.9. Differences as small
+    as errors of floats are ignored.
+    """
     scale = 10**digits
     return math.floor(round(lower * scale, 9)) / scale, math.ceil(round(upper * scale, 9)) / scale
 

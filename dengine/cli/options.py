@@ -738,9 +738,10 @@ def out_option(
 ) -> Option:
     """Return a decorator that adds `--out` and `--force`.
 
-    They are handed on as one `Out`, the subcommand's argument `out`, which is None without `--out`.
-    If a file of these names must not be written into `--out`, OutputError is raised before the
-    subcommand begins, so that no work is lost.
+    The subcommand gets both as its argument `out`, an `Out`; it is None without `--out`. Before the
+    subcommand begins, OutputError is raised if a file of `names` below `--out` must not be written
+    (`check_output`), so that no work is lost. The name "" is `--out` itself. `kind` is the type of
+    the path, and `text` the help of `--out`.
     """
 
     def make_out(out: Path | None, force: bool) -> Out | None:

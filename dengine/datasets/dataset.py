@@ -28,7 +28,7 @@ expect_data = partial(expect, error=DataError)
 
 
 def unit_text(units: Sequence[str]) -> str:
-    """Return the units of channels as a text, one if they are the same: "kN, mm", "N" or ""."""
+    """Return the units of channels as a text: "kN, mm", or a single "N" if all are equal."""
     return ", ".join(units if len({*units}) > 1 else units[:1])
 
 

@@ -306,10 +306,14 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
 
 
 def baseline_class(name: str) -> type[Baseline]:
-    """Return the class of a baseline: a name in `BASELINES`, or `module:Class` of another one.
+    """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`.
 
-    Raises SettingError for another name, and if the class cannot be imported.
+    Raises SettingError if there is no such name or class, or the class is no `Baseline`.
     """
-    is_path = ":" in name
-    expect(is_path or name in BASELINES, f"a baseline among {', '.join(BASELINES)}", name)
-    return import_class(name) if is_path else BASELINES[name]
+    kind = import_class(name) if ":" in name else BASELINES.get(name, object)
+    if not issubclass(kind, Baseline):
+        known = ", ".join(BASELINES)
+        raise SettingError(
+            f"Expected a baseline among {known}, or module:Class of one, got {name}."
+        )
+    return kind

@@ -109,6 +109,7 @@ def test_what_a_copy_learns_stays_with_it_and_a_label_counts_at_once_where_the_m
     [
         ("nope", {}, "baseline among knn, always"),
         ("training.published:Nope", {}, "module:Class that can be imported here"),
+        ("training.published:ScaledComponents", {}, "module:Class of one, got"),
         ("knn", {"n": 3}, "baseline knn has no parameter n; it has k"),
         ("knn", {"k": 0}, "k to be an integer of at least 1, got 0"),
         ("wskde", {"bandwidth": -1.0}, "bandwidth to be a number above 0, got -1.0"),

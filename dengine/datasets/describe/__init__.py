@@ -115,7 +115,7 @@ def choose_files(p: Proposal, root: Path) -> bool:
     if not names:
         raise DataError(f"Expected files of recordings, {listed(SUFFIXES)}, in {root}, got none.")
     likely = likely_suffixes(names)
-    endings = signals_in(names) if len(likely) == 1 else ()
+    endings = signal_endings(names) if len(likely) == 1 else ()
     if len(likely) + len(endings) > 1 and not stated:
         counts = Counter(map(suffix_of, names))
         choices = (
@@ -141,10 +141,12 @@ def likely_suffixes(names: Names) -> Names:
     return [suffix for suffix, n in counts.items() if n > 1 or suffix == BAG] or [*counts]
 
 
-def signals_in(names: Names) -> Names:
-    """Return the endings of names like `1_Kraft.csv`, if each part has a file with each of them.
+def signal_endings(names: Names) -> Names:
+    """Return the endings of file names, if they tell signals apart: `Kraft.csv` of `1_Kraft.csv`.
 
-    An ending is the last word, which has no number and is no verdict. Empty for any other names.
+    An ending is the last word with its suffix, and what stands before it is the part. There must be
+    two parts and two endings or more, and each part must have a file with each ending. If an ending
+    has a digit, or is a verdict like `ok`, the result is empty.
     """
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     endings = sorted({name[-1] for name in words})

@@ -109,22 +109,29 @@ def in_paths(paths: Names) -> list[str]:
     return patterns
 
 
-def is_named(source: LabelSource) -> bool:
-    """Return whether the name of a place is that of a verdict; a path must have known words."""
+def is_named_like_verdict(source: LabelSource) -> bool:
+    """Return whether the column or line of a source is named like a verdict, for example `result`.
+
+    A path counts if its pattern lists words, like `(ok|nok)`, but not if it takes any word. A
+    source without column, line and path counts.
+    """
     name = source.column or source.line
     return "([^" not in source.path and (not name or NAME.fullmatch(name) is not None)
 
 
 def may_be_labels(source: LabelSource, words: Names) -> bool:
-    """Return whether a place has few words: 2 to 12, each for two recordings in the mean.
+    """Return whether a source may hold labels, because it has few different words.
 
-    In a place that is named like a verdict 12 words are few, and so is one of known meaning.
+    There must be 2 to 12, and on average at least two recordings for each. If the source is named
+    like a verdict, 12 words are allowed for any number of recordings, and one word is enough if it
+    is known as good or bad. `words` has the word of each recording, or of each row of a listing.
     """
     words = [*words]
     n = len({*words})
     about = with_meanings(source, words)
     is_known = bool({*about.good, *about.bad} - {UNKNOWN})
-    least, most = (2 - is_known, MOST_WORDS) if is_named(source) else (2, len(words) / 2)
+    is_named = is_named_like_verdict(source)
+    least, most = (2 - is_known, MOST_WORDS) if is_named else (2, len(words) / 2)
     return least <= n <= min(most, MOST_WORDS)
 
 
@@ -246,7 +253,7 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
     for source in sources_of(p, [table.path for table in tables]):
         words = words_of(p, source, tables, parts)
         n = len(tables if source.listing or source.path else p.tables)
-        is_new = words not in counted.values() or is_named(source)
+        is_new = words not in counted.values() or is_named_like_verdict(source)
         is_likely = len(words) > n / 2 and is_new and may_be_labels(source, words.values())
         if is_likely or source == p.description.label:
             counted[with_meanings(source, words.values())] = words
@@ -276,7 +283,7 @@ def propose_label(p: Proposal) -> None:
     counted = count_sources(p)
     sides = {source: sides_of(source, words) for source, words in counted.items()}
     is_stated = any(getattr(p.description.label, kind) for kind in KINDS)
-    named = [source for source in counted if is_stated or is_named(source)]
+    named = [source for source in counted if is_stated or is_named_like_verdict(source)]
     certain = [source for source in named if sides[source]]
     doubt = _disagreement([sides[source] for source in [*certain[:1], *counted]])
     several = len({*sides[certain[0]].values()} - {0}) > 1 if certain else len(named) == 1

@@ -69,24 +69,24 @@ def runs_in(column: Column) -> int:
 
 
 def has_long_runs(column: Column) -> bool:
-    """Return whether the words of a column stand in 8 or more successive rows, in the mean.
+    """Return whether a run, one word in successive rows, has 8 rows or more on average.
 
-    It is False for a column with only one word in each table or with an empty cell.
+    False if a cell is empty, or if no table has more than one word.
     """
     is_long = column.counts.total() >= LEAST_RUN * runs_in(column)
     return not column.fixed and is_long and "" not in column.counts
 
 
 def words_in(column: Column) -> int:
-    """Return how many different words the tables have, added up."""
+    """Return the number of different words in each table, added up."""
     return sum(len({*words}) for words in column.words)
 
 
 def may_tell_parts(column: Column) -> bool:
-    """Return whether the words of a column have long runs, and each has one.
+    """Return whether a column may tell the parts of rows apart: by long runs, one for each word.
 
-    If it is named like a part, a word may have a run in each table. It is False for a column of
-    times, unless it is named like a part.
+    If the column is named like a part, a word may have one run in each table. Any other column of
+    times gives False.
     """
     if not has_long_runs(column):
         return False

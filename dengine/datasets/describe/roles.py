@@ -14,7 +14,7 @@ from ...errors import DataError, listed
 from ..description import ANY, UNKNOWN, Channel, LabelSource, PartSource, RowWords, expect_one_of
 from ..read.files import natural_key
 from ..read.recordings import kept_rows
-from ..read.split import numbered
+from ..read.split import match_numbered
 from ..table import Table
 from ..units import quantity_of, unit_in
 from .clock import NAME as CLOCK_NAME
@@ -184,17 +184,18 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
 
 def _doubt_on(p: Proposal, name: str) -> str:
-    """Return why a column may not be the channel that its name or unit promises; "" if it may.
+    """Return the first reason why a column may not be a channel; "" if there is none.
 
-    Its name is one of a set value, some of its cells are words, or the numbers of columns like `x*`
-    have unequal steps.
+    The reasons: its name is like that of a set value or a limit; texts that do not mean a lost
+    sample are in more than 1 % of its cells; in columns like `x0`, `x1`, a step between two numbers
+    differs from the first step by more than half of it.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
     if name in p.columns and (words := _strange_in(p.columns[name])):
         return f"{name} has words, {counts_of(words)}: do they mean a lost sample, text.missing?"
     origin = p.tables[0].origin.get(name, ()) if ANY in name else ()
-    columns = numbered(name, origin)
+    columns = match_numbered(name, origin)
     steps = np.diff([float(match[1]) for match in columns])
     odd = np.flatnonzero(np.abs(steps - steps[:1]) > np.abs(steps[:1]) / 2)
     return f"{name} is not numbered evenly at {columns[odd[0] + 1][0]}" if len(odd) else ""

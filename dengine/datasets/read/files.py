@@ -26,9 +26,10 @@ def natural_key(text: str) -> Key:
 
 
 def as_source(source: Any) -> Any:
-    """Return a path as a `Path`, and a DataFrame as it is.
+    """Return a path as a `Path`, and anything with `columns`, like a DataFrame, as it is.
 
-    Raises DataError for anything else, and if nothing is at the path, or it cannot be looked up.
+    Raises DataError for anything else, for a path at which there is nothing, and for one that the
+    system refuses.
     """
     if hasattr(source, "columns"):
         return source

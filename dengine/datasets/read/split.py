@@ -136,7 +136,7 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
     """Yield each row as a part, with samples from numbered columns or from lists in its cells."""
     groups = {
-        key: [match[0] for match in numbered(key, table.columns)]
+        key: [match[0] for match in match_numbered(key, table.columns)]
         for key in description.channels
         if ANY in key
     }
@@ -168,10 +168,11 @@ def _row_of(table: Table, i: int) -> Table:
         return replace(part, columns={}, damage=[error])
 
 
-def numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
-    """Return the columns that match a channel's pattern, with a number for `*`, in their order.
+def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
+    """Return a match for each column that fits `key`, sorted by the numbers in it.
 
-    `F_0.002` stands before `F_0.1`. The groups of a match are the numbers.
+    Each `*` in `key` stands for a number without a sign, and is a group of the match. `F_0.002`
+    comes before `F_0.1`. Without `*` only the column `key` fits.
     """
     matches = filter(None, map(pattern_of(key, NUMBERED).fullmatch, columns))
     return sorted(matches, key=lambda match: [*map(float, match.groups())])
