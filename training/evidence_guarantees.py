@@ -13,10 +13,12 @@ rejected by the best two thresholds of a score. This is
 - for "hindsight, final scores" that of a `conv` that was trained beforehand on all labels of the
   set. It is cross-fitted: no part is scored by a copy that saw its label.
 
-Finished replays are kept in --keep, so that an interrupted run continues. Without --screw the set
+Finished replays are kept in --keep, so that an interrupted run continues. Rows of other shuffles
+that the same commit wrote stay in the table. Without --screw the set
 `screw driving` is left out.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +105,15 @@ def shuffle_rows(data: Dataset, replays: dict[str, Replay]) -> list[dict[str, An
     return [{"cycles": len(cost), **row} for row in rows]
 
 
+def read_rows(path: Path, commit: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
+    """Return the rows of a table that this commit played of other shuffles; none without a file."""
+    if not path.exists():
+        return []
+    rows = pd.read_csv(path, dtype={"commit": str})
+    kept: list[dict[str, Any]] = rows[rows["commit"] == commit].to_dict("records")
+    return [row for row in kept if row["seed"] not in seeds]
+
+
 def main() -> None:
     """Play the shuffles, and write the table after each."""
     parser = options(__doc__, seeds="100:110", n_jobs=1, keep=Path("out/evidence"), out=Path("out"))
@@ -117,7 +128,7 @@ def main() -> None:
     ]
     path = arguments.out / "evidence" / "guarantees.csv"
     commit = last_commit()
-    rows: list[dict[str, Any]] = []
+    rows = read_rows(path, commit, arguments.seeds)
     for seed in arguments.seeds:
         for name in names:
             data = load_set(name, seed, arguments.screw)

@@ -4,13 +4,15 @@
     python training/make_evidence.py --screw screw_driving.npz
     python training/make_evidence.py --only "rules;guarantees"
     python training/make_evidence.py --publish      # copy what is finished into docs/
+    python training/make_evidence.py --continue     # play what is not published, at its commit
 
 The commit is checked out into OUT/source, so that the working tree may change meanwhile, and each
 part is a command in that folder. OUT/manifest.json has for each finished part the commit, the
 command, the machine, when it ended, its hours, and the SHA-256 of its inputs and of each file that
 goes into the documentation. A part that was interrupted continues with the next call, since its
 command keeps what is finished. A finished part is not played again. A run of another commit needs
-another OUT; without --commit it is the one of the manifest, or the last one.
+another OUT; without --commit it is the one of the manifest, or the last one. With --continue the
+published parts count as finished, so that several machines, or days, can share the work.
 
 `screw driving` is a file that `make_screw_driving.py` writes. The part "faults" needs a PostgreSQL
 server, whose address stands in DENGINE_TEST_POSTGRES (see .ci/postgres.sh).
@@ -62,7 +64,10 @@ def results(*names: str) -> dict[str, str]:
     return {f"evidence/{name}": f"docs/results/{name}" for name in names}
 
 
-REPLAYS = "training/evidence.py{screw} --keep {out}/kept --out {out} --n-jobs {jobs} --seeds"
+PLAY = "{screw} --keep {out}/kept --out {out} --n-jobs {jobs} --seeds"
+REPLAYS = f"training/evidence.py{PLAY}"
+GUARANTEES = f"training/evidence_guarantees.py{PLAY}"
+TABLE = results("guarantees.csv")
 PAGE = results("index.md", "replays.csv", "differences.csv", "curves.png", "net_seconds.png")
 PROOF = "-m tests.slow.proof --jobs {jobs} --docs {out} --out {out}/kept"
 # In the order in which they are played. Each is to end within two hours on two idle cores.
@@ -79,11 +84,9 @@ PARTS = {
         "-m tests.slow.proof.null --jobs {jobs} --docs {out} --out {out}/kept",
         {"null_proof.csv": "docs/explanation/null_proof.csv"},
     ),
-    "guarantees": Part(
-        "training/evidence_guarantees.py{screw} --keep {out}/kept --out {out} --n-jobs {jobs}",
-        results("guarantees.csv"),
-        "replays",
-    ),
+    "guarantees 1 to 3": Part(f"{GUARANTEES} 100:103", TABLE, "replays"),
+    "guarantees 4 to 6": Part(f"{GUARANTEES} 103:106", TABLE, "replays"),
+    "guarantees 7 to 10": Part(f"{GUARANTEES} 106:110", TABLE, "replays"),
     "replays 1 to 10": Part(f"{REPLAYS} 100:110", PAGE, "replays"),
     "replays 11 to 20": Part(f"{REPLAYS} 110:120", PAGE, "replays"),
     "replays 21 to 30": Part(f"{REPLAYS} 120:130", PAGE, "replays"),
@@ -225,6 +228,20 @@ class Run:
         }
         self._write()
 
+    def take_over(self, published: dict[str, Any]) -> None:
+        """Let published parts count as finished, and put their files where later parts continue.
+
+        Nothing happens if a part was begun here, which may have taken them over.
+        """
+        if self.manifest["parts"]:
+            return
+        for name in published["parts"]:
+            for file, place in PARTS[name].files.items():
+                (self.folder(name) / file).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(REPO / place, self.folder(name) / file)
+        self.manifest["parts"] = published["parts"]
+        self._write()
+
     def publish(self) -> None:
         """Copy the files of all finished parts, and the manifest, into the documentation."""
         published: dict[str, Any] = self.about | {"parts": {}}
@@ -263,13 +280,19 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=2, help="processes at a time")
     parser.add_argument("--list", action="store_true", help="print the parts; play nothing")
+    parser.add_argument(
+        "--continue", dest="goes_on", action="store_true", help="play what is not published yet"
+    )
     parser.add_argument("--publish", action="store_true", help="copy finished parts into docs/")
     arguments = parser.parse_args()
     names = [name.strip() for name in arguments.only.split(";")]
     if unknown := [name for name in names if name not in PARTS]:
         parser.error(f"expected parts of {'; '.join(PARTS)}, got {'; '.join(unknown)}")
     arguments.out.mkdir(parents=True, exist_ok=True)
-    run = Run(arguments.out, arguments.commit)
+    published = json.loads((REPO / MANIFEST).read_text("utf-8")) if arguments.goes_on else {}
+    run = Run(arguments.out, published.get("checkout", arguments.commit))
+    if published:
+        run.take_over(published)
     signal.signal(signal.SIGTERM, stop)
     if arguments.publish:
         run.publish()

@@ -233,5 +233,11 @@ def test_a_part_of_the_evidence_is_played_at_its_commit_once_and_its_files_are_i
     assert "one                  finished" in run("make_evidence", "--out", out, "--list")
     with pytest.raises(SystemExit, match="give another --out"):
         run("make_evidence", "--out", out, "--commit", "HEAD")
+    elsewhere = tmp_path / "elsewhere"
+    assert "one                  finished" in run(
+        "make_evidence", "--out", elsewhere, "--continue", "--list"
+    )
+    assert (elsewhere / "one" / "table.csv").read_text() == "x\n"
+    assert json.loads((elsewhere / "manifest.json").read_text())["checkout"] == manifest["checkout"]
     with pytest.raises(SystemExit, match="nowhere failed"):
         run("make_evidence", "--out", tmp_path / "other", "--commit", "nowhere")
