@@ -275,7 +275,8 @@ class Description:
         `columns`: a column for each part. `npz`: arrays with all parts. `mcap`: bags.
     order
         The order in which the parts were made. `name`: by file name, with the numbers in it sorted
-        by value. `time`: by the first time of each recording. Or the name of a column.
+        by value, and dates like 31.12.2025 by year. `time`: by the first time of each recording. Or
+        the name of a column.
     """
 
     version: int = VERSION

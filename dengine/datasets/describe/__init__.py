@@ -52,6 +52,7 @@ NO_RECORDING = re.compile(
 BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_ROWS = 50_000
+MOST_PIECES, LEAST_PARTS = 4, 10  # files with numbered pieces of a part's curve
 Names = Sequence[str]
 
 
@@ -152,7 +153,9 @@ def signal_endings(names: Names) -> Names:
     endings = sorted({name[-1] for name in words})
     n_parts = len({name[0] for name in words})
     has_all = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
-    is_other = re.search(rf"(?i)\d|\b({WORD})\.", " ".join(endings)) is not None
+    has_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
+    other = rf"(?i)\b({WORD})\." if has_pieces else rf"(?i)\d|\b({WORD})\."
+    is_other = re.search(other, " ".join(endings)) is not None
     return endings if has_all and not is_other else ()
 
 

@@ -39,8 +39,9 @@ EPOCHS = (
     ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
 )
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
-# Smaller steps are taken for seconds: as milliseconds they would be of a rate above 50 kHz.
-SLOWEST_STEP = 0.019
+# Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
+# and smaller ones minutes.
+SECONDS = (2e-4, 0.019)
 FEW = 0.1  # of the recordings that may have a gap, and of the steps that may fall
 ANSWERS = (  # to a clock that the reader would refuse
     "state the longest time.gap (0: any; with traces.lengths=resample if the clock jitters), or "
@@ -150,9 +151,9 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
         scale = scale_of(unit)
         if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
             return unit, f"{title}, by the size of the numbers"
-    if step <= SLOWEST_STEP:
+    if SECONDS[0] <= step <= SECONDS[1]:
         return "s", f"seconds, for steps of {step:.6g}; the unit is not stated"
-    steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns")}
+    steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns", "min")}
     rates = ", ".join(f"{unit} ({1 / s:.6g} Hz)" for unit, s in steps.items() if is_rate(s))
     return UNKNOWN, f"steps of {step:.6g}, the unit is not stated: {rates}"
 

@@ -72,7 +72,8 @@ def look(content: bytes, stated: Stated) -> Look:
         width = 1
     rows = [[*map(str.strip, split_line(line, delimiter))] for line in lines]
     data = _first_row(rows[:MOST_LINES], width)
-    header, units = _head_lines(rows[:data], width, stated)
+    is_closed = not any(row[-1] for row in rows[data:] if len(row) == width)  # by a delimiter
+    header, units = _head_lines(rows[:data], width - is_closed, stated)
     form = TextForm(encoding, delimiter, header=header, units=units, data=data + 1)
     return Look(form, width, "".join(lines[header - 1 : header]), rows[data:])
 
@@ -210,7 +211,8 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    Empty cells behind the last column are left out. Without a header, or if it has more words than
+    Empty cells behind the last column are left out; if only the samples have them, they get a name.
+    Without a header, or if it has more words than
     there are columns, the names are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names
     all of them. Such a matrix has a part in each row; if its first column has few different whole
     numbers, it is named `class`.
@@ -221,7 +223,8 @@ def _column_names(usual: Look) -> Sequence[str]:
     line = COMMENT.sub("", usual.line.lstrip())
     cells = split_line(line, usual.form.delimiter)
     if line and not any(map(str.strip, cells[width:])):
-        return header_names(cells)[:width] if len(cells) > width else []
+        names = header_names([*cells, *[""] * (width - len(cells))])[:width]
+        return names if len(cells) != width else []
     if width < MOST_NAMES:
         return [f"c{i}" for i in range(width)]
     firsts, seconds = ({row[i].strip() for row in usual.rows if len(row) > i} for i in (0, 1))

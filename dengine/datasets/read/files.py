@@ -15,12 +15,17 @@ from ..description import FOLDER_FILE, Description
 from ..table import UnreadableError
 
 GZIP = ".gz"
+DATE = re.compile(r"(?<![0-9])([0-9]{2})\.([0-9]{2})\.([0-9]{4})(?![0-9])")
 BAD = (ValueError, NotImplementedError, OSError, IndexError)  # what an unusable pattern raises
 Key = list[tuple[int, int, str]]
 
 
 def natural_key(text: str) -> Key:
-    """Return a key that sorts numbers in texts by their size: run_2 before run_10."""
+    """Return a key that sorts numbers in texts by their size: run_2 before run_10.
+
+    Dates like 31.12.2025 are sorted by year, month and day.
+    """
+    text = DATE.sub(r"\3.\2.\1", text)
     pieces = re.split(r"([0-9]+)", text)
     return [(1, int(p), "") if p.isascii() and p.isdecimal() else (0, 0, p) for p in pieces if p]
 
