@@ -17,7 +17,7 @@ import numpy as np
 from ...errors import DataError, listed
 from ..dataset import Fault
 from ..description import UNKNOWN, TextForm
-from ..read.files import caught
+from ..read.files import caught, natural_key
 from ..read.text import BLANK, COMMENT, header_names, split_line
 from ..table import pattern_of
 from ..units import is_unit
@@ -120,7 +120,8 @@ def _first_row(rows: Rows, width: int) -> int:
 
     It is the first of four successive rows that each have about as many numbers as is usual; or one
     directly above it, if it begins like the row below, but for the digits: `0.0,,` above `0.1,5,`
-    has lost a sample, but `time,force,` is no row of samples.
+    has lost a sample, but `time,force,` is no row of samples. If it has 20 numbers or more, each
+    larger than the one before, and the next row has not, these are names of columns.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
@@ -128,7 +129,14 @@ def _first_row(rows: Rows, width: int) -> int:
     forms = [NUMBER.sub("0", row[0]) if len(row) == width else "" for row in rows]
     while first and "" < forms[first - 1] == forms[first]:
         first -= 1
-    return first
+    has_names = [is_numbering(row) for row in rows[first : first + 2]]
+    return first + (has_names == [True, False])
+
+
+def is_numbering(cells: Sequence[str]) -> bool:
+    """Return whether 20 cells or more are numbers, and each number is larger than the one before."""
+    numbers = [*filter(NUMBER.fullmatch, cells)]
+    return len(numbers) >= MOST_NAMES and numbers == sorted({*numbers}, key=natural_key)
 
 
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:

@@ -77,9 +77,10 @@ def columns_of(prefix: str, value: Any) -> Columns:
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
     items = value if isinstance(value, list | np.ndarray) else [value]
+    is_object = isinstance(value, Mapping)
     with instead(UnreadableError, f"Expected items of one form in {prefix}", *DAMAGES):
-        nested = value if isinstance(value, Mapping) else _turned(items)
-    columns: Columns = {} if nested else {prefix: as_cells(items)}
+        nested = value if is_object else _turned(items)
+    columns: Columns = {} if nested or is_object else {prefix: as_cells(items)}
     for name, item in nested.items():
         columns |= columns_of(f"{prefix}.{name}" if prefix else str(name), item)
     return columns
