@@ -134,7 +134,7 @@ def _first_row(rows: Rows, width: int) -> int:
 
 
 def is_numbering(cells: Sequence[str]) -> bool:
-    """Return whether 20 cells or more are numbers, and each number is larger than the one before."""
+    """Return whether 20 cells or more are numbers, each larger than the one before."""
     numbers = [*filter(NUMBER.fullmatch, cells)]
     return len(numbers) >= MOST_NAMES and numbers == sorted({*numbers}, key=natural_key)
 
