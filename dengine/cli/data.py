@@ -2,7 +2,6 @@
 `train`, which imports one into a store and trains an engine on it.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -25,11 +24,10 @@ from .output import (
 
 if TYPE_CHECKING:
     from ..datasets import Dataset, Description
-    from ..experiments.survey import Drift, Survey
+    from ..experiments.survey import Survey
 
 MOST_FAULTS = 10  # that are shown
 MOST_EMPTY_RETRAINS = 10  # in a row, without a step: on a busy machine one alone means nothing
-SIGNIFICANT = 0.01  # p-values below it are called drift
 
 
 @verb("dengine data insertion --out out/")
@@ -135,16 +133,13 @@ def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
     from ..model.neighbours import MANY_REPEATS
     from ..records import REPEATS, REPEATS_MEANING
 
-    rows = list(field_rows(survey, "name", "faults", "drift", "not_finite_in"))
+    rows = list(field_rows(survey, "name", "faults", "not_finite_in"))
     rows += [] if survey.rate_hz else [("rate", "unknown")]
     rows += [] if survey.unit else [("unit", "unknown")]
     rows += [("first", _trace_line(dataset, 0)), ("last", _trace_line(dataset, -1))]
     yield table_of_rows(survey.name, rows)
     yield from dataset.notes
-    if dataset.ordered:
-        drifts = map(_drift_row, survey.drift)
-        yield table_of_rows("By tenths of the recorded order", drifts, ("", "means", ""))
-    else:
+    if not dataset.ordered:
         yield (
             "All parts of one label come first, so this is not the order of their recording: drift "
             "cannot be seen."
@@ -174,22 +169,6 @@ def _trace_line(dataset: "Dataset", i: int) -> str:
     source = "" if dataset.source is None else f"{dataset.source[i]}, "
     label = "good" if dataset.y[i] else "bad"
     return f"{source}{label}: {', '.join(samples[:3])}, ..., {', '.join(samples[3:])}"
-
-
-def _drift_row(drift: "Drift") -> tuple[str, str, str]:
-    """Return three cells of a table: the quantity, its means over tenths, and a verdict on drift.
-
-    The verdict says that the quantity rises or falls with the order if the p-value is below 0.01,
-    and otherwise that no drift is seen; Spearman's rho and the p-value follow. If rho is NaN, it is
-    only "never changes".
-    """
-    means = " ".join(f"{mean:.2g}" for mean in drift.tenths)
-    if math.isnan(drift.rho):
-        return drift.name, means, "never changes"
-    verdict = "no drift is seen"
-    if drift.p < SIGNIFICANT:
-        verdict = f"{'rises' if drift.rho > 0 else 'falls'} with the order"
-    return drift.name, means, f"{verdict} (Spearman's rho {drift.rho:+.2f}, p {drift.p:.2g})"
 
 
 @verb("dengine simulate --n 50 --out traces.npz --seed 0")

@@ -27,7 +27,6 @@ from ..records import Action, Floats, TraceSpec
 from ..reducers import has_own_unit
 from .costs import CostCurve, policy_name
 from .replay import Replay
-from .survey import channel_means
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -514,6 +513,6 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
     finish(top, ylim=(0, 104), ylabel="share [%]")
     for success, name, colour, _, _ in LABEL_STYLES:
         rows = finite & (y == success)
-        means = channel_means(data.cube[rows, :1])[:, 0]
+        means = data.cube[rows, 0].mean(axis=1, dtype=np.float64)
         bottom.scatter(x[rows], means, s=8, color=colour, alpha=0.5, linewidths=0, label=name)
     finish(bottom, xlabel="recording, in the order in which they were made", ylabel=f"mean {label}")

@@ -1,9 +1,7 @@
-"""A survey of a data set before anything is learned from it: counts, faults, repeats and drift.
+"""A survey of a data set before anything is learned from it: counts, faults and repeats.
 `dengine data` prints it.
 
     survey_dataset(load_dataset("cell_3/"))
-
-It counts traces, labels, faults and repeats, and looks for drift in the recorded order.
 """
 
 from dataclasses import dataclass
@@ -15,7 +13,6 @@ from numpy.typing import NDArray
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, trace_hash
 from ..model.neighbours import NEWEST, near_repeats
-from ..records import Floats, TraceArray
 from ..traces import LARGEST, as_traces
 
 
@@ -26,31 +23,6 @@ class Spread:
     low: float
     median: float
     high: float
-
-
-@dataclass(frozen=True, slots=True)
-class Drift:
-    """How one quantity changes with the recorded order.
-
-    Attributes
-    ----------
-    name : str
-        "good", or a channel whose mean is taken.
-    rho, p : float
-        Spearman's rank correlation with the position, and its p-value for this quantity alone. NaN
-        if the quantity never changes.
-    tenths : tuple of float
-        Its mean in each tenth of the stream, NaN if there is none.
-
-    References
-    ----------
-    Spearman (1904), American Journal of Psychology 15(1).
-    """
-
-    name: str
-    rho: float
-    p: float
-    tenths: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +58,6 @@ class Survey:
         trace than parts are to each other.
     parts : int or None
         Different parts; None if their numbers are not known.
-    drift : tuple of Drift
-        Of the share of good labels, and of each channel's mean. Empty if the order of the
-        recordings is not known.
     """
 
     name: str
@@ -114,15 +83,13 @@ class Survey:
     near_repeats: int
     looked_at: int
     parts: int | None
-    drift: tuple[Drift, ...]
 
 
 def survey_dataset(data: Dataset) -> Survey:
-    """Count the traces, labels, faults and repeats of a data set, and test its order for drift.
+    """Count the traces, labels, faults and repeats of a data set.
 
-    Labels are only counted, nothing is learned from them. Repeats, and the drift of the channels,
-    are looked for among the usable traces: finite, not constant and not too large. If the recorded
-    order is not known, the survey has no drift.
+    Labels are only counted, nothing is learned from them. Repeats are looked for among the usable
+    traces: finite, not constant and not too large.
 
     Returns
     -------
@@ -163,46 +130,10 @@ def survey_dataset(data: Dataset) -> Survey:
         near_repeats=near_repeats(X[usable], part_hashes[usable]),
         looked_at=min(n_usable, NEWEST),
         parts=None if data.part is None else len(set(parts)),
-        drift=_drifts(data, X, usable) if data.ordered else (),
     )
-
-
-def channel_means(X: TraceArray) -> Floats:
-    """Return each channel's mean over the trace, (n, C), of traces (n, C, T)."""
-    return np.asarray(X.mean(axis=2, dtype=np.float64))
 
 
 def _spread(values: NDArray[Any] | None) -> Spread | None:
     """Return the spread of the finite values; None if there is none."""
     finite = np.empty(0) if values is None else values[np.isfinite(values)]
     return Spread(*np.quantile(finite, (0.0, 0.5, 1.0)).tolist()) if len(finite) else None
-
-
-def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Drift, ...]:
-    """Return the drift of the labels, named "good", and then of each channel's mean.
-
-    The labels of all traces are used, but only the means of the usable traces of X (n, C, T).
-    """
-    means = channel_means(np.where(usable[:, None, None], X, 0))
-    means = np.where(usable[:, None], means, np.nan)
-    quantities = [data.y.astype(np.float64), *means.T]
-    return tuple(_drift(*pair) for pair in zip(("good", *data.spec.names), quantities, strict=True))
-
-
-def _drift(name: str, values: Floats) -> Drift:
-    """Return the drift of values (n,) in recorded order, leaving out those that are NaN.
-
-    The correlation and its p-value are NaN if there are fewer than three values, or all are equal.
-    """
-    from scipy.stats import spearmanr
-
-    position = np.arange(len(values))
-    finite = np.isfinite(values)
-    rho = p = np.nan
-    if finite.sum() > 2 and len(np.unique(values[finite])) > 1:
-        rho, p = spearmanr(position[finite], values[finite])
-    tenths = []
-    for block in np.array_split(values, 10):
-        block = block[np.isfinite(block)]
-        tenths.append(float(block.mean()) if len(block) else np.nan)
-    return Drift(name, float(rho), float(p), tuple(tenths))

@@ -115,24 +115,6 @@ def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset])
     assert survey_dataset(data).near_repeats <= 3
 
 
-def test_drift_is_seen_where_there_is_some_and_only_there(
-    make_data: Callable[..., Dataset],
-) -> None:
-    data = make_data(300, samples=60)
-    y = (np.random.default_rng(1).random(300) < np.linspace(1.0, 0.3, 300)).astype(np.int8)
-    drifting = replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)
-    still, moved = (
-        {drift.name: drift for drift in survey_dataset(item).drift} for item in (data, drifting)
-    )
-    for name, low, high in (("good", -1.0, -0.2), ("channel 0", 0.3, 1.0)):
-        assert still[name].p > 0.01
-        assert moved[name].p < 1e-4
-        assert low <= moved[name].rho <= high
-    flat = survey_dataset(replace(data, y=np.ones(300, dtype=np.int8))).drift[0]
-    assert np.isnan([flat.rho, flat.p]).all()
-    assert flat.tenths == (1.0,) * 10
-
-
 def refused(*words: object) -> str:
     """Return the error of a command that must fail."""
     result = dengine(*words)
