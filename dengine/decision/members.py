@@ -416,12 +416,12 @@ class MemberEvidence(nn.Module):
 
         The target is the lowest level (possible threshold) whose parts since the last alarm give
         enough evidence. The evidence is the log capital of a bet on the tolerance, or under the
-        priced rule what was saved minus what errors cost. Under the pooled rule few of the newest
-        50 parts of the level may be wrong as well. If no level is like this, the target is the
-        strictest level. The threshold is the score of the target if such a level was found, all
-        members (the parts that the promise is about) so far give enough evidence, and the members
-        since an alarm, if there was one, show recovery; otherwise it is `CLOSED`, which no score
-        reaches.
+        priced rule what was saved minus what errors cost. Under the pooled rule it is also required
+        that few of the newest 50 parts of the level were wrong (`max_recent_errors`). If no level
+        meets this, the target is the strictest level. The threshold is the score of the target if
+        such a level was found, all members (the parts that the promise is about) so far give enough
+        evidence, and the members since an alarm, if there was one, show recovery; otherwise it is
+        `CLOSED`, which no score reaches.
 
         The watched rule (the paper's rule with a safe mode) has no target. Only an alarm closes its
         threshold, which becomes the first level again once the members since the alarm show

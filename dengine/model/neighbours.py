@@ -131,10 +131,12 @@ class Predictor(nn.Module):
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """Predict one trace (C, T) of float32.
 
-        `part` is the hash of its part, whose references are not counted; 0 excludes none. Returns
-        the positions of action and reason in `ACTIONS` and `REASONS`, lower, upper, n_success,
-        n_failure, and the scaled embedding (K, d). A novel trace is verified without counting: its
-        bounds are 0 and 1, its counts are 0.
+        `part` is the hash of the part that the trace is of; references of this part are not
+        counted, and 0 excludes none. Returns the positions of action and reason in `ACTIONS` and
+        `REASONS`, the bounds lower and upper of the success probability, the counts n_success and
+        n_failure of the labels within the radius, and the embedding (K, d), divided by the scale of
+        each space. A novel trace is verified without counting: its bounds are 0 and 1, its counts
+        are 0.
         """
         z = self.embed(x)
         if self.novelty(x):
@@ -166,10 +168,11 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return the template of a decider: a compiled decider of the same structure (`structure_of`).
 
     If the process keeps none of this structure, `eager` is compiled, which takes tens of
-    milliseconds. The new template decides three times on a ramp of `warm_up_shape` (C, T), so that
-    later calls are fast. The process keeps it, and drops the oldest if there were `KINDS` before.
-    All deciders of a structure have the same template, so do not change it: `compiled` copies it.
-    Raises what `script` raises if TorchScript cannot compile the decider.
+    milliseconds. The new template then decides three times on a trace of shape `warm_up_shape`
+    (C, T) whose samples rise from 0 to 1, so that later calls are fast. The process keeps it, and
+    drops the oldest if there were 16 (`KINDS`) before. All deciders of a structure have the same
+    template, so do not change it: `compiled` copies it. Raises what `script` raises if TorchScript
+    cannot compile the decider.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -188,8 +191,9 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     """Return a hashable key, equal for two modules if one compiled module can serve for both.
 
     The key holds the class and the attributes of all submodules; of a tensor it holds only the
-    shape, because `compiled` sets the values. The module of the force limits is left out. The class
-    itself is in the key, not its name: a notebook cell that is run again defines another class.
+    shape, because `compiled` sets the values. The module of the force limits is left out, so that
+    their number makes no difference. The class itself is in the key, not its name: a notebook cell
+    that is run again defines another class.
     """
     parts = [
         (path, type(module), _as_key(attributes_of(module)))
@@ -200,7 +204,7 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 
 
 def _as_key(value: object) -> object:
-    """Return the part of `structure_of` for a value; None if the value makes no difference.
+    """Return a hashable key of an attribute for `structure_of`; None if it makes no difference.
 
     A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
     item is the text of a constant, the shape of a tensor, and else its own `_as_key`. A function is
@@ -249,7 +253,7 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     Parameters
     ----------
     decider : Decider
-        Compiled or not. It decides on each trace as on a new part.
+        Compiled or not. It decides on each trace as on a trace of an unknown part.
     X : array of float32, shape (n, C, T)
     points : array of float32, shape (n, K, d)
         The scaled embeddings that the reducer gives.
@@ -257,8 +261,8 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     Yields
     ------
     str
-        What is wrong; "" if the two agree within `SAME_POINTS`, and for a trace in which the
-        decider finds a fault.
+        For each trace a sentence on what is wrong; "" if the two agree within 0.001
+        (`SAME_POINTS`), and for a trace in which the decider finds a fault.
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
@@ -400,11 +404,11 @@ class ModelPrediction(EngineModel):
         return replace(report, note="; ".join(filter(None, (report.note, self._note))))
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
-        """Train the reducer from scratch, and replace the references by the traces.
+        """Train the reducer from scratch, and make the traces the references in place of the old.
 
         If there are more traces than the classifier's capacity, only the last become references.
-        The scales and the novelty gate are computed anew as well, the rule stays as it is. If the
-        training raises, the reducer is left untrained: call `fit` again.
+        The scales of the embedding spaces and the novelty gate are computed anew as well, the rule
+        stays as it is. If the training raises, the reducer is left untrained: call `fit` again.
 
         Parameters
         ----------
@@ -447,12 +451,13 @@ class ModelPrediction(EngineModel):
 
         A reducer that can go on from its last training does so. If there are more traces than the
         classifier's capacity, only the last become references. `index`, `scale`, `gate` (the
-        novelty gate), `examples` and `trace_shape` are replaced, the decider is dropped, and the
-        rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds;
-        `numbers` (n,), of the labels, are kept with the references; `stop` may end the reducer's
-        training early. Extreme samples are clipped first. Raises SettingError if the reducer cannot
-        be trained on these traces, and if 20 traces or more are all of one part. If the reducer
-        raises, it may be changed already; all else is not.
+        novelty gate), `examples` (8 of the traces) and `trace_shape` are replaced, the decider is
+        dropped and built anew when it is used, and the decision rule stays as it is. y (n,) are
+        labels, 1 or 0; `hashes` (n,), of the parts, give the folds; `numbers` (n,), of the labels,
+        are kept with the references; `stop` may end the reducer's training early. Extreme samples
+        are clipped first. Raises SettingError if the reducer cannot be trained on these traces, and
+        if 20 traces or more are all of one part. If the reducer raises, it may be changed already;
+        all else is not.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -502,10 +507,10 @@ class ModelPrediction(EngineModel):
             computing.result()
 
     def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
-        """Compile a decider for traces of this shape (C, T), with empty references.
+        """Compile a decider for traces of this shape (C, T), without references.
 
-        The process keeps it as a template, from which `compiled` copies later deciders. Nothing in
-        the model changes.
+        `encoder` is the module of the untrained reducer. The process keeps the compiled decider as
+        a template, from which `compiled` copies later deciders. Nothing in the model changes.
         """
         channels, samples = trace_shape
         gate = NoveltyGate(channels, samples)
@@ -518,7 +523,7 @@ class ModelPrediction(EngineModel):
         template_of(decider.eval(), trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Share the rule object of the previous model, and build the decider.
+        """Take over the rule object of the previous model, and build the decider.
 
         If the rule of either model is stale, because an update of it failed, this model is stale
         afterwards. The decider is built for the `DecisionConditions` under which the previous model
@@ -538,7 +543,7 @@ class ModelPrediction(EngineModel):
             self._conditions = conditions
 
     def build_decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Build a decider that shares the references and the rule of this model.
+        """Build a decider, which shares the references and the rule of this model.
 
         It is returned, not kept; `decider` keeps one.
 
@@ -617,9 +622,9 @@ class ModelPrediction(EngineModel):
 
         The hash of its part, `hash_`, gives the fold. The reference is `point` if given, otherwise
         the row of `embedding` for that space; without both it is computed from the trace. A full
-        index drops its oldest reference. `number` is the label's sequence number. Returns the
-        reference point, float32 (d,), scaled. Raises ValueError if it must be computed and nothing
-        was fitted.
+        index drops its oldest reference. `y` is 1 for success, 0 for failure; `number` is the
+        sequence number of this label. Returns the reference point, float32 (d,), divided by the
+        scale of the space. Raises ValueError if it must be computed and nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
@@ -682,7 +687,7 @@ class ModelPrediction(EngineModel):
         return self.rule.learns()
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model under another policy that shares the references and the reducer.
+        """Return a model under another policy; it shares the references and the reducer.
 
         Its rule is new, has learned nothing and is not stale; its decider is not built yet. This
         model does not change, except that a reference that is added to either is in both. Raises
@@ -803,8 +808,9 @@ class ModelPrediction(EngineModel):
 
         The references must be finite, and so must the points to which the reducer maps `examples`,
         some training traces. A reducer that is restored from the state of this one must map
-        `examples` to the same points, each of two times; if a reducer gives no state, it must do
-        so itself. The scaled points are kept for `check_answers`.
+        `examples` to the same points, each of two times; if a reducer gives no state, it must do so
+        itself. The points, divided by the scale of their space, are kept for `check_answers`. If
+        restoring raises a StoreError, that is a defect; other errors are raised.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -852,13 +858,13 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale, rule and novelty gate are restored, and the reducer if the state holds
-        it. If it does not (`needs_refit`), train this model on the same traces before this call.
-        The decider is dropped. If the rule was stale, the state does not hold it, and this model's
-        rule stays as it is; `rule_is_stale` always stays as it is. Raises StoreError if the state
-        holds no reducer although this fitted reducer gives a state, and for a rule or gate of other
-        sizes. For the state of another reducer it raises StoreError, KeyError, ValueError or
-        NotImplementedError. After an error do not use the model.
+        References, scale, rule (in place) and novelty gate are restored, and the reducer if the
+        state holds it. If it does not (`needs_refit`), train this model on the same traces before
+        this call. The decider is dropped. If the rule was stale, the state does not hold it, and
+        this model's rule stays as it is; `rule_is_stale` always stays as it is. Raises StoreError
+        if the state holds no reducer although this fitted reducer gives a state, and for a rule or
+        gate of other sizes. For the state of another reducer it raises StoreError, KeyError,
+        ValueError or NotImplementedError. After an error do not use the model.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
@@ -886,19 +892,20 @@ class ModelPrediction(EngineModel):
 
 
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
-    """Count those of the newest `NEWEST` traces that nearly repeat one of another part among them.
+    """Count those of the newest 500 traces that nearly repeat one of another part among them.
 
     Labels are counted as independent trials, so the number of a part that is inserted again must be
     given (`part=`). This function notices plain cases in which it was not; no decision depends on
     it. A trace is compared with the traces of other parts only. It nearly repeats one if the
-    nearest of them is nearer than `NEAR` times the distance to the next after the `NEIGHBOURS`
-    nearest. So a trace with more than `NEIGHBOURS` near repeats does not count, and a trace that
-    has only 1 to `NEIGHBOURS` traces of other parts to compare with counts.
+    nearest of them is nearer than 0.12 times the distance to the eleventh nearest
+    (`NEAR`, `NEIGHBOURS`). So a trace with more than 10 near repeats does not count, and a trace
+    that has only 1 to 10 traces of other parts to compare with counts.
 
     Parameters
     ----------
     traces : array of float32, shape (n, channels, samples)
-        Oldest first; only the newest `NEWEST` are read, and they are compared with each other.
+        Oldest first; only the newest 500 (`NEWEST`) are read, and they are compared with each
+        other.
     parts : array of int64, shape (n,)
         Hash of each trace's part.
 
@@ -930,7 +937,8 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     """Return a note for the report of a retrain if `near_repeats` counts many traces, else "".
 
-    It takes the arguments of `near_repeats`. More than `MANY_REPEATS` traces are many.
+    It takes the arguments of `near_repeats`: traces (n, C, T), and the hash of the part of each.
+    More than 25 traces (`MANY_REPEATS`) are many.
     """
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:

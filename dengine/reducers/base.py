@@ -406,13 +406,15 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
 
     Space k has the points of fold k. Outliers are left out, since a single one would draw all other
     points together. Outliers are the points more than 50 times as far from the median as the median
-    distance. If these are several, and more than 5 % of the fold's points, none is left out.
+    distance; distances are measured along the axis on which they are largest. If these are several,
+    and more than 5 % of the fold's points, none is left out.
 
     Parameters
     ----------
     points : array of float32, shape (n, d)
         Row i lies in space ``folds[i]``.
     folds : array of int64, shape (n,)
+        Fold of each point, which is also its space.
     n_spaces : int
         K.
 

@@ -73,7 +73,7 @@ class RidgeProblem:
 
         Head k, the logistic regression of fold k, is trained on the rows that mask k selects. A
         column of ones is appended to the features. `l2` is the ridge of every weight but the bias,
-        whose ridge is `BIAS_RIDGE`.
+        whose ridge is 0.001 (`BIAS_RIDGE`).
         """
         g32 = torch.cat([g, torch.ones(len(g), 1)], 1)
         ridge = torch.full((len(outside), g32.size(1)), l2, dtype=torch.float64)

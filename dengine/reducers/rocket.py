@@ -117,7 +117,7 @@ class FeatureEmbedding(nn.Module):
         return self.embed_features(self.encoder(x))
 
     def embed_features(self, f: Tensor) -> Tensor:
-        """Scaled features (B, P) -> embedding (B, K, d), a point in each of the K spaces.
+        """Scaled features f (B, P) -> embedding (B, K, d), a point in each of the K spaces.
 
         Head k, the classifier that is trained without the labels of fold k, gives the first
         coordinate in space k: the probability of success, from 0 to 1. If d is 2, the second
@@ -180,7 +180,7 @@ class Tower(NamedTuple):
         -------
         Tower
             Its components are sorted by variance, the largest first. The axes of components that
-            are no more than noise are 0.
+            are no more than noise, with less than a millionth of the largest variance, are 0.
         """
         centred = f - f.mean(0)
         # In float32, in half the time: components are told from noise to 1e-6.
@@ -449,9 +449,9 @@ class RocketReducer(Reducer):
     def build(self, channels: int, samples: int, average: int) -> None:
         """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
-        Towers, counters and the cache of features become empty. `average` is the number of samples
-        that are averaged to one. Raises SettingError for a parameter out of its range or fewer than
-        2 samples.
+        `towers_` and the cache of features become empty, the counters 0. `average` is the number of
+        samples that are averaged to one. Raises SettingError for a parameter out of its range or
+        fewer than 2 samples.
         """
         self.check()
         self.trace_shape_ = (channels, samples)
@@ -489,8 +489,10 @@ class RocketReducer(Reducer):
         features `raw` (n, P); if there are more than 4000 rows, on 4000 of them (`sample_rows`).
         `stop` may end the Newton steps; at the first fit its deadline does so after three steps at
         the earliest. The principal components are computed anew at the first fit, after every 20
-        fits, and if there are at least 1.5 times as many rows as when they were computed last. It
-        sets `towers_`, `n_iter_`, `holdout_losses_`, `n_fits_` and `note_`.
+        fits, and if there are at least 1.5 times as many rows as when they were computed last.
+        `labels` (n,) are 1 or 0, `folds` (n,) the folds, `numbers` (n,) the numbers of the labels.
+        It sets `towers_`, `n_iter_` (steps of this fit), `holdout_losses_` (leave-one-out loss of
+        each space), `n_fits_` and `note_` (heads that do not help, "" if there are none).
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -559,7 +561,7 @@ class RocketReducer(Reducer):
         return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compute_components(self, raw: Tensor) -> None:
-        """Compute feature scales and principal components anew from raw features (n, P).
+        """Compute feature scales and principal components anew from unscaled features (n, P).
 
         At most 1000 rows, evenly spaced, are read; `n_component_traces_` becomes n.
 
@@ -611,7 +613,7 @@ class RocketReducer(Reducer):
 
         `axis` (p,) is the axis of the component on the features `f` (n, p) of the first `Tower`.
         Before the sigmoid the component is scaled to mean 0 and standard deviation 2 over `f`. Its
-        sign is changed if it would point against the last second coordinate.
+        sign is changed if it would point against the second coordinate that `net_` had before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
@@ -621,11 +623,12 @@ class RocketReducer(Reducer):
         net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
-        """Return the raw features (n, P) of traces (n, C, T), from the cache as far as it has them.
+        """Return the unscaled features (n, P) of traces (n, C, T), from the cache if it has them.
 
-        `numbers` (n,), increasing, identify the traces. Afterwards the cache holds the features of
-        these traces and no others; the tensor that is returned shares its memory. Without numbers
-        the cache is neither read nor written.
+        They are float32, computed from the outputs of the kernels. `numbers` (n,), increasing,
+        identify the traces. Afterwards the cache holds the features of these traces and no others;
+        the tensor that is returned shares its memory. Without numbers the cache is neither read nor
+        written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -711,8 +714,8 @@ class RocketReducer(Reducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
-        Raises StoreError if the sizes do not follow from the parameters; the fitted model is lost
-        then.
+        Raises StoreError if the sizes do not follow from the parameters, SettingError for a
+        parameter out of its range; the fitted model is lost after a StoreError.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])

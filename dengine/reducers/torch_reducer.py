@@ -286,10 +286,11 @@ class TorchReducer(Reducer):
     def _initialize(self, traces: Floats) -> None:
         """Build preprocessor, networks and `encoder_` anew for traces (n, C, T).
 
-        Earlier trainings are discarded; no label is read. The scales of the channels are read from
-        the traces, the weights from the checkpoint, if one is given. Raises SettingError for a
-        parameter out of its range, fewer than 2 samples, a network that does not give
-        (B, features), or a checkpoint that cannot be used.
+        Earlier trainings are discarded; no label is read. The preprocessor averages and scales the
+        samples; its scales are computed from the traces. The weights are read from the checkpoint,
+        if one is given, and otherwise drawn. Raises SettingError for a parameter out of its range,
+        fewer than 2 samples, a network that does not give (B, features), or a checkpoint that
+        cannot be used.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -415,8 +416,9 @@ class TorchReducer(Reducer):
     def make_optimizer(self) -> torch.optim.Optimizer:
         """Return a new AdamW for `members_`, with the moments that the last training left.
 
-        The moments are not copied: a step of the optimiser changes `optimizer_state_`. Weight decay
-        is for weights only, not for biases and the parameters of batch normalisation.
+        The moments are the running means of gradients and of their squares. They are not copied: a
+        step of the optimiser changes `optimizer_state_`. Weight decay is for weights only, not for
+        biases and the parameters of batch normalisation.
         """
         decayed: list[nn.Parameter] = []
         others: list[nn.Parameter] = []
@@ -437,8 +439,8 @@ class TorchReducer(Reducer):
         """Move the parameters of `averaged_members_`, in place, towards those of `members_`.
 
         An averaged parameter becomes `weight_averaging` times itself plus the rest of the trained
-        one; in the first steps the factor is smaller. Statistics of batch normalisation are not
-        averaged.
+        one; in the first steps the factor is smaller, (1 + n) / (10 + n) after n steps. Statistics
+        of batch normalisation are not averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
         averages = self.averaged_members_.parameters()
@@ -608,9 +610,10 @@ class TorchReducer(Reducer):
         return self
 
     def _modules(self) -> dict[str, nn.Module]:
-        """Return the modules whose tensors are in the state.
+        """Return the modules whose tensors `get_state` returns.
 
-        The keys are the prefixes that the names of these tensors have in the state.
+        They are the preprocessor, the trained copies of the network and their averages. The keys
+        are the prefixes of the names of these tensors in the state.
         """
         return {
             "preprocessor.": self.preprocessor_,

@@ -127,8 +127,8 @@ class UmapEncoder(nn.Module):
         """Embed traces, each a vector of F frames, among the references: (B, F) -> (B, dim).
 
         A trace starts at the mean of its nearest references' points, weighted by their membership
-        strengths. It is then moved five times to the mean of the same points, weighted by the
-        coefficients of attraction at its current distances.
+        strengths. It is then moved five times to the mean of the same points, weighted by how
+        strongly UMAP attracts it to each of them at its current distances.
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
@@ -295,8 +295,9 @@ class UmapReducer(Reducer):
         """Search the neighbours of traces X (n, C, T), and keep them for the next training.
 
         `train` finds them again by `numbers`, the numbers of the traces' labels; without numbers
-        nothing is done. Before the first training it also sets the shape, draws the seed and fits
-        the frames. Raises SettingError for a parameter out of its range, or too few traces.
+        nothing is done. Before the first training it also sets the shape, draws the seed and sets
+        up the frames, the sums of samples between which distances are measured. Raises SettingError
+        for a parameter out of its range, or too few traces.
         """
         if numbers is None:
             return
@@ -323,11 +324,11 @@ class UmapReducer(Reducer):
         return bool(np.isin(numbers, neighbors.numbers).any())
 
     def _initialize(self, traces: Floats) -> None:
-        """Discard all trainings, draw the seed, and set up the frames for traces (n, C, T).
+        """Discard all trainings, draw the seed, and set up the frames of traces (n, C, T).
 
-        `random_state` gives the seed. The number of frames and their centre and scale come from at
-        most 256 of the traces, evenly spaced. An earlier `encoder_` stays until the next training
-        replaces it.
+        `random_state` gives the seed. A frame is the sum of a short stretch of samples. The number
+        of frames of a trace and their centre and scale come from at most 256 of the traces, evenly
+        spaced. An earlier `encoder_` stays until the next training replaces it.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
@@ -377,9 +378,10 @@ class UmapReducer(Reducer):
     ) -> Tensor:
         """Return the points (n, n_components), float32, at which a layout starts.
 
-        If at least half of the traces were in the last training, they start at their last points,
-        and a new trace starts where the encoder puts it, plus a little noise. Otherwise all start
-        at the points of `spectral_start`, and `n_epochs_` becomes 0.
+        `neighbors` and `graph` are those of the n traces; `rng` draws the noise. If at least half
+        of the traces were in the last training, they start at their last points, and a new trace
+        starts where the last `encoder_` puts it, plus a little noise. Otherwise all start at the
+        points of `spectral_start`, and `n_epochs_` becomes 0.
         """
         last_rows = self.neighbors_.rows_of(neighbors.numbers)
         is_old = last_rows >= 0
@@ -395,9 +397,10 @@ class UmapReducer(Reducer):
         return points
 
     def _set_references(self, neighbors: Neighbors, points: Tensor) -> None:
-        """Make these traces and their points (n, n_components) the references of a new encoder.
+        """Make traces and their points (n, n_components) the references of a new encoder.
 
-        It replaces `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
+        `neighbors` holds the frames of the traces and their nearest neighbours. It replaces
+        `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
         """
         self.neighbors_ = neighbors
         self.precomputed_neighbors_ = None

@@ -110,7 +110,7 @@ class Neighbors:
     def empty(cls, n_features: int, k: int) -> Self:
         """Return an object without traces, whose `update` finds k neighbours of each trace.
 
-        `n_features` is F, the number of frames of a trace.
+        `n_features` is F, the number of frames (sums of short stretches of samples) of a trace.
         """
         return cls(
             numbers=np.zeros(0, dtype=np.int64),
