@@ -145,7 +145,7 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     Returns
     -------
     step : int
-        At least 1.
+        What a wrong decision adds to the sum; at least 1.
     limit : int
         The smallest limit, 1 or more, with which `parts` or more pass on average.
 
@@ -432,7 +432,7 @@ def certify(
     Returns
     -------
     Certificate
-        Without prices.
+        Without prices; its tolerance is rounded to 12 decimals.
 
     Raises
     ------

@@ -58,8 +58,9 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
         """Make these embeddings the references (labelled points), in place of all earlier ones.
 
-        It sets `classes_`, the sorted classes, of which the last is the success. A lone class 0,
-        False or -1 counts as failure, any other lone class as success.
+        It sets `classes_`, the sorted classes, of which the last is the success, `index_`, which
+        holds the references, and `neighbours_`, which decides by them. A lone class 0, False or -1
+        counts as failure, any other lone class as success.
 
         Parameters
         ----------
@@ -125,6 +126,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Parameters
         ----------
         Z : array, shape (n, d)
+            Points; ValueError if scikit-learn refuses them.
 
         Returns
         -------

@@ -285,7 +285,7 @@ class MemberEvidence(nn.Module):
         predicted: int,
         inclusion_probability: float,
     ) -> None:
-        """Count a part's outcome, choose both thresholds, and end a safe mode if it is due.
+        """Count the outcome of a part, choose thresholds anew, and end a safe mode if it is due.
 
         In a safe mode all parts are verified. The outcome is counted on both sides, for accepting
         and for rejecting. `lower` and `upper` are the bound on the success probability that the
@@ -333,10 +333,11 @@ class MemberEvidence(nn.Module):
 
         If the rule knows all outcomes, the part counts as checked; otherwise
         `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. Each
-        level (possible threshold) that the score reaches counts the part. The part is a member (one
-        of the parts that the claim is about) if its score reaches the target level, or if
-        `predicted`, the `ActionCode` of what the model alone would have done, is the action of this
-        side. No threshold is chosen if the part is counted nowhere.
+        level (possible threshold) that the score reaches counts the part, and keeps whether it was
+        wrong among its newest 50. The part is a member (one of the parts that the claim is about)
+        if its score reaches the target level, or if `predicted`, the `ActionCode` of what the model
+        alone would have done, is the action of this side. No threshold is chosen if the part is
+        counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -463,9 +464,9 @@ class MemberEvidence(nn.Module):
 
         `side` is 0 for accepting, 1 for rejecting; members are the parts that the promise is about.
         The number supposes that their outcomes go on as they were since the alarm. It is 0 or less
-        if they show recovery now, so that the side may open again. It is huge, up to about 1e12 and
-        more, while their evidence does not grow. Under the priced rule at least 25 members since
-        the alarm (`FEWEST_SINCE_ALARM`) are needed. Nothing is changed.
+        if they show recovery now, so that the side may open again. It is huge, about 1e12 or more,
+        while their evidence does not grow. Under the priced rule at least 25 members since the
+        alarm (`FEWEST_SINCE_ALARM`) are needed. Nothing is changed.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

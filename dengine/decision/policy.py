@@ -288,7 +288,8 @@ class Policy:
     def certificate(self, outcomes: Outcomes) -> Certificate:
         """Return the bounds on how often parts decided without a check were decided wrongly.
 
-        With `stops="all"`, accepted parts of unknown outcome are left out.
+        With `stops="all"`, accepted parts of unknown outcome are left out. Raises the errors of
+        `certify`.
 
         Parameters
         ----------

@@ -211,7 +211,8 @@ class RadiusIndex(nn.Module):
     def put(self, point: Tensor, label: float, space: int, part: int = 0) -> None:
         """Add one point; in a full index it replaces the oldest.
 
-        The sequence number of its label, in `numbers`, is not set; `add_one` sets it.
+        The sequence number of its label, in `numbers`, is not set; `add_one` sets it. All other
+        attributes of the index are updated, except `agreement`.
 
         Parameters
         ----------

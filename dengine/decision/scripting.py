@@ -60,7 +60,11 @@ def reason_of(error: Exception) -> str:
 
 
 def attributes_of(module: nn.Module) -> dict[str, Any]:
-    """Return parameters, buffers and plain attributes of one module, without its submodules."""
+    """Return parameters, buffers and plain attributes of one module by name, without submodules.
+
+    Plain attributes are those of the object itself, `training` among them, except the ones in which
+    torch keeps parameters, submodules and hooks.
+    """
     plain = dict(vars(module))
     for name in INTERNAL & plain.keys():
         del plain[name]

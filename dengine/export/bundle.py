@@ -212,10 +212,11 @@ def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
     `source` is what the file is made from. The dict has the schema (the version of its keys), the
-    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy, the references
-    (labelled points: their number and SHA-256), the order of the fields of a decision, of actions,
-    reasons and safe modes, the audit rate, the seed and the recipe. `metadata_of` reads it without
-    loading the model.
+    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy, the limit of
+    novelty, the numbers of embedding spaces and of coordinates, the references (labelled points:
+    their number, their largest number and their SHA-256), the order of the fields of a decision, of
+    actions, reasons and safe modes, the audit rate, the seed and the recipe. `metadata_of` reads it
+    without loading the model.
     """
     model = source.model
     index = model.index
@@ -320,8 +321,9 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     Raises
     ------
     ExportError
-        If the file or its checksum is missing or unreadable, or with a key the signature or the
-        key, the content does not have the sum in PATH.sha256, or it was not signed with this key.
+        If the file or its checksum is missing or unreadable, or the content does not have the sum
+        in PATH.sha256. With a key also if the key or the signature is missing or unreadable, or the
+        content was not signed with this key.
     """
     _read(path, most=0)  # if both are missing, the error names the file itself
     expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))

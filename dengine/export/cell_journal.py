@@ -197,13 +197,14 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
 
 
 def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
-    """Return the decision, trace and label of a part; `words` are the rest of its line.
+    """Return the decision, trace and label of a part from the words of its line in a journal.
 
-    The words are id, label ("1", "0" or "" for none), number of the part, action, predicted action,
-    reason, lower, upper, n_success, n_failure, and the samples, channel after channel. The trace of
-    a rejected part is empty, (1, 0); other traces are fitted as `spec.fit` says. The embedding, the
-    model version and the propensity (the probability of a check) are not in the line; they become
-    None, 0 and 1. Raises ValueError, LookupError or TraceError for words that are no such line.
+    The first word, "part", and the checksum are left out; `words` are id, label ("1", "0" or "" for
+    none), number of the part, action, predicted action, reason, lower, upper, n_success, n_failure,
+    and the samples, channel after channel. The trace of a rejected part is empty, (1, 0); other
+    traces are fitted as `spec.fit` says. The embedding, the model version and the propensity (the
+    probability of a check) are not in the line; they become None, 0 and 1. Raises ValueError,
+    LookupError or TraceError for words that are no such line.
     """
     id_, label, part, action, predicted, reason, *numbers = words
     lower, upper, n_success, n_failure, *samples = numbers

@@ -95,9 +95,11 @@ def export_onnx(
         rule other than that of the guarantee "local" with stops "some", or if a part is among the
         references more than once; the message names all of these that apply. Also if nothing was
         trained yet; for a baseline; if the reducer, the interval or the rule cannot be exported; if
-        the rule is stale, because an update of it failed; if the store was changed from outside; if
-        the key cannot be read; if a package is missing; and if onnxruntime does not decide like the
-        model.
+        the compiled decision and the reducer map a trace to different points; if the rule is stale,
+        because an update of it failed; if the store was changed from outside; if the key cannot be
+        read; if a package is missing; and if onnxruntime does not decide like the model.
+    SettingError
+        If the engine's force limits do not fit `trace`.
     OutputError
         If a file exists, without `force`, or cannot be written.
     """
@@ -194,9 +196,10 @@ class OnnxModel:
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
 
-        Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace,
-        or a novel one, which is unlike all traces of the training, is verified, and its reason says
-        so. Raises TraceError for a wrong shape.
+        Returns action, reason, lower, upper, n_success, n_failure and embedding. Another T is cut,
+        padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace, or a novel one,
+        which is unlike all traces of the training, is verified, and its reason says so. Raises
+        TraceError for a wrong shape.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, *counted, z = outputs
@@ -300,7 +303,7 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 
     torch.export makes it, without TorchScript. Meanwhile Python's warnings, and log messages up to
     level WARNING, are off in the whole process, because torch reports optional packages that are
-    missing. Raises ExportError if torch makes no program.
+    missing. Raises ExportError if torch makes no program; errors of torch are raised as they are.
     """
     example = (torch.from_numpy(golden_trace(spec)),)
     options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}

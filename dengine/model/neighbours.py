@@ -167,12 +167,12 @@ _COMPILED: dict[Any, Any] = {}
 def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return the template of a decider: a compiled decider of the same structure (`structure_of`).
 
-    If the process keeps none of this structure, `eager` is compiled, which takes tens of
-    milliseconds. The new template then decides three times on a trace of shape `warm_up_shape`
-    (C, T) whose samples rise from 0 to 1, so that later calls are fast. The process keeps it, and
-    drops the oldest if there were 16 (`KINDS`) before. All deciders of a structure have the same
-    template, so do not change it: `compiled` copies it. Raises what `script` raises if TorchScript
-    cannot compile the decider.
+    If the process keeps none of this structure, `eager`, a decider in Python, is compiled, which
+    takes tens of milliseconds. The new template then decides three times on a trace of shape
+    `warm_up_shape` (C, T) whose samples rise from 0 to 1, so that later calls are fast. The process
+    keeps it, and drops the oldest if there were 16 (`KINDS`) before. All deciders of a structure
+    have the same template, so do not change it: `compiled` copies it. Raises what `script` raises
+    if TorchScript cannot compile the decider.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -451,13 +451,13 @@ class ModelPrediction(EngineModel):
 
         A reducer that can go on from its last training does so. If there are more traces than the
         classifier's capacity, only the last become references. `index`, `scale`, `gate` (the
-        novelty gate), `examples` (8 of the traces) and `trace_shape` are replaced, the decider is
-        dropped and built anew when it is used, and the decision rule stays as it is. y (n,) are
-        labels, 1 or 0; `hashes` (n,), of the parts, give the folds; `numbers` (n,), of the labels,
-        are kept with the references; `stop` may end the reducer's training early. Extreme samples
-        are clipped first. Raises SettingError if the reducer cannot be trained on these traces, and
-        if 20 traces or more are all of one part. If the reducer raises, it may be changed already;
-        all else is not.
+        novelty gate, disabled if `novelty` is 0), `examples` (up to 8 of the traces), the note on
+        repeated parts and `trace_shape` are replaced, the decider is dropped and built anew when it
+        is used, and the decision rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of
+        the parts, give the folds; `numbers` (n,), of the labels, are kept with the references;
+        `stop` may end the reducer's training early. Extreme samples are clipped first. Raises
+        SettingError if the reducer cannot be trained on these traces, and if 20 traces or more are
+        all of one part. If the reducer raises, it may be changed already; all else is not.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -583,7 +583,10 @@ class ModelPrediction(EngineModel):
 
     @property
     def trace_spec(self) -> TraceSpec:
-        """`TraceSpec` with the shape of the training traces; ValueError if nothing was fitted."""
+        """`TraceSpec` with the shape of the training traces, all else as by default.
+
+        Raises ValueError if nothing was fitted.
+        """
         if "index" not in vars(self):
             raise ValueError("Expected a fitted model; call fit(X, y) first.")
         channels, samples = self.trace_shape
@@ -708,9 +711,10 @@ class ModelPrediction(EngineModel):
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """Predict one trace (channels, samples) without fault checks, force limits and audits.
 
-        References of the part with this hash are not counted; 0 excludes none. The trace's shape is
-        not checked. Raises RuntimeError if the rule is stale, because an update of it failed, and
-        ValueError if nothing was fitted.
+        Returns action, bounds of the success probability, label counts, embedding (K, d) and
+        reason, as a `Prediction`. References of the part with this hash are not counted; 0 excludes
+        none. The trace's shape is not checked. Raises RuntimeError if the rule is stale, because an
+        update of it failed, and ValueError if nothing was fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -794,8 +798,9 @@ class ModelPrediction(EngineModel):
     def successor(self) -> "ModelPrediction":
         """Return a model to train next, with a copy of this one's reducer to start from.
 
-        The successor shares rule, references, scale and novelty gate with this model. Training
-        replaces the last three in the successor only, so this model goes on deciding.
+        The successor has no decider yet. It shares rule, references, scale and novelty gate with
+        this model. Training replaces the last three in the successor only, so this model goes on
+        deciding.
         """
         model = copy.copy(self)
         model.spaces = copy.deepcopy(self.spaces)
@@ -896,10 +901,11 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 
     Labels are counted as independent trials, so the number of a part that is inserted again must be
     given (`part=`). This function notices plain cases in which it was not; no decision depends on
-    it. A trace is compared with the traces of other parts only. It nearly repeats one if the
-    nearest of them is nearer than 0.12 times the distance to the eleventh nearest
-    (`NEAR`, `NEIGHBOURS`). So a trace with more than 10 near repeats does not count, and a trace
-    that has only 1 to 10 traces of other parts to compare with counts.
+    it. A trace is compared with the traces of other parts only, by the distance between the means
+    of about 50 stretches of samples. It nearly repeats one if the nearest of them is nearer than
+    0.12 times the distance to the eleventh nearest (`NEAR`, `NEIGHBOURS`). So a trace with more
+    than 10 near repeats does not count, and a trace that has only 1 to 10 traces of other parts to
+    compare with counts.
 
     Parameters
     ----------

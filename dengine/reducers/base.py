@@ -660,7 +660,8 @@ class CrossFitted(_Wrapping):
             If K is below 2, the labels are missing or not of two classes, or the traces outside a
             fold have a single class.
         TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite. Errors of the clones are
+            raised as they are.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

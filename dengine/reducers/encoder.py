@@ -205,7 +205,7 @@ def count_features(networks: nn.Module, count: int, channels: int, samples: int)
     copies. The trial is in evaluation mode, so that no statistics change; afterwards the networks
     are in training mode. Raises ValueError unless the output, which must be a tensor, holds floats
     and has three dimensions, three rows and at least one feature. What the networks' `forward`
-    raises passes, and they stay in evaluation mode then.
+    raises is raised as it is; they stay in evaluation mode then.
     """
     networks.eval()
     with torch.no_grad():

@@ -401,9 +401,9 @@ class RocketReducer(Reducer):
 
         It is `net_`, which later trainings change in place; before the first training its
         classifier heads are 0. If no kernels are drawn yet, they are drawn here from the traces X
-        (n, C, T). If these are fewer than `MIN_TRACES`, the kernels are drawn in a clone, whose
-        module is returned, and this reducer stays as it is. Raises SettingError for a parameter out
-        of its range or fewer than 2 samples.
+        (n, C, T). If these are fewer than 20 (`MIN_TRACES`), the kernels are drawn in a clone,
+        whose module is returned, and this reducer stays as it is. Raises SettingError for a
+        parameter out of its range or fewer than 2 samples.
         """
         is_initialized = "net_" in vars(self)
         reducer: Self = self if len(X) >= MIN_TRACES or is_initialized else clone(self)
@@ -492,7 +492,8 @@ class RocketReducer(Reducer):
         fits, and if there are at least 1.5 times as many rows as when they were computed last.
         `labels` (n,) are 1 or 0, `folds` (n,) the folds, `numbers` (n,) the numbers of the labels.
         It sets `towers_`, `n_iter_` (steps of this fit), `holdout_losses_` (leave-one-out loss of
-        each space), `n_fits_` and `note_` (heads that do not help, "" if there are none).
+        each space), `n_fits_` and `note_` (the heads that are no better than their base rate in
+        every tower; "" if there are none).
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -623,12 +624,12 @@ class RocketReducer(Reducer):
         net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
-        """Return the unscaled features (n, P) of traces (n, C, T), from the cache if it has them.
+        """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
 
         They are float32, computed from the outputs of the kernels. `numbers` (n,), increasing,
-        identify the traces. Afterwards the cache holds the features of these traces and no others;
-        the tensor that is returned shares its memory. Without numbers the cache is neither read nor
-        written.
+        identify the traces: only features that the cache lacks are computed. Afterwards the cache
+        holds the features of these traces and no others; the tensor that is returned shares its
+        memory. Without numbers the cache is neither read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -714,8 +715,8 @@ class RocketReducer(Reducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
-        Raises StoreError if the sizes do not follow from the parameters, SettingError for a
-        parameter out of its range; the fitted model is lost after a StoreError.
+        Raises SettingError for a parameter out of its range, and StoreError if the sizes do not
+        follow from the parameters; then the fitted model is lost.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
@@ -734,9 +735,9 @@ class RocketReducer(Reducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        `kernels`, `dilations`, `width` and `max_iter` are integers of at least 1, `regions` is an
-        integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1 or 2, and `folds` at
-        least 2. `l2` is above 0.
+        `kernels`, `dilations`, `width` and `max_iter` are integers of at least 1 and at most a
+        billion, `regions` is an integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1
+        or 2, and `folds` at least 2. `l2` is above 0.
         """
         integers = (
             "n_components",

@@ -313,9 +313,10 @@ class RocketEncoder(nn.Module):
     def learn_feature_scales(self, raw: Tensor) -> None:
         """Set `gain` and `offset` so that `offset + gain * raw` is standardised.
 
-        They are computed from raw features (n, P). All features of tower 2 are divided by the same
-        standard deviation, the root mean square of theirs. A small floor is added to each deviation
-        so that a feature that never varied does not become huge.
+        Both are changed in place. They are computed from the unscaled features `raw` (n, P). All
+        features of tower 2 are divided by the same standard deviation, the root mean square of
+        theirs. A small floor is added to each deviation so that a feature that never varied does
+        not become huge.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more
@@ -326,10 +327,10 @@ class RocketEncoder(nn.Module):
 
 
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
-    """Compute the raw features of traces (n, C, T): float32 (n, P).
+    """Compute the unscaled features of traces (n, C, T): float32 (n, P).
 
-    The features of a trace are the same to the bit whatever other traces it comes with, since every
-    chunk is full; the last chunk is filled up with zeros.
+    The encoder computes 32 traces at a time. The features of a trace are the same to the bit
+    whatever other traces it comes with, since the last 32 are filled up with traces of zeros.
     """
     out = torch.empty(len(traces), len(encoder.gain))
     for start in range(0, len(traces), CHUNK):

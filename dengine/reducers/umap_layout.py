@@ -171,9 +171,10 @@ class Edges:
 
     @classmethod
     def from_graph(cls, graph: csr_matrix) -> Self:
-        """Return the edges of a symmetric graph (n, n), whose row i holds the edges with head i.
+        """Return the edges of a symmetric graph (n, n) of points, each edge in both directions.
 
-        The strengths are divided by the largest strength.
+        An edge joins a point, its `head`, to another, its `tail`; row i of the graph holds the
+        strengths of the edges with head i. They are divided by the largest strength.
         """
         counts = torch.from_numpy(np.diff(graph.indptr).astype(np.int64))
         strength = torch.from_numpy(graph.data.astype(np.float32))
