@@ -290,8 +290,8 @@ class MemberEvidence(nn.Module):
         In a safe mode all parts are verified. The outcome is counted on both sides, for accepting
         and for rejecting. `lower` and `upper` are the bound on the success probability that the
         part was decided by, `success` is its label, and `predicted` (an `ActionCode`: 0 verify, 1
-        accept, 2 reject) is what the model alone would have done. If the rule knows all outcomes
-        (its own inclusion probability is 1), every part counts as checked. Otherwise
+        accept, 2 reject) is what the model alone would have done. If the decision rule knows all
+        outcomes (its own inclusion probability is 1), every part counts as checked. Otherwise
         `inclusion_probability`, with which this outcome would be asked for, says how it counts: 1
         as checked, above 0 as audited, and at 0 only the drift detectors see it. A wrong outcome
         may raise an alarm, which starts the safe mode: both thresholds are then `CLOSED`, which no
@@ -331,7 +331,7 @@ class MemberEvidence(nn.Module):
         been wrong for the part. If the score reaches the threshold of the side, the drift detector
         of the side takes a step first, which may start the safe mode (all is verified).
 
-        If the rule knows all outcomes, the part counts as checked; otherwise
+        If the decision rule knows all outcomes, the part counts as checked; otherwise
         `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. Each
         level (possible threshold) that the score reaches counts the part, and keeps whether it was
         wrong among its newest 50. The part is a member (one of the parts that the claim is about)

@@ -74,7 +74,7 @@ class RadiusNeighbours(nn.Module):
         return self.uncertain if self.rule.safe_mode() == 0 else self.safe_mode
 
     def forward(self, z: Tensor, part: int = 0) -> tuple[int, float, float, int, int]:
-        """Decide on one embedded trace; the rule and the references do not change.
+        """Decide on one embedded trace; the decision rule and the references do not change.
 
         Parameters
         ----------

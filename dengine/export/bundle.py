@@ -101,8 +101,8 @@ def prepare_export(
 ) -> tuple[Exportable, DecisionModule]:
     """Check that an engine or a model can be exported, and build its decision module.
 
-    Nothing is written. The module shares references and rule with the model. Its decider is
-    compiled already; the module itself is not.
+    Nothing is written. The module shares references and decision rule with the model. Its decider
+    is compiled already; the module itself is not.
 
     Parameters
     ----------

@@ -170,7 +170,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:
-        """Learn the outcome of a part: update the rule, and make the trace a reference.
+        """Learn the outcome of a part: update the decision rule, and make the trace a reference.
 
         If the trace and its part are those of the pending decision, its bound is used, and no
         decision is pending afterwards. Otherwise the trace is first decided on, because a bound
@@ -230,8 +230,8 @@ class DecisionModule(nn.Module):
         """End the wait for the outcome of a pending accept; return whether it was learned as good.
 
         A pending accept is the part decided last, if it was accepted and nothing was reported on
-        it. With `stops_all` (every line stop is reported) it is learned as good: the rule is
-        updated, and the trace becomes a reference. Otherwise it counts as unreported. Then no
+        it. With `stops_all` (every line stop is reported) it is learned as good: the decision rule
+        is updated, and the trace becomes a reference. Otherwise it counts as unreported. Then no
         decision is pending. If the pending decision is no accept, or there is none, nothing
         changes.
         """
@@ -295,8 +295,8 @@ class DecisionModule(nn.Module):
     def learn_pending(self, success: bool) -> None:
         """Learn the outcome of the pending decision; afterwards no decision is pending.
 
-        The rule is updated, and the trace becomes a reference with the label `success`, as in
-        `learn_outcome`. It is not checked whether a decision is pending.
+        The decision rule is updated, and the trace becomes a reference with the label `success`, as
+        in `learn_outcome`. It is not checked whether a decision is pending.
         """
         self.learn_outcome(
             self.pending_lower,
@@ -321,16 +321,16 @@ class DecisionModule(nn.Module):
         action: int,
         predicted: int,
     ) -> None:
-        """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
+        """Update the decision rule with an outcome, and make the trace a reference.
 
-        `success` is the label. `lower` and `upper` (the bound), `novel` (whether the trace was
-        novel), `action` and `predicted` (what the model alone would have done; `ActionCode`s) are
-        those of the decision, from before the label was known. `part` is the hash of the part; it
-        also gives the part's fold k, and the reference is put into embedding space k. The rule gets
-        as inclusion probability the audit rate if the part was audited, 1 if it was verified for
-        another reason, and 0 if it was accepted or rejected. It also gets `n_unreported`, the
-        number of accepted parts without a report since the last label, which restarts at 0. If the
-        index is full, its oldest reference is dropped.
+        `success` is the label, and z (K, d) the embedding of the trace. `lower` and `upper` (the
+        bound), `novel` (whether the trace was novel), `action` and `predicted` (what the model
+        alone would have done; `ActionCode`s) are those of the decision, from before the label was
+        known. `part` is the hash of the part; it also gives the part's fold k, and the reference is
+        put into embedding space k. The rule gets as inclusion probability the audit rate if the
+        part was audited, 1 if it was verified for another reason, and 0 if it was accepted or
+        rejected. It also gets `n_unreported`, the number of accepted parts without a report since
+        the last label, which restarts at 0. If the index is full, its oldest reference is dropped.
         """
         inclusion_probability = 0.0
         if action == ActionCode.VERIFY.value:

@@ -92,12 +92,13 @@ def export_onnx(
     ------
     ExportError
         If the engine audits (checks some parts that the model is certain of), has force limits or a
-        rule other than that of the guarantee "local" with stops "some", or if a part is among the
-        references more than once; the message names all of these that apply. Also if nothing was
-        trained yet; for a baseline; if the reducer, the interval or the rule cannot be exported; if
-        the compiled decision and the reducer map a trace to different points; if the rule is stale,
-        because an update of it failed; if the store was changed from outside; if the key cannot be
-        read; if a package is missing; and if onnxruntime does not decide like the model.
+        decision rule other than that of the guarantee "local" with stops "some", or if a part is
+        among the references more than once; the message names all of these that apply. Also if
+        nothing was trained yet; for a baseline; if the reducer, the interval or the rule cannot be
+        exported; if the compiled decision and the reducer map a trace to different points; if the
+        rule is stale, because an update of it failed; if the store was changed from outside; if the
+        key cannot be read; if a package is missing; and if onnxruntime does not decide like the
+        model.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -153,8 +154,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
 def _refuse_unsupported(source: Exportable) -> None:
     """Raise ExportError if the decision needs something that ONNX cannot carry, and name it all.
 
-    That is an audit rate above 0, a rule other than that of the guarantee "local" with stops
-    "some", a part that is among the references more than once, and force limits.
+    That is an audit rate above 0, a decision rule other than that of the guarantee "local" with
+    stops "some", a part that is among the references more than once, and force limits.
     """
     rule = type(source.model.rule)  # a user's own as well: `OnnxDecision` knows the paper's alone
     n_repeats = int(source.model.index.repeats)

@@ -120,10 +120,10 @@ def export_torchscript(
     Raises
     ------
     ExportError
-        If nothing was trained yet, for a baseline, if the reducer, the interval or the rule cannot
-        be compiled, if the compiled decision and the reducer map a trace to different points, if
-        the rule is stale, because an update of it failed, if the store was changed from outside,
-        and if the key cannot be read.
+        If nothing was trained yet, for a baseline, if the reducer, the interval or the decision
+        rule cannot be compiled, if the compiled decision and the reducer map a trace to different
+        points, if the rule is stale, because an update of it failed, if the store was changed from
+        outside, and if the key cannot be read.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -236,10 +236,10 @@ class ExportedModel:
     def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.
 
-        The trace becomes a reference, the rule is updated, and `metadata["references"]` becomes the
-        new number of references. The file on the disk is not changed; see `save`. A faulty trace is
-        ignored. If the trace or the part is not that of the pending decision, the model first
-        decides on the trace, and the earlier decision stays pending.
+        The trace becomes a reference, the decision rule is updated, and `metadata["references"]`
+        becomes the new number of references. The file on the disk is not changed; see `save`. A
+        faulty trace is ignored. If the trace or the part is not that of the pending decision, the
+        model first decides on the trace, and the earlier decision stays pending.
 
         Parameters
         ----------

@@ -135,8 +135,8 @@ class Predictor(nn.Module):
         counted, and 0 excludes none. Returns the positions of action and reason in `ACTIONS` and
         `REASONS`, the bounds lower and upper of the success probability, the counts n_success and
         n_failure of the labels within the radius, and the embedding (K, d), divided by the scale of
-        each space. A novel trace is verified without counting: its bounds are 0 and 1, its counts
-        are 0.
+        each embedding space. A novel trace is verified without counting: its bounds are 0 and 1,
+        its counts are 0.
         """
         z = self.embed(x)
         if self.novelty(x):
@@ -407,8 +407,9 @@ class ModelPrediction(EngineModel):
         """Train the reducer from scratch, and make the traces the references in place of the old.
 
         If there are more traces than the classifier's capacity, only the last become references.
-        The scales of the embedding spaces and the novelty gate are computed anew as well, the rule
-        stays as it is. If the training raises, the reducer is left untrained: call `fit` again.
+        The scales of the embedding spaces and the novelty gate are computed anew as well, the
+        decision rule stays as it is. If the training raises, the reducer is left untrained: call
+        `fit` again.
 
         Parameters
         ----------
@@ -450,14 +451,15 @@ class ModelPrediction(EngineModel):
         """Train the reducer on traces (n, C, T), and replace the references by them; return self.
 
         A reducer that can go on from its last training does so. If there are more traces than the
-        classifier's capacity, only the last become references. `index`, `scale`, `gate` (the
-        novelty gate, disabled if `novelty` is 0), `examples` (up to 8 of the traces), the note on
-        repeated parts and `trace_shape` are replaced, the decider is dropped and built anew when it
-        is used, and the decision rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of
-        the parts, give the folds; `numbers` (n,), of the labels, are kept with the references;
-        `stop` may end the reducer's training early. Extreme samples are clipped first. Raises
-        SettingError if the reducer cannot be trained on these traces, and if 20 traces or more are
-        all of one part. If the reducer raises, it may be changed already; all else is not.
+        classifier's capacity, only the last become references. `index`, `scale` (the divisor of the
+        points in each embedding space), `gate` (the novelty gate, disabled if `novelty` is 0),
+        `examples` (up to 8 of the traces), the note on repeated parts and `trace_shape` are
+        replaced, the decider is dropped and built anew when it is used, and the decision rule stays
+        as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds; `numbers`
+        (n,), of the labels, are kept with the references; `stop` may end the reducer's training
+        early. Extreme samples are clipped first. Raises SettingError if the reducer cannot be
+        trained on these traces, and if 20 traces or more are all of one part. If the reducer
+        raises, it may be changed already; all else is not.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -491,9 +493,9 @@ class ModelPrediction(EngineModel):
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
         `numbers` are the labels' sequence numbers, by which the reducer finds its results again. It
-        computes in a thread of its own. Before the first training, if reducer and rule can be
-        compiled, the caller's thread compiles a decider meanwhile, because the first retrain has no
-        time for that; the process keeps it as a template (`template_of`). The call returns when
+        computes in a thread of its own. Before the first training, if reducer and decision rule can
+        be compiled, the caller's thread compiles a decider meanwhile, because the first retrain has
+        no time for that; the process keeps it as a template (`template_of`). The call returns when
         both are done, and raises what either raised.
         """
         X = clip_extremes(X)
@@ -523,7 +525,7 @@ class ModelPrediction(EngineModel):
         template_of(decider.eval(), trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Take over the rule object of the previous model, and build the decider.
+        """Take over the decision rule object of the previous model, and build the decider.
 
         If the rule of either model is stale, because an update of it failed, this model is stale
         afterwards. The decider is built for the `DecisionConditions` under which the previous model
@@ -543,7 +545,7 @@ class ModelPrediction(EngineModel):
             self._conditions = conditions
 
     def build_decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Build a decider, which shares the references and the rule of this model.
+        """Build a decider, which shares the references and the decision rule of this model.
 
         It is returned, not kept; `decider` keeps one.
 
@@ -621,13 +623,14 @@ class ModelPrediction(EngineModel):
         embedding: Embedding | None = None,
         point: Floats | None = None,
     ) -> Floats:
-        """Add one labelled trace (channels, samples) to the index, in the space of its fold.
+        """Make one labelled trace (channels, samples) a reference in the space of its fold.
 
-        The hash of its part, `hash_`, gives the fold. The reference is `point` if given, otherwise
-        the row of `embedding` for that space; without both it is computed from the trace. A full
-        index drops its oldest reference. `y` is 1 for success, 0 for failure; `number` is the
-        sequence number of this label. Returns the reference point, float32 (d,), divided by the
-        scale of the space. Raises ValueError if it must be computed and nothing was fitted.
+        The hash of its part, `hash_`, gives the fold, which is also the number of the embedding
+        space. The reference is `point` if given, otherwise the row of `embedding` for that space;
+        without both it is computed from the trace. A full index drops its oldest reference. `y` is
+        1 for success, 0 for failure; `number` is the sequence number of this label. Returns the
+        reference point, float32 (d,), divided by the scale of the space. Raises ValueError if it
+        must be computed and nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
@@ -655,12 +658,13 @@ class ModelPrediction(EngineModel):
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
-        """Update the rule in place with the outcome of one part and the novelty of its trace.
+        """Update the decision rule, in place, with the outcome of one part.
 
         The rule's `observe` gets `n_unreported`, the number of accepted parts without a known
-        outcome since the last update, and `novel`; then its `update` gets the other arguments, see
-        `EngineModel.update_rule`. The decider decides by the new state at once. If one of the two
-        raises, `rule_is_stale` is set and the exception is passed on.
+        outcome since the last update, and `novel`, whether its trace was novel; then its `update`
+        gets the other arguments, see `EngineModel.update_rule`. The decider decides by the new
+        state at once. If one of the two raises, `rule_is_stale` is set and the exception is passed
+        on.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
@@ -692,9 +696,9 @@ class ModelPrediction(EngineModel):
     def with_policy(self, policy: Policy) -> Self:
         """Return a model under another policy; it shares the references and the reducer.
 
-        Its rule is new, has learned nothing and is not stale; its decider is not built yet. This
-        model does not change, except that a reference that is added to either is in both. Raises
-        SettingError if the rule cannot be made.
+        Its decision rule is new, has learned nothing and is not stale; its decider is not built
+        yet. This model does not change, except that a reference that is added to either is in both.
+        Raises SettingError if the rule cannot be made.
         """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
@@ -713,8 +717,8 @@ class ModelPrediction(EngineModel):
 
         Returns action, bounds of the success probability, label counts, embedding (K, d) and
         reason, as a `Prediction`. References of the part with this hash are not counted; 0 excludes
-        none. The trace's shape is not checked. Raises RuntimeError if the rule is stale, because an
-        update of it failed, and ValueError if nothing was fitted.
+        none. The trace's shape is not checked. Raises RuntimeError if the decision rule is stale,
+        because an update of it failed, and ValueError if nothing was fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -736,13 +740,13 @@ class ModelPrediction(EngineModel):
         -------
         Verdict
             The tuple that `Decider.forward` returns. Its embedding (K, d) has a point in each of
-            the K spaces, divided by the space's scale.
+            the K embedding spaces, divided by the scale of the space.
 
         Raises
         ------
         RuntimeError
-            If the rule is stale, because an update of it failed, and the trace has no fault. A
-            faulty trace is verified without the rule.
+            If the decision rule is stale, because an update of it failed, and the trace has no
+            fault. A faulty trace is verified without the rule.
         ValueError, ...
             As in `build_decider`.
         """
@@ -798,9 +802,9 @@ class ModelPrediction(EngineModel):
     def successor(self) -> "ModelPrediction":
         """Return a model to train next, with a copy of this one's reducer to start from.
 
-        The successor has no decider yet. It shares rule, references, scale and novelty gate with
-        this model. Training replaces the last three in the successor only, so this model goes on
-        deciding.
+        The successor has no decider yet. It shares decision rule, references, scale (the divisor of
+        the points in each embedding space) and novelty gate with this model. Training replaces the
+        last three in the successor only, so this model goes on deciding.
         """
         model = copy.copy(self)
         model.spaces = copy.deepcopy(self.spaces)
@@ -814,8 +818,9 @@ class ModelPrediction(EngineModel):
         The references must be finite, and so must the points to which the reducer maps `examples`,
         some training traces. A reducer that is restored from the state of this one must map
         `examples` to the same points, each of two times; if a reducer gives no state, it must do so
-        itself. The points, divided by the scale of their space, are kept for `check_answers`. If
-        restoring raises a StoreError, that is a defect; other errors are raised.
+        itself. The points, divided by the scale of their embedding space, are kept for
+        `check_answers`. If restoring raises a StoreError, that is a defect; other errors are
+        raised.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -843,11 +848,11 @@ class ModelPrediction(EngineModel):
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
 
-        Trace shape, references and scale (the divisor of the points in each space) are always in
-        it. The names of the arrays of the reducer, the rule and the novelty gate begin with
-        "reducer.", "rule." and "novelty.". A reducer without a state and a disabled gate have no
-        arrays. In place of a stale rule there is "rule_is_stale". Arrays of the scale and the
-        reducer may be views. Raises AttributeError before the first training.
+        Trace shape, references and scale (the divisor of the points in each embedding space) are
+        always in it. The names of the arrays of the reducer, the decision rule and the novelty gate
+        begin with "reducer.", "rule." and "novelty.". A reducer without a state and a disabled gate
+        have no arrays. In place of a stale rule there is "rule_is_stale". Arrays of the scale and
+        the reducer may be views. Raises AttributeError before the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -863,13 +868,14 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale, rule (in place) and novelty gate are restored, and the reducer if the
-        state holds it. If it does not (`needs_refit`), train this model on the same traces before
-        this call. The decider is dropped. If the rule was stale, the state does not hold it, and
-        this model's rule stays as it is; `rule_is_stale` always stays as it is. Raises StoreError
-        if the state holds no reducer although this fitted reducer gives a state, and for a rule or
-        gate of other sizes. For the state of another reducer it raises StoreError, KeyError,
-        ValueError or NotImplementedError. After an error do not use the model.
+        References, scale (the divisor of the points in each embedding space), decision rule (in
+        place) and novelty gate are restored, and the reducer if the state holds it. If it does not
+        (`needs_refit`), train this model on the same traces before this call. The decider is
+        dropped. If the rule was stale, the state does not hold it, and this model's rule stays as
+        it is; `rule_is_stale` always stays as it is. Raises StoreError if the state holds no
+        reducer although this fitted reducer gives a state, and for a rule or gate of other sizes.
+        For the state of another reducer it raises StoreError, KeyError, ValueError or
+        NotImplementedError. After an error do not use the model.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))

@@ -91,10 +91,11 @@ class RidgeProblem:
         return (self.mask * (p - self.y)) @ self.g + self.ridge * w
 
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
-        """Return the lower Cholesky factor of the Hessian for head k, float64 (W + 1, W + 1).
+        """Return the lower Cholesky factor of the Hessian of classifier head k.
 
-        The Hessian of logistic regression k depends on `p` (n,), the probabilities that head k
-        gives. The product of features is computed in float32, since a Newton step may be inexact.
+        The factor is float64 (W + 1, W + 1). The head is a logistic regression, whose Hessian
+        depends on `p` (n,), the probabilities that head k gives. The product of features is
+        computed in float32, since a Newton step may be inexact.
         """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact
@@ -227,7 +228,7 @@ def base_rate_if_better(
 
 
 def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:
-    """Approximate the logit of each row by each head as if the head was fitted without the row.
+    """Approximate the logit of each row by each classifier head fitted without the row.
 
     Parameters
     ----------

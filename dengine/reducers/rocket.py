@@ -117,7 +117,7 @@ class FeatureEmbedding(nn.Module):
         return self.embed_features(self.encoder(x))
 
     def embed_features(self, f: Tensor) -> Tensor:
-        """Scaled features f (B, P) -> embedding (B, K, d), a point in each of the K spaces.
+        """Scaled features f (B, P) -> embedding (B, K, d), a point in each embedding space.
 
         Head k, the classifier that is trained without the labels of fold k, gives the first
         coordinate in space k: the probability of success, from 0 to 1. If d is 2, the second
@@ -213,10 +213,11 @@ def weigh_towers(
 ) -> tuple[list[Tensor], Tensor]:
     """Choose for each fold the shares by which the logits of several towers are mixed to one logit.
 
-    Each `Tower` has a head k, trained without the labels of fold k. The first tower starts with a
-    share of 1. Then each further tower gets a share of 0 to 1 in steps of 0.1, and the shares of
-    the towers before it are multiplied by the rest. The share is chosen that has the smallest
-    penalised log loss on the rows outside fold k, so that labels of fold k do not reach space k.
+    Each `Tower`, a group of features, has a classifier head k, trained without the labels of fold
+    k. The first tower starts with a share of 1. Then each further tower gets a share of 0 to 1 in
+    steps of 0.1, and the shares of the towers before it are multiplied by the rest. The share is
+    chosen that has the smallest penalised log loss on the rows outside fold k, so that labels of
+    fold k do not reach embedding space k.
 
     Parameters
     ----------
@@ -359,14 +360,14 @@ class RocketReducer(Reducer):
         """Fit the classifier heads, starting from their last weights; return the reference points.
 
         The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
-        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,) identify the
-        traces: a trace that was in the last call has its features in a cache. `stop` may end the
-        Newton steps, but in the first fit its deadline leaves them three. If there are more than
-        4000 traces, the heads are fitted to 4000 of them, chosen by a hash of the numbers. The
-        module `net_`, and so the module that `module` returned before, is changed in place. The
-        points are float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than
-        20 traces, if the traces outside a fold have a single class, and at the first call for a
-        parameter out of its range or fewer than 2 samples.
+        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,), those of
+        the labels, identify the traces: a trace that was in the last call has its features in a
+        cache. `stop` may end the Newton steps, but in the first fit its deadline leaves them three.
+        If there are more than 4000 traces, the heads are fitted to 4000 of them, chosen by a hash
+        of the numbers. The module `net_`, and so the module that `module` returned before, is
+        changed in place. The points are float32 (n, d), row i in embedding space ``folds[i]``.
+        Raises SettingError for fewer than 20 traces, if the traces outside a fold have a single
+        class, and at the first call for a parameter out of its range or fewer than 2 samples.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -387,8 +388,8 @@ class RocketReducer(Reducer):
 
         Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
         without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `net_`
-        is changed in place. Returns the points of the traces, float32 (n, d), row i in space
-        ``folds[i]``, whose head did not see the label of row i.
+        is changed in place. Returns the points of the traces, float32 (n, d), row i in embedding
+        space ``folds[i]``, whose head did not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -492,8 +493,8 @@ class RocketReducer(Reducer):
         fits, and if there are at least 1.5 times as many rows as when they were computed last.
         `labels` (n,) are 1 or 0, `folds` (n,) the folds, `numbers` (n,) the numbers of the labels.
         It sets `towers_`, `n_iter_` (steps of this fit), `holdout_losses_` (leave-one-out loss of
-        each space), `n_fits_` and `note_` (the heads that are no better than their base rate in
-        every tower; "" if there are none).
+        each embedding space), `n_fits_` and `note_` (the heads that are no better than their base
+        rate in every tower; "" if there are none).
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -533,11 +534,11 @@ class RocketReducer(Reducer):
         self.note_ = note if useless else ""
 
     def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
-        """Write the classifier heads of all towers to `net_`, so that it gives a logit per space.
+        """Write the classifier heads of all towers to `net_`, which then gives K logits.
 
-        Logit k of `net_` becomes the sum over the towers of share k times the tower's own logit k.
-        `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns them. The heads in
-        `net_` are overwritten.
+        Logit k of `net_`, for embedding space k, becomes the sum over the towers of share k times
+        the tower's own logit k. `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns
+        them. The heads in `net_` are overwritten.
         """
         net = self.net_
         logit_columns = slice(0, net.n_scores, self.n_components)
@@ -626,10 +627,10 @@ class RocketReducer(Reducer):
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
         """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
 
-        They are float32, computed from the outputs of the kernels. `numbers` (n,), increasing,
-        identify the traces: only features that the cache lacks are computed. Afterwards the cache
-        holds the features of these traces and no others; the tensor that is returned shares its
-        memory. Without numbers the cache is neither read nor written.
+        They are float32, computed from the outputs of the kernels. `numbers` (n,), those of the
+        labels, increasing, identify the traces: only features that the cache lacks are computed.
+        Afterwards the cache holds the features of these traces and no others; the tensor that is
+        returned shares its memory. Without numbers the cache is neither read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -672,7 +673,7 @@ class RocketReducer(Reducer):
         return FitReport(self.n_iter_, self.note_)
 
     def embed(self, X: ArrayLike) -> Floats:
-        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
+        """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
         The points in space k come from head k, the classifier that was fitted without the labels of
         fold k. If kernels were drawn (`precompute`, `untrained_module`) but nothing was fitted, all

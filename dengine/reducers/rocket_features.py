@@ -315,8 +315,8 @@ class RocketEncoder(nn.Module):
 
         Both are changed in place. They are computed from the unscaled features `raw` (n, P). All
         features of tower 2 are divided by the same standard deviation, the root mean square of
-        theirs. A small floor is added to each deviation so that a feature that never varied does
-        not become huge.
+        their standard deviations. A small floor is added to each deviation so that a feature that
+        never varied does not become huge.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more

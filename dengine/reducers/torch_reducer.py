@@ -245,9 +245,9 @@ class TorchReducer(Reducer):
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
         the last training, or from initial weights the first time. `numbers` is not read. Returns
-        the points of the traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError
-        for fewer than two traces outside a fold, and at the first training for fewer than 20
-        traces, or a parameter, network or checkpoint that cannot be used.
+        the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises
+        SettingError for fewer than two traces outside a fold, and at the first training for fewer
+        than 20 traces, or a parameter, network or checkpoint that cannot be used.
         """
         traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
@@ -343,8 +343,8 @@ class TorchReducer(Reducer):
         The networks with averaged weights and new statistics of batch normalisation become
         `encoder_`. `n_steps_left_` becomes 0 if `stop` limits the number of steps, else the number
         of steps that are missing until training is complete. `numbers` is not read. Returns the
-        points of the traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError for
-        fewer than two traces outside a fold; `encoder_` stays then.
+        points of the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises
+        SettingError for fewer than two traces outside a fold; `encoder_` stays then.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -477,9 +477,10 @@ class TorchReducer(Reducer):
 
     @torch.inference_mode()
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
-        """Embed preprocessed traces (n, C', L): float32 (n, d), row i in space ``folds[i]``.
+        """Embed preprocessed traces (n, C', L), each in one embedding space: float32 (n, d).
 
-        Network k computes the rows of fold k alone, so this takes 1 / K of the time of `embed`.
+        Row i is in space ``folds[i]``, as a reference. Network k computes the rows of fold k alone,
+        so this takes 1 / K of the time of `embed`.
         """
         rows_of_fold = [np.flatnonzero(folds == k) for k in range(self.folds)]
         longest = max(map(len, rows_of_fold))
@@ -499,7 +500,7 @@ class TorchReducer(Reducer):
 
     @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
+        """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
         The points in space k come from network k, which was trained without the labels of fold k.
         Raises NotFittedError before there are networks, ValueError for traces of another shape and

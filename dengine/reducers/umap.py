@@ -264,12 +264,12 @@ class UmapReducer(Reducer):
     ) -> Floats:
         """Compute a layout of traces X (n, C, T), and make them the references of a new `encoder_`.
 
-        `numbers` (n,), increasing, identify the traces from training to training; labels and folds
-        are not read. The layout goes on from the last one if at least half of the traces were in
-        it; otherwise, or without `numbers`, it starts anew. `stop` may end the epochs; after its
-        deadline at most ten more are taken. Returns the points of the traces, float32 (n,
-        n_components), which share their memory with `embedding_`. Raises SettingError for a
-        parameter out of its range, or too few traces.
+        `numbers` (n,), those of the labels, increasing, identify the traces from training to
+        training; labels and folds are not read. The layout goes on from the last one if at least
+        half of the traces were in it; otherwise, or without `numbers`, it starts anew. `stop` may
+        end the epochs; after its deadline at most ten more are taken. Returns the points of the
+        traces, float32 (n, n_components), which share their memory with `embedding_`. Raises
+        SettingError for a parameter out of its range, or too few traces.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
@@ -463,9 +463,9 @@ class UmapReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape and counters, and the numbers, frames, neighbours, distances and points of
-        the last training. Not all of them are copies. Neighbours that `precompute` found are not
-        among them. Raises NotFittedError before a fit.
+        They are shape and counters, and the numbers (of the labels), frames, neighbours, distances
+        and points of the last training. Not all of them are copies. Neighbours that `precompute`
+        found are not among them. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]

@@ -136,8 +136,8 @@ class Neighbors:
         traces : array of float32, shape (n, C, T)
             More than k.
         numbers : array of int64, shape (n,)
-            Increasing; the same number stands for the same trace as before. A trace of this object
-            whose number is not among them is dropped.
+            Numbers of the labels, increasing; the same number stands for the same trace as before.
+            A trace of this object whose number is not among them is dropped.
         make_frames : Frames
             The module that computed `frames`.
 
