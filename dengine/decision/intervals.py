@@ -237,10 +237,11 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
 
 
 def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute `wilson_interval` of two integers at the normal quantile z.
+    """Compute the Wilson interval of a success probability from two counts, in Python.
 
-    Returns the interval of the success probability, (lower, upper) within [0, 1], which is (0, 1)
-    if both counts are 0. TorchScript compiles it.
+    `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
+    [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles
+    it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:
@@ -252,10 +253,11 @@ def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float
 
 
 def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute `wald_interval` of two integers at the normal quantile z.
+    """Compute the Wald interval of a success probability from two counts, in Python.
 
-    Returns the interval of the success probability, (lower, upper) within [0, 1], which is (0, 1)
-    if both counts are 0. TorchScript compiles it.
+    `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
+    [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles
+    it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:

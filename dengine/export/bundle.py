@@ -119,6 +119,7 @@ def prepare_export(
     source : Exportable
         The model with its `TraceSpec`, audits and force limits.
     module : DecisionModule
+        Decides on traces and learns their outcomes; the content of a TorchScript file.
 
     Raises
     ------

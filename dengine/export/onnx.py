@@ -119,7 +119,7 @@ def export_onnx(
 
 
 def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
-    """Check an ONNX file, load it into onnxruntime on one thread, and warm it up.
+    """Check an ONNX file, load it into onnxruntime on one thread, and decide once.
 
     Unlike `load_exported` it does not compare the embedding of a test trace with the file's.
 
@@ -138,7 +138,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     ------
     ExportError
         For a file that is missing, damaged or not signed with the key, that is no ONNX export or
-        has another schema, and if a package for ONNX is missing.
+        has another schema, and if a package for ONNX is missing. Errors of onnxruntime are raised
+        as they are.
     """
     onnx = _import_package("onnx")
     target = Path(path)

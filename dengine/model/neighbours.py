@@ -513,6 +513,7 @@ class ModelPrediction(EngineModel):
 
         `encoder` is the module of the untrained reducer. The process keeps the compiled decider as
         a template, from which `compiled` copies later deciders. Nothing in the model changes.
+        Raises what `template_of` raises.
         """
         channels, samples = trace_shape
         gate = NoveltyGate(channels, samples)

@@ -267,7 +267,8 @@ class ConvReducer(TorchReducer):
         """Restore what `get_state` returned, `rocket_` included; return self.
 
         The constructor's parameters must be the same. Raises StoreError if the state is of another
-        network, or of an older release, which stored no `rocket_`. After an error do not use it.
+        network, or of an older release, which stored no `rocket_`. Raises what
+        `TorchReducer.set_state` raises. After an error do not use the reducer.
         """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone

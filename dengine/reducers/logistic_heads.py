@@ -117,11 +117,12 @@ def fit_heads(
 
     Head k, trained without the labels of fold k, minimises the sum of its log losses plus
     ``l2 / 2 * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the
-    same weights wherever it starts, unless the steps are limited. It has converged if its next step
-    would change no weight by more than about 0.0002. If the leave-one-out loss of a head is above
-    the loss of its base rate, the share of successes among its rows, the head is replaced by the
-    base rate. This is decided for each head alone, since a common decision would let the labels of
-    fold k choose head k.
+    same weights wherever it starts, unless the steps are limited. A step that raises the loss of a
+    head is halved up to six times, and then left out. A head has converged when its next step would
+    change no weight by more than about 0.0002. If the leave-one-out loss of a head is above the
+    loss of its base rate, the share of successes among its rows, the head is replaced by the base
+    rate. This is decided for each head alone, since a common decision would let the labels of fold
+    k choose head k.
 
     Parameters
     ----------

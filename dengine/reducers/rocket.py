@@ -359,15 +359,16 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the classifier heads, starting from their last weights; return the reference points.
 
-        The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
-        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,), those of
-        the labels, identify the traces: a trace that was in the last call has its features in a
-        cache. `stop` may end the Newton steps, but in the first fit its deadline leaves them three.
-        If there are more than 4000 traces, the heads are fitted to 4000 of them, chosen by a hash
-        of the numbers. The module `net_`, and so the module that `module` returned before, is
-        changed in place. The points are float32 (n, d), row i in embedding space ``folds[i]``.
-        Raises SettingError for fewer than 20 traces, if the traces outside a fold have a single
-        class, and at the first call for a parameter out of its range or fewer than 2 samples.
+        The kernels are drawn at the first call of `train`, `precompute` or `untrained_module` and
+        stay. X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds.
+        `numbers` (n,), those of the labels, identify the traces: a trace that was in the last call
+        has its features in a cache. `stop` may end the Newton steps, but in the first fit its
+        deadline leaves them three. If there are more than 4000 traces, the heads are fitted to 4000
+        of them, chosen by a hash of the numbers. The module `net_`, and so the module that `module`
+        returned before, is changed in place. The points are float32 (n, d), row i in embedding
+        space ``folds[i]``. Raises SettingError for fewer than 20 traces, if the traces outside a
+        fold have a single class, and at the first call for a parameter out of its range or fewer
+        than 2 samples.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -717,7 +718,8 @@ class RocketReducer(Reducer):
 
         Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
         Raises SettingError for a parameter out of its range, and StoreError if the sizes do not
-        follow from the parameters; then the fitted model is lost.
+        follow from the parameters; then the fitted model is lost. Raises KeyError if an array is
+        missing.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])

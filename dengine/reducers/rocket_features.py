@@ -280,9 +280,9 @@ class RocketEncoder(nn.Module):
 
         `x`, float32 (n, C, T), are traces whose channels are scaled by `shift` and `scale`, which
         must be set before. It writes the buffers `kernel`, `threshold` and, if there are groups,
-        `competing_kernel`. The thresholds are quantiles of the outputs, from 5 to 95 %. A kernel of
-        tower 1 is scaled so that its ramp is two standard deviations of its outputs wide, those of
-        tower 2 so that this deviation is 1.
+        `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the outputs, from 5
+        to 95 %. A kernel of tower 1 is scaled so that its ramp is two standard deviations of its
+        outputs wide, those of tower 2 so that this deviation is 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)

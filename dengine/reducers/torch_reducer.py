@@ -274,8 +274,9 @@ class TorchReducer(Reducer):
     def _check_and_initialize(self, X: Floats) -> Floats:
         """Check traces and return them as (n, C, T); build the networks at the first call.
 
-        The first traces set the shape and the scales of the channels; no label is read. Raises
-        SettingError if the first call has fewer than 20 traces, or a parameter is not usable.
+        The first traces set the shape and the scales of the channels; no label is read. The first
+        call raises SettingError for fewer than 20 traces, and for a parameter, network or
+        checkpoint that cannot be used. Raises the errors of `check_traces`.
         """
         if not vars(self).get("is_initialized_"):
             do = "verify more parts first"
@@ -587,7 +588,8 @@ class TorchReducer(Reducer):
 
         The constructor's parameters must be the same. Raises StoreError if the sizes are others, or
         if the network gives other points for a fixed trace than when the state was taken; a state
-        without these points is not checked so. After an error do not use the reducer.
+        without these points is not checked so. Raises KeyError if an array of counts, shape or loss
+        is missing. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
@@ -723,9 +725,9 @@ def compile_fault(network: NetworkFactory, channels: int, samples: int) -> str:
     """Return why TorchScript cannot compile a network, and log it as a warning; "" if it can.
 
     A user's network may hold Python that TorchScript does not support. To find out, two copies of
-    it are built, compiled and run. A process keeps the answers for the last 32 networks and shapes,
-    and logs nothing when it gives such an answer again. The state of torch's global random
-    generator does not change.
+    it are built, compiled and run; any exception counts as a fault, and none is raised. A process
+    keeps the answers for the last 32 networks and shapes, and logs nothing when it gives such an
+    answer again. The state of torch's global random generator does not change.
     """
     try:
         with torch.random.fork_rng(devices=[]), torch.inference_mode():

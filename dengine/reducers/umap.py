@@ -326,9 +326,10 @@ class UmapReducer(Reducer):
     def _initialize(self, traces: Floats) -> None:
         """Discard all trainings, draw the seed, and set up the frames of traces (n, C, T).
 
-        `random_state` gives the seed. A frame is the sum of a short stretch of samples. The number
-        of frames of a trace and their centre and scale come from at most 256 of the traces, evenly
-        spaced. An earlier `encoder_` stays until the next training replaces it.
+        `random_state` gives the seed; the counters of epochs become 0. A frame is the sum of a
+        short stretch of samples. The number of frames of a trace and their centre and scale come
+        from at most 256 of the traces, evenly spaced. An earlier `encoder_` stays until the next
+        training replaces it.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
@@ -484,7 +485,8 @@ class UmapReducer(Reducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         What `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module
-        that averages traces, have other sizes than the shape of the traces in `state` asks for.
+        that averages traces, have other sizes than the shape of the traces in `state` asks for,
+        KeyError if an array is missing.
         """
         channels, samples = self.restore_shape(state)
         n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])
