@@ -237,7 +237,7 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
 
 
 def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute the Wilson interval of a success probability from two counts, in Python.
+    """Compute the Wilson interval of a success probability from two integer counts.
 
     `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
     [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles
@@ -253,7 +253,7 @@ def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float
 
 
 def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute the Wald interval of a success probability from two counts, in Python.
+    """Compute the Wald interval of a success probability from two integer counts.
 
     `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
     [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles

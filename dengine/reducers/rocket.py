@@ -718,8 +718,8 @@ class RocketReducer(Reducer):
 
         Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
         Raises SettingError for a parameter out of its range, and StoreError if the sizes do not
-        follow from the parameters; then the fitted model is lost. Raises KeyError if an array is
-        missing.
+        follow from the parameters; then the fitted model is lost. Raises KeyError if shape,
+        counters or losses are missing.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])

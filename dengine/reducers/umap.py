@@ -486,7 +486,7 @@ class UmapReducer(Reducer):
 
         What `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module
         that averages traces, have other sizes than the shape of the traces in `state` asks for,
-        KeyError if an array is missing.
+        KeyError if another array is missing.
         """
         channels, samples = self.restore_shape(state)
         n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])
