@@ -486,9 +486,10 @@ def _bound_audits(
 ) -> OutcomeBound:
     """Return the bound on wrong decisions that rests on audits, and the counts that it is about.
 
-    It is about unchecked and audited parts together. `n_bad` of the audited parts, and `n_others`
-    of the unchecked ones, are known to be decided wrongly: the bound is never below the share of
-    both. `audit_rate` is the probability with which a certain decision is audited. In the result
+    It is about `n_unchecked` parts that were decided without a check and `n_audited` audited ones,
+    together; `alpha` is its error level. `n_bad` of the audited parts, and `n_others` of the
+    unchecked ones, are known to be decided wrongly: the bound is never below the share of both.
+    `audit_rate` is the probability with which a certain decision is audited. In the result
     `shadowed` is True if `audit_rate` is 1 and no part went unchecked. Raises the errors of
     `failure_bound`.
     """

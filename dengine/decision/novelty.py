@@ -259,10 +259,10 @@ def fit_novelty(
 def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
     """Return what is added to each roughness before its logarithm, float32 (C, 2*S + 3).
 
-    There are 2*S + 3 roughnesses for each channel (norms of differences in a stretch of samples,
-    see `plain_features`). The result is a twentieth of the median roughness of the traces x
-    (n, C, T), scaled to the length of the stretch. For a channel that never moved it is 1e-12: any
-    movement there is then far away.
+    `gate` says how many samples each of the 2*S + 3 roughnesses of a channel is taken over (they
+    are norms of differences in a stretch of samples, see `plain_features`). The result is a
+    twentieth of the median roughness of the traces x (n, C, T), scaled to the length of the
+    stretch. For a channel that never moved it is 1e-12: any movement there is then far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))

@@ -383,7 +383,7 @@ def metadata_of(content: bytes, path: Path) -> Metadata:
 
 
 def check_schema(metadata: Any, path: Path) -> Metadata:
-    """Return the description of an exported file as it is if it has the present schema, 2.
+    """Return `metadata`, the description of an exported file, if it has the present schema, 2.
 
     The schema is the version of its keys (`SCHEMA`). Raises ExportError, which names `path`, if it
     has another schema or is not a dict.

@@ -301,7 +301,7 @@ class OnnxDecision(nn.Module):
 
 
 def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
-    """Return the ONNX program of a decision on traces of this shape, a protobuf `ModelProto`.
+    """Return the ONNX program of a decision on traces like `spec`, a protobuf `ModelProto`.
 
     torch.export makes it, without TorchScript. Meanwhile Python's warnings, and log messages up to
     level WARNING, are off in the whole process, because torch reports optional packages that are

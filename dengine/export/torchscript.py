@@ -350,7 +350,7 @@ def _check_golden(model: ExportedModel, path: Path) -> None:
     """Warm a model up on the test trace in its file; raise ExportError for another embedding.
 
     The test trace and its expected embedding are the entry "golden" of the description. The model
-    decides on the trace and learns it several times, so pass a copy.
+    decides on the trace and learns it several times, so pass a copy. `path` is named in the error.
     """
     golden = model.metadata["golden"]
     trace = np.array(golden["trace"], dtype=np.float32)

@@ -190,10 +190,10 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     """Return a hashable key, equal for two modules if one compiled module can serve for both.
 
-    The key holds the class and the attributes of all submodules; of a tensor it holds only the
-    shape, because `compiled` sets the values. The module of the force limits is left out, so that
-    their number makes no difference. The class itself is in the key, not its name: a notebook cell
-    that is run again defines another class.
+    The key holds the class and the attributes of all submodules of `eager`, a module in Python; of
+    a tensor it holds only the shape, because `compiled` sets the values. The module of the force
+    limits is left out, so that their number makes no difference. The class itself is in the key,
+    not its name: a notebook cell that is run again defines another class.
     """
     parts = [
         (path, type(module), _as_key(attributes_of(module)))
@@ -663,9 +663,10 @@ class ModelPrediction(EngineModel):
 
         The rule's `observe` gets `n_unreported`, the number of accepted parts without a known
         outcome since the last update, and `novel`, whether its trace was novel; then its `update`
-        gets the other arguments, see `EngineModel.update_rule`. The decider decides by the new
-        state at once. If one of the two raises, `rule_is_stale` is set and the exception is passed
-        on.
+        gets the bound by which the part was decided (`lower`, `upper`), the label `success`, what
+        the model alone would have done (`predicted`, an `ActionCode`), and the probability, fixed
+        beforehand, that the outcome would be asked for. The decider decides by the new state at
+        once. If one of the two raises, `rule_is_stale` is set and the exception is passed on.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
@@ -717,9 +718,9 @@ class ModelPrediction(EngineModel):
         """Predict one trace (channels, samples) without fault checks, force limits and audits.
 
         Returns action, bounds of the success probability, label counts, embedding (K, d) and
-        reason, as a `Prediction`. References of the part with this hash are not counted; 0 excludes
-        none. The trace's shape is not checked. Raises RuntimeError if the decision rule is stale,
-        because an update of it failed, and ValueError if nothing was fitted.
+        reason, as a `Prediction`. References of the part with the hash `hash_` are not counted; 0
+        excludes none. The trace's shape is not checked. Raises RuntimeError if the decision rule is
+        stale, because an update of it failed, and ValueError if nothing was fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -734,8 +735,9 @@ class ModelPrediction(EngineModel):
         """Decide on one raw trace x (C, T), in the unit of the sensor, under these conditions.
 
         The decider, the module that decides, is built first if the one that the model keeps is for
-        other conditions. References of the part with this hash are not counted. 0 stands for an
-        unknown part: then references with the same content hash as the trace are not counted.
+        other conditions. References of the part with the hash `part_hash` are not counted. 0 stands
+        for an unknown part: then references with the same content hash as the trace are not
+        counted.
 
         Returns
         -------
@@ -950,8 +952,8 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     """Return a note for the report of a retrain if `near_repeats` counts many traces, else "".
 
-    It takes the arguments of `near_repeats`: traces (n, C, T), and the hash of the part of each.
-    More than 25 traces (`MANY_REPEATS`) are many.
+    It takes the arguments of `near_repeats`: traces (n, C, T), and `parts`, the hash of the part of
+    each. More than 25 traces (`MANY_REPEATS`) are many.
     """
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:

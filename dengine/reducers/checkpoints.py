@@ -31,9 +31,10 @@ def save_checkpoint(members: Members, path: str | Path) -> None:
 
 
 def load_checkpoint(members: Members, path: str | Path) -> None:
-    """Copy the weights of a checkpoint into every copy of the network in `members`, in place.
+    """Copy the weights in a file into every copy of the network in `members`, in place.
 
-    Buffers, such as the statistics of batch normalisation, are copied as well.
+    The file is a checkpoint, which `save_checkpoint` wrote. Buffers, such as the statistics of
+    batch normalisation, are copied as well.
 
     Raises
     ------

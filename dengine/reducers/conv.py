@@ -110,8 +110,8 @@ def conv_layers(
 ) -> list[nn.Module]:
     """Return a list of three layers: convolution, batch normalisation and ReLU.
 
-    `inputs` and `outputs` are channels of each group. The convolution has no bias and pads kernel
-    // 2 zeros at both ends.
+    The convolution has `groups` groups, which it keeps apart; `inputs` and `outputs` are channels
+    of each group. It has no bias and pads `kernel` // 2 zeros at both ends.
     """
     convolution = nn.Conv1d(
         groups * inputs,

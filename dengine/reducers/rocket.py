@@ -388,9 +388,10 @@ class RocketReducer(Reducer):
         """Fit the classifier heads like `train`, but without checking the input.
 
         Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
-        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `net_`
-        is changed in place. Returns the points of the traces, float32 (n, d), row i in embedding
-        space ``folds[i]``, whose head did not see the label of row i.
+        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
+        and `numbers` are those of `train`. `net_` is changed in place. Returns the points of the
+        traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did not see the
+        label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -566,7 +567,7 @@ class RocketReducer(Reducer):
     def _compute_components(self, raw: Tensor) -> None:
         """Compute feature scales and principal components anew from unscaled features (n, P).
 
-        At most 1000 rows, evenly spaced, are read; `n_component_traces_` becomes n.
+        At most 1000 rows of `raw`, evenly spaced, are read; `n_component_traces_` becomes n.
 
         A `Tower` holds a group of features, their principal components, and one linear classifier,
         a head, for each fold. `towers_` gets a new tower for each group; its heads are the ones

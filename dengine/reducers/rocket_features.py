@@ -201,11 +201,11 @@ class RocketEncoder(nn.Module):
         return rows.permute(1, 2, 0).contiguous().index_select(1, self.taps)
 
     def as_windows(self, values: Tensor, n: int) -> Tensor:
-        """Arrange the inputs of n dilations, (C, n * 9 * P, B), as windows (n, C * 9, P * B).
+        """Arrange inputs of n dilations, `values` (C, n * 9 * P, B), as (n, C * 9, P * B).
 
         P is the number of places in a trace, 9 the number of inputs of a kernel in a channel. A
-        column holds all inputs of a kernel at one place of one trace, so that a convolution is a
-        matrix product.
+        column of the result, a window, holds all inputs of a kernel at one place of one trace, so
+        that a convolution is a matrix product.
         """
         channels = values.size(0)
         taps = self.kernel_size
@@ -279,10 +279,11 @@ class RocketEncoder(nn.Module):
         """Draw the kernels, and set their scales and thresholds from their outputs on traces.
 
         `x`, float32 (n, C, T), are traces whose channels are scaled by `shift` and `scale`, which
-        must be set before. It writes the buffers `kernel`, `threshold` and, if there are groups,
-        `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the outputs, from 5
-        to 95 %. A kernel of tower 1 is scaled so that its ramp is two standard deviations of its
-        outputs wide, those of tower 2 so that this deviation is 1.
+        must be set before. `rng` draws the kernels. The method writes the buffers `kernel`,
+        `threshold` and, if there are groups, `competing_kernel`. Thresholds, which only tower 1
+        has, are quantiles of the outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that its
+        ramp is two standard deviations of its outputs wide, those of tower 2 so that this deviation
+        is 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)
@@ -371,9 +372,10 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
-    Each of the N choices is drawn n / N times, rounded up or down, so none twice unless n exceeds
-    N. A kernel reads one to all channels; a small number of channels is more likely. It is the same
-    in all channels that it reads, and 0 in the others. Each row of the result has the norm 1.
+    `rng` draws them. Each of the N choices is drawn n / N times, rounded up or down, so none twice
+    unless n exceeds N. A kernel reads one to all channels; a small number of channels is more
+    likely. It is the same in all channels that it reads, and 0 in the others. Each row of the
+    result has the norm 1.
     """
     drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
     kernels = choices[torch.from_numpy(drawn)]

@@ -343,9 +343,10 @@ class TorchReducer(Reducer):
 
         The networks with averaged weights and new statistics of batch normalisation become
         `encoder_`. `n_steps_left_` becomes 0 if `stop` limits the number of steps, else the number
-        of steps that are missing until training is complete. `numbers` is not read. Returns the
-        points of the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises
-        SettingError for fewer than two traces outside a fold; `encoder_` stays then.
+        of steps that are missing until training is complete. `labels` (n,) are 1 or 0, `folds` (n,)
+        the folds; `numbers` is not read. Returns the points of the traces, float32 (n, d), row i in
+        embedding space ``folds[i]``. Raises SettingError for fewer than two traces outside a fold;
+        `encoder_` stays then.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -399,10 +400,11 @@ class TorchReducer(Reducer):
         self.loss_ = float(np.mean(losses)) if losses else float("nan")
 
     def train_step(self, optimizer: torch.optim.Optimizer, x: Tensor, y: Tensor) -> float:
-        """Take one step on x (B, K, C', L) and y (B, K); return the mean loss, in nats.
+        """Take one step on traces x (B, K, C', L), labels y (B, K); return the loss, in nats.
 
-        The averaged weights move as well, and `n_steps_` grows by 1. The loss is the one before the
-        step, the mean over the batch and over the K copies of the network.
+        `optimizer` is that of `make_optimizer`. The averaged weights move as well, and `n_steps_`
+        grows by 1. The loss is the one before the step, the mean over the batch and over the K
+        copies of the network.
         """
         logits = self.members_(x)  # (B, K)
         loss = F.binary_cross_entropy_with_logits(logits, y)
@@ -725,9 +727,10 @@ def compile_fault(network: NetworkFactory, channels: int, samples: int) -> str:
     """Return why TorchScript cannot compile a network, and log it as a warning; "" if it can.
 
     A user's network may hold Python that TorchScript does not support. To find out, two copies of
-    it are built, compiled and run; any exception counts as a fault, and none is raised. A process
-    keeps the answers for the last 32 networks and shapes, and logs nothing when it gives such an
-    answer again. The state of torch's global random generator does not change.
+    it for preprocessed traces (channels, samples) are built, compiled and run; any exception counts
+    as a fault, and none is raised. A process keeps the answers for the last 32 networks and shapes,
+    and logs nothing when it gives such an answer again. The state of torch's global random
+    generator does not change.
     """
     try:
         with torch.random.fork_rng(devices=[]), torch.inference_mode():

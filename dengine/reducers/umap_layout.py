@@ -298,11 +298,12 @@ def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
 
 
 def learning_rates(n_epochs: int, stop: StopRule) -> Iterator[float]:
-    """Yield the learning rate of each epoch, which falls from 1 towards 0.
+    """Yield the learning rate of each of `n_epochs` epochs, which falls from 1 towards 0.
 
-    `stop` is asked before each epoch. If it limits the number of steps, the rate falls within that
-    number. After its deadline at most ten more epochs are taken, over which the rate falls quickly:
-    at a high rate the points would stay scattered by the negative samples of the last epoch.
+    `stop` is asked before each epoch. If `stop` limits the number of steps, the rate falls within
+    that number. After its deadline at most ten more epochs are taken, over which the rate falls
+    quickly: at a high rate the points would stay scattered by the negative samples of the last
+    epoch.
     """
     if stop.max_steps is not None:
         n_epochs = min(n_epochs, stop.max_steps)
