@@ -23,12 +23,12 @@ FoldArray = NDArray[np.int64]
 
 
 def hash_weights(size: int) -> FoldArray:
-    """Return pseudo-random odd weights, one for each sample position; the same at each call.
+    """Return pseudo-random odd integers, one for each sample of a trace; the same at each call.
 
     Parameters
     ----------
     size : int
-        Number of samples of all channels.
+        Number of samples of a trace, all channels together.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def content_hash(X: NDArray[np.floating]) -> FoldArray:
 
 
 def part_hash(part: str) -> int:
-    """Hash a part's number to a signed 64-bit integer that is never 0.
+    """Hash the number of a part, a text, to a signed 64-bit integer that is never 0.
 
     References
     ----------
@@ -93,7 +93,8 @@ def trace_hash(content: int, part: str | None) -> int:
 def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:
     """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64 of shape (n,).
 
-    It is a fixed function of the hash and the salt: the same arguments give the same integers.
+    It is a fixed function of the hash and the salt, an integer that makes another sequence: the
+    same arguments give the same integers.
     """
     with np.errstate(over="ignore"):
         h = np.asarray(hashes, dtype=np.int64) ^ np.int64(salt)

@@ -45,11 +45,12 @@ BETS = (0.05, 0.1, 0.2, 0.4, 0.7, 0.98)  # never 1: after one bad part its capit
 
 
 def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) -> float:
-    """Return the log capital of a bettor who bets that parts fail less often than `tolerance`.
+    """Return the logarithm of the evidence that parts fail less often than `tolerance`.
 
-    The capital starts at 1, so the result is 0 for no parts. It falls with each bad part, unless
-    tolerance and propensity are 1, and rises with each other part, unless the tolerance is 0. It is
-    a weighted mean of six capitals, each with a fixed stake. No argument is checked.
+    The evidence is the capital of a bettor who bets on each part being good. It starts at 1, so the
+    result is 0 for no parts. It falls with each bad part, unless tolerance and propensity are 1,
+    and rises with each other part, unless the tolerance is 0. It is a weighted mean of the capitals
+    of six bettors, each of whom always bets the same share of the capital. No argument is checked.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
     Parameters
     ----------
     n : int
-        Number of parts, of known outcome or not.
+        Number of parts, of known outcome (good or bad) or not.
     n_bad : int
         Parts among them whose outcome was asked for and is bad.
     alpha : float
@@ -130,13 +131,13 @@ def failure_bound(n: int, n_bad: int, alpha: float, propensity: float = 1.0) -> 
 def cusum(share: float, parts: float) -> tuple[int, int]:
     """Design the CUSUM detector that notices soonest when the share of wrong decisions doubles.
 
-    A wrong decision adds `step` to a sum, a right one takes 1 from it, and the sum restarts at 0
-    if it would fall below. The detector alarms when the sum is `limit` or more.
+    A wrong decision adds `step` to a sum, a right one takes 1 from it, and the sum restarts at 0 if
+    it would fall below. The detector alarms when the sum is `limit` or more.
 
     Parameters
     ----------
     share : float
-        Probability, above 0 and below 0.5, with which a decision may be wrong.
+        Probability, above 0 and below 0.5, with which a decision may be wrong. It is not checked.
     parts : float
         So many parts, or more, shall pass on average before a false alarm, as long as each decision
         is wrong with probability `share` or less given the past.
@@ -144,7 +145,7 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     Returns
     -------
     step : int
-        At least 1.
+        What a wrong decision adds to the sum; at least 1.
     limit : int
         The smallest limit, 1 or more, with which `parts` or more pass on average.
 
@@ -166,8 +167,9 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
 def _run_length(share: float, step: int, limit: int) -> float:
     """Return the mean number of parts until a CUSUM that starts at 0 reaches `limit`.
 
-    A part is wrong with the probability `share` and then adds `step`; a right one takes 1. The mean
-    is exact, not simulated (Brook and Evans, 1972, Biometrika 59).
+    A CUSUM is a running sum that never falls below 0. Each part is a decision, which is wrong with
+    the probability `share` and then adds `step`; a right one takes 1. The mean is exact, not
+    simulated (Brook and Evans, 1972, Biometrika 59).
     """
     # The mean from the sum s is a[s] + b[s] t, where t is the mean from the largest sum; it is
     # computed downwards, and the equation at 0 gives t. At and beyond the limit both are 0.
@@ -286,9 +288,11 @@ class Certificate:
         """Lower bound on what was saved by not checking accepted parts, in the unit of the prices.
 
         It is check * n_unchecked - escape * min(n_unchecked, n * upper), where `check` and `escape`
-        are the prices of a check and of a bad part that is accepted. An audited part saves no
-        check, and it cannot escape. Like `upper` it bounds an expectation. It may be negative: then
-        not checking may have cost money. None without prices.
+        are the prices of a check and of a bad part that is accepted, and the other names are
+        attributes of `accepted`: the parts without a check, all parts including audited ones, and
+        the bound on their mean failure probability. An audited part saves no check, and it cannot
+        escape. The result bounds the expected saving. It may be negative: then not checking may
+        have cost money. None without prices.
         """
         if self.prices is None:
             return None
@@ -296,7 +300,11 @@ class Certificate:
         return checks - escapes
 
     def _checks_and_escapes(self, prices: tuple[float, float, float]) -> tuple[float, float]:
-        """Return the price of the checks left out, and an upper bound on the cost of bad parts."""
+        """Return the price of the checks left out, and an upper bound on the cost of bad parts.
+
+        Both are about accepted parts and in the unit of `prices`, which are the prices of a check,
+        of a bad accepted part and of a good rejected part; the last is not used.
+        """
         check, escape, _ = prices
         n_unchecked = self.accepted.n_unchecked
         n_escaped = min(n_unchecked, self.accepted.n * self.accepted.upper)
@@ -312,11 +320,11 @@ class Certificate:
         """The claim about accepted parts in English: "Of 1,203 parts ..., at most 3.5 % were bad".
 
         It names the confidence and the tolerance (with prices, the share of bad parts up to which
-        accepting pays). If nothing can be claimed, it says so, and why. With prices it also says
-        what the checks that were left out would have cost, what bad parts cost at most, rounded up,
-        and the difference, rounded down: what was saved at least, or lost at most. These costs are
-        missing if the bound is 1 or all parts were checked. With prices the last sentence says when
-        accepting pauses.
+        accepting pays). If nothing can be claimed, it says so, and why. If the certificate has
+        prices, it also says what the checks that were left out would have cost, what bad parts cost
+        at most, rounded up, and the difference, rounded down: what was saved at least, or lost at
+        most. These costs are missing if the bound is 1 or all parts were checked. With prices the
+        last sentence says when accepting pauses.
         """
         unknown = (
             "silence is no success: set audit_rate, or stops='all' where every bad part stops the "
@@ -358,12 +366,13 @@ class Certificate:
 
         It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
         tolerance or, with prices, the share up to which the decision pays. It says that nothing can
-        be said if the group is empty, if no outcome was asked for (`unknown` is the reason), or if
-        the bound is 1.
+        be said if the group is empty, if its `propensity` is 0, because no outcome was asked for
+        (`unknown` is the reason that is given), or if the bound is 1.
 
-        `which` describes the parts, for example "rejected without a check". A claim that rests on
-        audits names instead the parts that the model would `verb`, for example "reject", and how
-        many of them were audited. `wrong` says what a wrongly decided part was, "bad" or "good".
+        `which` describes the parts, for example "rejected without a check". If outcomes come from
+        audits, the claim names instead the parts that the model would `verb` ("accept" or
+        "reject"), and how many of them were audited; in shadow mode, that each was checked. `wrong`
+        says what a wrongly decided part was, "bad" or "good".
         """
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""
@@ -390,7 +399,8 @@ class Certificate:
 def _round_up(bound: float) -> str:
     """Return a probability in per cent, rounded up, as in "3.5 %": never less than the bound.
 
-    It has at most one digit after the point from 1 % on, two from 0.1 % on, and four below.
+    `bound` is the probability, from 0 to 1. The text has at most one digit after the point from 1 %
+    on, two from 0.1 % on, and four below.
     """
     digits = 4
     if bound >= 0.01:
@@ -422,7 +432,7 @@ def certify(
     Returns
     -------
     Certificate
-        Without prices.
+        Without prices; its tolerance is rounded to 12 decimals.
 
     Raises
     ------
@@ -436,11 +446,11 @@ def certify(
     If `stops` is "all", or every accepted part was confirmed or stopped the line, all outcomes are
     known, and the bound is about the accepted parts. Otherwise it comes from audits and is about
     all parts that the model would have accepted, those that were audited included; it is never
-    below the share known to be bad. Without audits it is 1. If either bound may come up, they share
-    alpha, a tenth for known outcomes and nine tenths for audits: whoever sees one of them now and
-    the other later is then wrong with probability alpha at most. The bound on rejected parts comes
-    from audits, and without these it is 1; it is never below the share known to be good. A
-    forgotten or overdue label counts as a wrong decision.
+    below the share known to be bad. Without audits it is 1. With audits and `stops` "some", the
+    bound may come from known outcomes now and from audits later. The two then share alpha, a tenth
+    for known outcomes and nine tenths for audits: whoever sees both is wrong with probability alpha
+    at most. The bound on rejected parts comes from audits, and without these it is 1; it is never
+    below the share known to be good. A forgotten or overdue label counts as a wrong decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
     expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")
@@ -474,10 +484,14 @@ def certify(
 def _bound_audits(
     n_unchecked: int, n_audited: int, n_bad: int, n_others: int, audit_rate: float, alpha: float
 ) -> OutcomeBound:
-    """Return the bound that rests on audits, about unchecked and audited parts together.
+    """Return the bound on wrong decisions that rests on audits, and the counts that it is about.
 
-    `n_bad` of the audited parts, and `n_others` of the unchecked ones, are known to be decided
-    wrongly: the bound is never below the share of both.
+    It is about `n_unchecked` parts that were decided without a check and `n_audited` audited ones,
+    together; `alpha` is its error level. `n_bad` of the audited parts, and `n_others` of the
+    unchecked ones, are known to be decided wrongly: the bound is never below the share of both.
+    `audit_rate` is the probability with which a certain decision is audited. In the result
+    `shadowed` is True if `audit_rate` is 1 and no part went unchecked. Raises the errors of
+    `failure_bound`.
     """
     n = n_unchecked + n_audited
     bound = _bound_outcomes(n, n_audited, n_bad, n_unchecked, audit_rate, alpha)

@@ -56,10 +56,11 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         self.capacity = capacity
 
     def fit(self, Z: ArrayLike, y: ArrayLike) -> Self:
-        """Make these embeddings the references, in place of all earlier ones.
+        """Make these embeddings the references (labelled points), in place of all earlier ones.
 
-        It sets `classes_`, the sorted classes, of which the last is the success. A lone class 0,
-        False or -1 counts as failure, any other lone class as success.
+        It sets `classes_`, the sorted classes, of which the last is the success, `index_`, which
+        holds the references, and `neighbours_`, which decides by them. A lone class 0, False or -1
+        counts as failure, any other lone class as success.
 
         Parameters
         ----------
@@ -120,17 +121,18 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return np.array([ACTIONS[int(position)] for position in positions], dtype=object)
 
     def predict_proba(self, Z: ArrayLike) -> Floats:
-        """Return the observed rates of both classes within the radius.
+        """Return the observed rates of both classes within the radius; NotFittedError before `fit`.
 
         Parameters
         ----------
         Z : array, shape (n, d)
+            Points; ValueError if scikit-learn refuses them.
 
         Returns
         -------
         array of float64, shape (n, 2)
             Rate of failure, rate of success, in the order of `classes_`; 0.5 each without
-            neighbours. Ones of shape (n, 1) if `classes_` has one class.
+            neighbours. Ones, of shape (n, 1) if `classes_` has one class.
         """
         n_success, n_failure = self.count(Z)
         n = n_success + n_failure
@@ -177,10 +179,12 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         return RadiusNeighbours(index, rule, self.radius, scored and rule.sorts)
 
     def _decisions(self, Z: ArrayLike) -> Floats:
-        """Decide on each row of Z (n, d); raises NotFittedError before `fit`.
+        """Decide on each row of Z (n, d), by the labels within the radius.
 
-        Returns float64 (n, 5): `ActionCode` (0 verify, 1 accept, 2 reject), lower, upper,
-        n_success, n_failure.
+        Returns float64 (n, 5), with the columns `ActionCode` (0 verify, 1 accept, 2 reject), lower,
+        upper (bound on the success probability), n_success and n_failure (labels within the
+        radius). Raises NotFittedError before `fit`, and ValueError for arrays that scikit-learn
+        refuses.
         """
         check_is_fitted(self)
         valid = validate_data(self, Z, reset=False)

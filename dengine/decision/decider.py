@@ -106,8 +106,8 @@ class Decider(nn.Module):
         x : Tensor of float32, shape (C, T)
             The trace.
         part : int, default 0
-            Hash of its part's number, 0 if unknown: then the content hash stands for the part. The
-            part's own references do not count.
+            Hash of the number of the part that the trace is of, 0 if unknown: then the content hash
+            stands for the part. References (labelled points) of this part do not count.
 
         Returns
         -------
@@ -117,8 +117,9 @@ class Decider(nn.Module):
         content : int
             Content hash of the trace (`folds.content_hash`).
         action, predicted : int
-            `ActionCode`s: what to do, and what the model alone would do. They differ in an audit,
-            and if a force limit rejects. `predicted` is VERIFY if the model did not predict.
+            `ActionCode`s (0 verify, 1 accept, 2 reject): what to do, and what the model alone would
+            do. They differ in an audit, and if a force limit rejects. `predicted` is VERIFY if the
+            model did not predict.
         reason : int
             Position in `Reason`; for a faulty trace it is the fault.
         lower, upper : float
@@ -175,7 +176,7 @@ class Decider(nn.Module):
         """Return a pseudo-random integer from 0 to 2**30 - 1 that is a fixed function of the value.
 
         It is the number that `folds.toss` returns for this value. The arithmetic is on tensors
-        because int64 wraps around there, compiled or not.
+        because tensors of int64 wrap around, compiled or not.
         """
         h = torch.tensor(value)
         h = (h ^ (h >> 32)) * self.mix

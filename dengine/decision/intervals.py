@@ -198,7 +198,7 @@ def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[An
     xp : module
         `numpy` or `torch`, whose functions are used.
     n_success, n_failure : float64 array or tensor, of one shape
-        Counts of each kind.
+        Counts of successes and of failures, 0 or more; not checked.
     z : float
         Normal quantile, see `normal_quantile`.
 
@@ -221,7 +221,7 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
     xp : module
         `numpy` or `torch`, whose functions are used.
     n_success, n_failure : float64 array or tensor, of one shape
-        Counts of each kind.
+        Counts of successes and of failures, 0 or more; not checked.
     z : float
         Normal quantile, see `normal_quantile`.
 
@@ -237,9 +237,10 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
 
 
 def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute `wilson_interval` of two integers at the normal quantile z.
+    """Compute the Wilson interval of a success probability from two integer counts.
 
-    Returns (lower, upper) within [0, 1], which is (0, 1) if both counts are 0. TorchScript compiles
+    `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
+    [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles
     it.
     """
     total = float(n_success + n_failure)
@@ -252,9 +253,10 @@ def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float
 
 
 def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
-    """Compute `wald_interval` of two integers at the normal quantile z.
+    """Compute the Wald interval of a success probability from two integer counts.
 
-    Returns (lower, upper) within [0, 1], which is (0, 1) if both counts are 0. TorchScript compiles
+    `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
+    [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles
     it.
     """
     total = float(n_success + n_failure)
@@ -286,10 +288,11 @@ def _beta_interval(
 ) -> Bounds:
     """Return quantiles of Beta distributions, at alpha / 2 and 1 - alpha / 2, as (lower, upper).
 
-    `prior` is added to the count of the side that an end belongs to (successes for the lower end,
-    failures for the upper one), `other_prior` to the other count. The lower end is 0 without a
+    For the lower end, `prior` is added to the successes and `other_prior` to the failures; for the
+    upper end it is the other way round. `alpha` is the error level. The lower end is 0 without a
     success, the upper end 1 without a failure. The ends are arrays of the counts' shape, or floats
-    for scalar counts. Raises SettingError for an alpha, ValueError for counts out of range.
+    for scalar counts. Raises SettingError for an alpha out of range, ValueError for negative counts
+    and for counts of two shapes.
     """
     from scipy.special import betaincinv
 
@@ -305,7 +308,7 @@ def _beta_interval(
 
 
 def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return both counts as float64 arrays; ValueError for other shapes and negative counts."""
+    """Return both counts as float64 arrays; ValueError for negative counts and for two shapes."""
     successes = np.asarray(n_success, dtype=np.float64)
     failures = np.asarray(n_failure, dtype=np.float64)
     if successes.shape != failures.shape:
@@ -319,10 +322,12 @@ def _as_counts(n_success: ArrayLike, n_failure: ArrayLike) -> tuple[FloatArray, 
 def _clip_limits(
     xp: Any, lower: Any, upper: Any, n_success: Any, n_failure: Any
 ) -> tuple[Any, Any]:
-    """Return limits within [0, 1] that enclose the observed rate; (0, 1) if nothing was counted.
+    """Return interval limits, clipped to [0, 1] and moved to enclose the observed success rate.
 
-    All are float64 arrays (`xp` is numpy) or tensors (`xp` is torch). Rounding alone could push a
-    limit past the rate or out of [0, 1].
+    The result is (lower, upper), which is (0, 1) if nothing was counted. `lower` and `upper` are
+    the computed limits, `n_success` and `n_failure` the counts. All are float64 arrays (`xp` is
+    numpy) or tensors (`xp` is torch). Rounding alone could push a limit past the rate or out of
+    these.
     """
     total = n_success + n_failure
     rate = n_success / xp.where(total > 0.0, total, 1.0)

@@ -74,10 +74,11 @@ class SafeMode(IntEnum):
 
 
 def max_recent_errors(tolerance: float) -> int:
-    """Return how many of the newest `N_RECENT` outcomes of a level may be wrong.
+    """Return how many of the newest `N_RECENT` (50) outcomes of a level may be wrong.
 
     It is the smallest k for which more than k are wrong with a probability of at most
-    `TAIL_PROBABILITY`, if each outcome is wrong with the probability `tolerance`, independently.
+    `TAIL_PROBABILITY` (0.2), if each outcome is wrong with the probability `tolerance`,
+    independently.
     """
     tail = 1.0
     k = -1
@@ -88,11 +89,12 @@ def max_recent_errors(tolerance: float) -> int:
 
 
 def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[float]:
-    """Return what each outcome adds to the log capital of a bet that the tolerance is kept.
+    """Return what an outcome adds to the logarithm of the capital of a bet on the tolerance.
 
-    The capital is the evidence: 1 / alpha or more refutes, at error level alpha, that the share of
-    wrong parts is above the tolerance. A checked part's outcome was asked for with certainty, an
-    audited part's with the probability `inclusion_probability`.
+    The bet is that the share of wrong parts (bad if accepted, good if rejected) is below
+    `tolerance`, and its capital is the evidence for this: 1 / alpha or more refutes, at error level
+    alpha, that the share of wrong parts is above the tolerance. A checked part's outcome was asked
+    for with certainty, an audited part's with the probability `inclusion_probability`.
 
     Returns
     -------
@@ -234,10 +236,11 @@ class MemberEvidence(nn.Module):
         self.register_buffer("detector_sums", torch.zeros(3, dtype=torch.float64))
 
     def action(self, lower: float, upper: float) -> int:
-        """Return the `ActionCode` that a bound allows at present.
+        """Return the `ActionCode` (0 verify, 1 accept, 2 reject) that a bound allows at present.
 
-        It accepts if `lower` reaches the accept threshold, and rejects if 1 - `upper` reaches the
-        reject threshold. If both hold, or neither, it verifies.
+        The bound, `lower` and `upper`, is on the success probability. The part is accepted if
+        `lower` reaches the accept threshold, and rejected if 1 - `upper` reaches the reject
+        threshold, both from `thresholds`. If both hold, or neither, it is verified.
         """
         thresholds: list[float] = self.thresholds.tolist()
         accepts = lower >= thresholds[0]
@@ -250,14 +253,16 @@ class MemberEvidence(nn.Module):
         """Step the drift detectors with parts of unknown outcome and the novelty of one trace.
 
         It is called just before `update`, for the same part. A detector is a running sum of errors;
-        when the sum reaches a limit, it raises an alarm, which starts the safe mode. `n_unreported`
-        accepted parts went on since the last label. They count as not wrong, and outside of a safe
-        mode as not novel, so they lower the sums.
+        when the sum reaches a limit, it raises an alarm, which starts the safe mode (nothing is
+        accepted or rejected). `n_unreported` is the number of accepted parts since the last label
+        whose outcome is unknown. Each lowers the sum of the detector of accepted parts like a part
+        that was good, and, outside of a safe mode, the sum of the detector of novel traces like a
+        trace that was not novel.
 
         `novel` says whether the trace of this part was novel. Outside of a safe mode it steps the
-        detector of novel traces. In a safe mode for novel traces, the sum of that detector counts
-        how long few traces have been novel, by which `update` ends the safe mode. In any other safe
-        mode `novel` has no effect.
+        detector of novel traces. In a safe mode that began because of novel traces, the sum of that
+        detector counts how long few traces have been novel, by which `update` ends the safe mode.
+        In any other safe mode `novel` has no effect.
         """
         self.step_detector(Detector.ACCEPTED_PARTS.value, self.correct_step, n_unreported)
         safe_mode = int(self.safe_mode.item())
@@ -280,19 +285,23 @@ class MemberEvidence(nn.Module):
         predicted: int,
         inclusion_probability: float,
     ) -> None:
-        """Count a part's outcome on both sides, choose the thresholds, and end a safe mode if due.
+        """Count the outcome of a part, choose thresholds anew, and end a safe mode if it is due.
 
-        `lower` and `upper` are the bound that the part was decided by, `success` is its label, and
-        `predicted` (an `ActionCode`) is what the model alone would have done. If the rule knows all
+        In a safe mode all parts are verified. The outcome is counted on both sides, for accepting
+        and for rejecting. `lower` and `upper` are the bound on the success probability that the
+        part was decided by, `success` is its label, and `predicted` (an `ActionCode`: 0 verify, 1
+        accept, 2 reject) is what the model alone would have done. If the decision rule knows all
         outcomes (its own inclusion probability is 1), every part counts as checked. Otherwise
         `inclusion_probability`, with which this outcome would be asked for, says how it counts: 1
         as checked, above 0 as audited, and at 0 only the drift detectors see it. A wrong outcome
-        may raise an alarm, which starts the safe mode: both sides (accepting, rejecting) are
-        closed, so parts are verified until a side has a threshold again that is not `CLOSED`.
+        may raise an alarm, which starts the safe mode: both thresholds are then `CLOSED`, which no
+        score reaches, so parts are verified until a side has another threshold.
 
-        A safe mode ends only here. After an alarm of a side it ends when that side has such a
-        threshold; the other side may have one earlier, and then decides again. After too many novel
-        traces it ends when few traces are novel again and either side has such a threshold.
+        A safe mode ends only here. After an alarm about accepted or rejected parts it ends when
+        that side has another threshold than `CLOSED`; the other side may have one earlier, and then
+        decides again. After too many novel traces it ends when few traces are novel again and one
+        of the two thresholds is not `CLOSED`. The sum of the detector of novel traces then restarts
+        at 0.
         """
         side = Detector.ACCEPTED_PARTS.value
         self.count_outcome(side, lower, not success, predicted, inclusion_probability)
@@ -317,17 +326,18 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count one part of known outcome on one side, then choose the threshold of that side.
 
-        Side 0 accepts, and its score is the lower bound; side 1 rejects, and its score is 1 - upper
-        bound. `wrong` says whether the side's action would have been wrong. If the score reaches
-        the threshold, the drift detector of the side takes a step first, which may start the safe
-        mode.
+        Side 0 is accepting, and its `score` is the lower bound of the success probability; side 1
+        is rejecting, and its score is 1 - upper bound. `wrong` says whether this action would have
+        been wrong for the part. If the score reaches the threshold of the side, the drift detector
+        of the side takes a step first, which may start the safe mode (all is verified).
 
-        If the rule knows all outcomes, the part counts as checked; otherwise
+        If the decision rule knows all outcomes, the part counts as checked; otherwise
         `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. Each
-        level that the score reaches counts the part. The part is a member (one of the parts that
-        the claim is about) if its score reaches the target level, or if `predicted`, what the model
-        alone would have done, is the side's action. No threshold is chosen if the part is counted
-        nowhere.
+        level (possible threshold) that the score reaches counts the part, and keeps whether it was
+        wrong among its newest 50. The part is a member (one of the parts that the claim is about)
+        if its score reaches the target level, or if `predicted`, the `ActionCode` of what the model
+        alone would have done, is the action of this side. No threshold is chosen if the part is
+        counted nowhere.
         """
         if score >= float(self.thresholds[side].item()):
             self.step_detector(side, self.error_steps[side] if wrong else self.correct_step, 1)
@@ -366,11 +376,11 @@ class MemberEvidence(nn.Module):
             self.raise_alarm(detector)
 
     def add_steps(self, detector: int, step: float, times: int) -> float:
-        """Add `step` to a detector's sum `times` times, once or more, and return the new sum.
+        """Add `step` to the sum of a detector `times` times, once or more, and return the new sum.
 
-        Before each step a sum below 0 is taken as 0, so the new sum may be one step below 0. If
-        `times` is above 1, `step` must be negative: the caller compares only the new sum with the
-        limit.
+        `detector` is its position in `detector_sums`, which is changed in place. Before each step a
+        sum below 0 is taken as 0, so the new sum may be one step below 0. If `times` is above 1,
+        `step` must be negative: the caller compares only the new sum with the limit.
         """
         before = float(self.detector_sums[detector].item())
         total = max(before + (times - 1) * step, 0.0) + step
@@ -388,11 +398,12 @@ class MemberEvidence(nn.Module):
         self.start_safe_mode(reason if safe_mode == SafeMode.NONE.value else min(safe_mode, reason))
 
     def start_safe_mode(self, safe_mode: int) -> None:
-        """Accept and reject nothing until the members from now on show recovery.
+        """Accept and reject nothing until the outcomes of parts from now on show recovery.
 
-        `safe_mode` is a `SafeMode`, not NONE. The detectors and the counts since the last alarm
-        restart at 0, and the target is the strictest level again. The counts over all time, and the
-        newest errors of each level, stay.
+        `safe_mode`, a `SafeMode` other than NONE, says which alarm began it. Both thresholds become
+        `CLOSED`, which no score reaches. The sums of the drift detectors and the counts since the
+        last alarm restart at 0, and the target level of both sides is the strictest again. The
+        counts over all time, and the newest errors of each level, stay.
         """
         self.detector_sums.zero_()
         self.member_counts_since_alarm.zero_()
@@ -402,17 +413,20 @@ class MemberEvidence(nn.Module):
         self.safe_mode.fill_(safe_mode)
 
     def choose_threshold(self, side: int) -> None:
-        """Set target level and threshold of one side, accept or reject, from the counts.
+        """Set target level and threshold of one side (0 accepting, 1 rejecting) from the counts.
 
-        The target is the lowest level whose parts since the last alarm give enough evidence: log
-        capital of the bet, or under the priced rule balance of costs. Under the pooled rule its
-        newest parts must also have few errors. If no level is like this, the target is the
-        strictest level. The threshold is the score of the target if such a level was found, all
-        members so far give enough evidence, and the members since an alarm, if there was one, show
-        recovery; otherwise it is `CLOSED`.
+        The target is the lowest level (possible threshold) whose parts since the last alarm give
+        enough evidence. The evidence is the log capital of a bet on the tolerance, or under the
+        priced rule what was saved minus what errors cost. Under the pooled rule it is also required
+        that few of the newest 50 parts of the level were wrong (`max_recent_errors`). If no level
+        meets this, the target is the strictest level. The threshold is the score of the target if
+        such a level was found, all members (the parts that the promise is about) so far give enough
+        evidence, and the members since an alarm, if there was one, show recovery; otherwise it is
+        `CLOSED`, which no score reaches.
 
-        The watched rule has no target. Only an alarm closes its threshold, which becomes the first
-        level again once the members since the alarm show recovery.
+        The watched rule (the paper's rule with a safe mode) has no target. Only an alarm closes its
+        threshold, which becomes the first level again once the members since the alarm show
+        recovery.
         """
         is_recovered = self.members_to_recovery(side) <= 0.0
         if self.is_watched:  # only an alarm closes it
@@ -446,12 +460,13 @@ class MemberEvidence(nn.Module):
         return weighted_sum(counts, self.level_steps[side]) >= self.level_minimum[side]
 
     def members_to_recovery(self, side: int) -> float:
-        """Return how many more members a side needs until it shows recovery from an alarm.
+        """Return how many more members one side needs until it shows recovery from an alarm.
 
-        Members are the parts that the rule's claim is about. It is assumed that their outcomes go
-        on as they were since the alarm. The result is 0 or less if they show recovery now, so that
-        the side may open again. It is huge, about 1e12, while their evidence does not grow. The
-        priced rule needs at least `FEWEST_SINCE_ALARM` members.
+        `side` is 0 for accepting, 1 for rejecting; members are the parts that the promise is about.
+        The number supposes that their outcomes go on as they were since the alarm. It is 0 or less
+        if they show recovery now, so that the side may open again. It is huge, about 1e12 or more,
+        while their evidence does not grow. Under the priced rule at least 25 members since the
+        alarm (`FEWEST_SINCE_ALARM`) are needed. Nothing is changed.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

@@ -16,10 +16,11 @@ SAFE_MODE = REASONS.index(Reason.SAFE_MODE)
 
 
 def fade(probability: float, n_labels: int, prior_labels: float) -> float:
-    """Return a probability that is drawn towards 1/2 while a model has learned from few labels.
+    """Return a probability that is drawn towards 1/2 while few labels are known.
 
-    Its logit is multiplied by n / (n + `prior_labels`), where n is the number of labels. If
-    `prior_labels` is 0, the probability is returned unchanged.
+    Its logit is multiplied by `n_labels` / (`n_labels` + `prior_labels`), where `prior_labels` says
+    how strongly it is drawn, as a number of labels. If `prior_labels` is 0, the probability is
+    returned unchanged.
     """
     if prior_labels == 0.0:
         return probability
@@ -73,14 +74,15 @@ class RadiusNeighbours(nn.Module):
         return self.uncertain if self.rule.safe_mode() == 0 else self.safe_mode
 
     def forward(self, z: Tensor, part: int = 0) -> tuple[int, float, float, int, int]:
-        """Decide on one embedded trace; the rule and the references do not change.
+        """Decide on one embedded trace; the decision rule and the references do not change.
 
         Parameters
         ----------
         z : Tensor of float32, shape (K, d)
             The scaled embedding in each of the K embedding spaces.
         part : int, default 0
-            Hash of its part, whose own references do not count; 0 for an unknown part.
+            Hash of the part that the trace is of. References (labelled points) of this part do not
+            count; 0 for an unknown part, which excludes none.
 
         Returns
         -------
@@ -89,9 +91,10 @@ class RadiusNeighbours(nn.Module):
         lower, upper : float
             Bound on the success probability, from the counts. If `scored`, both are the mean of the
             first coordinates in the K spaces, drawn towards 1/2 by the rule's `prior_labels`
-            (`fade`), and the action follows from it.
+            (`fade`), and the action follows from this mean.
         n_success, n_failure : int
-            Labels within the radius; several labels of one part may count as fewer.
+            Labels within the radius; several labels of one part may count as fewer
+            (`RadiusIndex.count_votes`).
         """
         distances = self.references.squared_distances(z, part)
         n_success, n_failure = self.references.count_near(distances, self.radius)

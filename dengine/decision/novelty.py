@@ -123,9 +123,9 @@ class NoveltyGate(nn.Module):
         Each score looks at one group of features: the level of the signals, their texture (how
         rough they are), distortions (what a faulty sensor or clock would do), and gaps. It is the
         squared distance to the nearest reference in these features, divided by the limit of the
-        group; references are traces of the training. A reference in a small cluster of unusual
-        traces counts as nearer than it is, so a score near it may be below 0. A score is NaN or
-        infinite if a feature overflows.
+        group; references are traces that the gate was fitted to. A reference in a small cluster of
+        unusual traces counts as nearer than it is, so a score near it may be below 0. A score is
+        NaN or infinite if a feature overflows.
         """
         plain = self.plain_features(x)
         features = torch.cat([plain, plain @ self.discriminants])
@@ -136,11 +136,14 @@ class NoveltyGate(nn.Module):
     def plain_features(self, x: Tensor) -> Tensor:
         """Return the features of traces (..., C, T) that are not distortions, (..., P) float32.
 
-        For each channel they are the S minima and the S maxima of the segments, then 2*S + 3
-        logarithms of roughness, which is a norm of differences. The first S are of first
-        differences in the segments, the next S of second differences in the segments. The last
-        three, for gaps, are of first differences in brief stretches: the least over stretches of
-        twice the brief length, then the least and the largest over stretches of the brief length.
+        A channel is cut into S segments, overlapping stretches of equal length that together cover
+        the trace. For each channel the features are the S minima and the S maxima of the segments,
+        then 2*S + 3 logarithms of roughness, which is the norm of the differences of successive
+        samples in a stretch. The first S are of first differences in the segments, the next S of
+        second differences in the segments. The last three, for gaps, are of first differences in
+        brief stretches, which have a hundredth of the samples of a trace: the least roughness over
+        stretches of twice that length, then the least and the largest over stretches of that
+        length.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
@@ -178,11 +181,13 @@ class NoveltyGate(nn.Module):
 def fit_novelty(
     traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None
 ) -> NoveltyGate:
-    """Fit a novelty gate, which takes these traces for usual; there is no randomness.
+    """Fit a novelty gate, by which these traces are not novel; there is no randomness.
 
-    At most `REFERENCES` of the traces, evenly spaced in time, become its references; of these,
-    traces whose features overflow are left out. Each group of features (level, texture,
-    distortions, gaps; see the module) has a limit of its own.
+    At most 500 (`REFERENCES`) of the traces, evenly spaced in time, become references, to which
+    other traces are compared; of these, traces whose features overflow are left out. Each of four
+    groups of features has a limit of its own: level (minima and maxima), texture (roughness),
+    distortions (what a faulty sensor or clock would do) and gaps (the quietest and the loudest
+    brief stretches).
 
     Parameters
     ----------
@@ -192,17 +197,18 @@ def fit_novelty(
         Factor on the limits, which are squared distances. A limit is the 99.5 % quantile of the
         references' squared distances to the nearest other reference, at least 0.001; if there are
         outliers, it is less, so that a few of them do not set it. With n < 200 different references
-        it is multiplied by 200 / n; the limit of distortions by `REFERENCES` / n with n <
-        `REFERENCES`. The limit of gaps is at least 4 in the end. An outlier in a cluster of
-        outliers has a wider limit, by the distance to its third nearest outlier.
+        it is multiplied by 200 / n; the limit of distortions is multiplied by 500 / n with n < 500.
+        The limit of gaps is at least 4 in the end. An outlier in a cluster of outliers has a wider
+        limit, by the distance to its third nearest outlier.
     parts : array of int64, shape (n,), optional
-        Hashes of the parts; None: each trace is a part of its own. Only distances between different
-        parts and different traces count, because a trace that came twice is near itself.
+        Hash of the part of each trace; None: each trace is of another part. Only distances between
+        different parts and different traces count, because a trace that came twice is near itself.
 
     Returns
     -------
     NoveltyGate
-        Disabled if fewer than `FEWEST` of the references differ in part and content.
+        Disabled (no trace is novel) if fewer than 20 (`FEWEST`) of the references differ in part
+        and content.
     """
     n, channels, samples = traces.shape
     gate = NoveltyGate(channels, samples)
@@ -251,9 +257,11 @@ def fit_novelty(
 
 
 def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
-    """Return what is added to each roughness before its logarithm, float32, shape (C, 2*S + 3).
+    """Return what is added to each roughness before its logarithm, float32 (C, 2*S + 3).
 
-    It is a twentieth of the median roughness of the traces x (n, C, T), scaled to the length of the
+    `gate` says how many samples each of the 2*S + 3 roughnesses of a channel is taken over (they
+    are norms of differences in a stretch of samples, see `plain_features`). The result is a
+    twentieth of the median roughness of the traces x (n, C, T), scaled to the length of the
     stretch. For a channel that never moved it is 1e-12: any movement there is then far away.
     """
     n_samples = x.size(2)
@@ -265,7 +273,7 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
 
 
 def _distort(x: Tensor) -> list[Tensor]:
-    """Return distorted copies of traces (n, C, T): a list of `DISTORTIONS` tensors of that shape.
+    """Return distorted copies of traces x (n, C, T): a list of 14 tensors of that shape.
 
     They are what a sensor or a clock would make of the traces, each in both directions: gain and
     fading gain (4), offset, drift and a step (6), speed and delay (4). Beyond its ends a trace is
@@ -291,11 +299,13 @@ def _distort(x: Tensor) -> list[Tensor]:
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) -> Tensor:
     """Return Fisher's discriminants between traces and their distortions, float32, shape (P, D).
 
-    Column j separates the traces from their j-th distortion; it is for features that are not
-    standardised. x (n, C, T) are the traces, and plain (n, P), float64, their features. used (P,),
-    bool, marks the features that the discriminants read; the rows of the others are 0. Only some of
-    the traces are distorted, evenly spaced and fewer than two times `DISTORTED`; the mean
-    difference is taken over these. Inside, standardised features are clipped at 6 deviations.
+    A distortion is what a faulty sensor or clock would make of a trace (`_distort`). Column j
+    separates the traces from their j-th distortion; it is for features that are not standardised.
+    `x` (n, C, T) are the traces, and `plain` (n, P), float64, their features, computed by
+    `gate.plain_features`. `used` (P,), bool, marks the features that the discriminants read; the
+    rows of the others are 0. Only some of the traces, evenly spaced and fewer than 250, are
+    distorted; the mean difference is taken over these. Inside, standardised features are clipped at
+    6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
@@ -315,10 +325,10 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
 def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
     """Return (offset, gain), float64 (P,) each, so that offset + gain * features is standardised.
 
-    `features` are float64 (n, P), n at least 3. The 1 + n // TAIL_TRACES smallest and largest
-    values of each feature are first clipped to the next value inside, so that a glitch in one
-    reference does not set the scale of the others. Mean and deviation are those of the clipped
-    values.
+    `features` are float64 (n, P), where P is the number of features and n, the number of
+    references, is at least 3. The 1 + n // 200 smallest and largest values of each feature are
+    first clipped to the next value inside, so that a glitch in one reference does not set the scale
+    of the others. Mean and deviation are those of the clipped values.
 
     The gain is 1 / (deviation + floor), so it is finite. The floor is 1 % of the median deviation
     of all features, plus 1e-5 of the feature's absolute mean, which covers its rounding errors. So
@@ -337,10 +347,11 @@ def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> tuple[Tensor, int]:
-    """Return which traces are equal or of one part, (n, n) bool, and how many are not repeats.
+    """Return which traces are equal or of one part, and how many are not repeats.
 
-    `traces` is (n, C, T). The diagonal is True. The number counts the traces that are not the same
-    as an earlier one. Without `parts`, only equal traces are the same.
+    `traces` is (n, C, T), `parts` (n,) holds the hash of the part of each trace. The first result
+    is (n, n) bool, with a diagonal of True. The second counts the traces that are not the same as
+    an earlier one. If `parts` is None, only equal traces are the same.
     """
     for samples in (traces[..., ::16], traces):  # a few samples tell most apart
         numbers: dict[bytes, int] = {}
@@ -356,11 +367,11 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
 def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
     """Return (usual squared distance between nearest points, squared reach of each point (n,)).
 
-    `points` is (n, P); `same` (n, n), bool, marks pairs whose distance does not count. The usual
-    distance is the `QUANTILE` of the squared distances to the nearest other point. It is capped at
-    six times their 0.9 quantile, so that a few outliers are not the measure of the others, and is
-    at least 0.001. Outliers are the points whose nearest point is farther than that, or farther
-    than both 0.001 and three times the 0.9 quantile.
+    `points` is (n, P), the features of n references; `same` (n, n), bool, marks pairs whose
+    distance does not count. The usual distance is the 99.5 % quantile of the squared distances to
+    the nearest other point. It is capped at six times their 0.9 quantile, so that a few outliers
+    are not the measure of the others, and is at least 0.001. Outliers are the points whose nearest
+    point is farther than that, or farther than both 0.001 and three times the 0.9 quantile.
 
     The reach of a point is the usual distance. But if more than three points are outliers, some of
     them may be a cluster, a kind of its own: an outlier reaches to its third nearest outlier if all

@@ -180,11 +180,11 @@ class Policy:
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> Self:
-        """Return the policy whose settings `to_values` wrote; missing settings have their defaults.
+        """Return the policy whose settings `to_values` returned; missing ones have their defaults.
 
-        The force limits are one text, separated by spaces, or "none"; in older stores their name
-        is "windows". Names that are no settings are ignored. Raises SettingError for a value out of
-        its range.
+        `values` holds the settings by name. The force limits are one text, separated by spaces, or
+        "none"; in older stores their name is "windows". Names that are no settings are ignored.
+        Raises SettingError for a value out of its range.
         """
         names = [field.name for field in fields(cls)]
         settings = {name: values[name] for name in names if name in values}
@@ -198,7 +198,7 @@ class Policy:
         If `prices` are among them, and this policy has the guarantee "local" or "pooled", which
         have no prices, then the guarantee becomes "cost", and an audit rate of 0 becomes 0.05. A
         guarantee or an audit rate among the settings is taken instead. Raises SettingError for a
-        value out of its range.
+        value out of its range, TypeError for a name that is no setting.
         """
         implied: dict[str, Any] = {}
         if "prices" in settings and self.guarantee in ("local", "pooled"):
@@ -215,7 +215,7 @@ class Policy:
         """Share of accepted parts that may be bad, and share of rejected parts that may be good.
 
         Both are 1 - LB; under the guarantee "cost" they are check / escape and check / false
-        reject.
+        reject, the ratios of the `prices`.
         """
         if self.guarantee != "cost":
             return 1.0 - self.lower_bound, 1.0 - self.lower_bound
@@ -260,7 +260,8 @@ class Policy:
         ------
         SettingError
             If the class cannot be imported, is no `DecisionRule`, or its constructor raises
-            TypeError, since it takes other arguments. What else the constructor raises passes.
+            TypeError, since it takes other arguments. Any other error of the constructor is raised
+            as it is.
         """
         from . import member_rules  # torch is imported where it is used
         from .rule import DecisionRule
@@ -287,18 +288,19 @@ class Policy:
     def certificate(self, outcomes: Outcomes) -> Certificate:
         """Return the bounds on how often parts decided without a check were decided wrongly.
 
-        With `stops="all"`, accepted parts of unknown outcome are left out.
+        With `stops="all"`, accepted parts of unknown outcome are left out. Raises the errors of
+        `certify`.
 
         Parameters
         ----------
         outcomes : Outcomes
-            Counts of the decisions under this policy.
+            Counts of the parts decided under this policy, and of their outcomes.
 
         Returns
         -------
         Certificate
-            For accepted and for rejected parts, as `certify` returns it; with the prices if the
-            guarantee is "cost".
+            Two bounds, for accepted and for rejected parts, as `certify` returns it; with the
+            prices if the guarantee is "cost".
         """
         if self.stops == "all":
             bad = outcomes.false_accepts + outcomes.forgotten_accepts

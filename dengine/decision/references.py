@@ -48,7 +48,7 @@ def label_agreement(
     Parameters
     ----------
     points : array of float32, shape (n, d)
-        The last `SAMPLE` are used.
+        Reference points, the oldest first; only the last 3000 (`SAMPLE`) are used.
     labels : array of int, shape (n,)
         1 is success, 0 is failure.
     spaces : array of int64, shape (n,)
@@ -61,7 +61,7 @@ def label_agreement(
     -------
     float
         Upper confidence bound on the intraclass correlation, one-sided at 95 %, from 0 to 1; 1 if
-        fewer than `FEWEST_PARTS` known parts are among these points at least twice.
+        fewer than 20 (`FEWEST_PARTS`) known parts are among these points at least twice.
     """
     points = points[-SAMPLE:]
     labels = labels[-SAMPLE:]
@@ -94,9 +94,11 @@ def _success_rate_around(
 ) -> NDArray[np.float64]:
     """Return for each point the success rate among the nearest points of other parts, float64 (n,).
 
-    The `N_NEIGHBOURS` nearest are taken, or all if there are fewer. Half a success in one trial is
-    added to the counts: the rate is one half without points of other parts. All unknown parts share
-    one value of `part` and so count as one part.
+    `points` are (n, d), of one embedding space; `labels` (n,) are 1 for success, 0 for failure;
+    `part` (n,) is a number that is the same for all points of a part. The 30 nearest points are
+    taken (`N_NEIGHBOURS`), or all if there are fewer. Half a success in one trial is added to the
+    counts: the rate is one half without points of other parts. All unknown parts share one value of
+    `part` and so count as one part.
     """
     from scipy.spatial.distance import cdist
 
@@ -182,8 +184,8 @@ class RadiusIndex(nn.Module):
     def column(self, name: str) -> NDArray[Any]:
         """Return one attribute of the n points in the index, in the order of their slots.
 
-        Until the index is full that is the order of age; then new points overwrite the oldest
-        slots.
+        A slot is the position of a point. Until the index is full the slots are in the order of
+        age; then new points overwrite the oldest ones.
 
         Parameters
         ----------
@@ -209,7 +211,8 @@ class RadiusIndex(nn.Module):
     def put(self, point: Tensor, label: float, space: int, part: int = 0) -> None:
         """Add one point; in a full index it replaces the oldest.
 
-        The slot's entry in `numbers` stays as it is; `add_one` sets it.
+        The sequence number of its label, in `numbers`, is not set; `add_one` sets it. All other
+        attributes of the index are updated, except `agreement`.
 
         Parameters
         ----------
@@ -232,10 +235,12 @@ class RadiusIndex(nn.Module):
 
     @torch.jit.export
     def set_part(self, slot: int, part: int) -> None:
-        """Replace the part of the point in a slot by the hash `part`; 0 is an unknown part.
+        """Replace the part of the point at a position (slot) by the hash `part`; 0: unknown.
 
-        `first` (the first slot of each point's part) and `repeats` are updated for the points of
-        the old and of the new part. The new part is added to `part_filter`; the old one stays.
+        `first` (for each point the first slot with a point of the same part) and `repeats` (the
+        number of points whose part is in an earlier slot) are updated for the points of the old and
+        of the new part. The new part is added to `part_filter`, which says what parts may be in the
+        index; the old one stays there.
         """
         leaving = int(self.parts[slot].item())
         if leaving != 0 and int(self.repeats.item()) > 0:
@@ -263,12 +268,14 @@ class RadiusIndex(nn.Module):
             One query, embedded in every space: by K encoders, each of which never saw the labels of
             the points in its space. A single row is compared with all points, whatever their space.
         part : int, default 0
-            Hash of the query's part, whose own points are infinitely far; 0 excludes none.
+            Hash of the part that the query is of; points of this part get an infinite distance. 0
+            excludes none.
 
         Returns
         -------
         Tensor of float32, shape (n,)
-            In the order of the slots; shape (0,) for an empty index.
+            In the order of the slots, the positions of the points in the index; shape (0,) for an
+            empty index.
         """
         n = self.size()
         query = z.t()  # (d, K)
@@ -295,7 +302,7 @@ class RadiusIndex(nn.Module):
         -------
         n_success, n_failure : int
             (0, 0) for an empty index. If any part in the index came more than once, these are the
-            rounded votes of `count_votes`.
+            votes of `count_votes`, rounded to whole numbers.
         """
         n = distances.size(0)
         if n == 0:
@@ -401,7 +408,7 @@ class RadiusIndex(nn.Module):
             Hash of the point's part.
         label : int or None
             1 is success, 0 is failure. None removes the point: the other points move to the first
-            positions of the block, the oldest first, and `total` becomes their number.
+            slots, the oldest first, and `total` becomes their number.
 
         Returns
         -------
@@ -440,7 +447,12 @@ class RadiusIndex(nn.Module):
             self.agreement.fill_(label_agreement(*columns))
 
     def _index_parts(self) -> None:
-        """Compute `first`, `repeats` and `part_filter` anew from `parts`, in place."""
+        """Compute `first`, `repeats` and `part_filter` anew, in place, from the points' parts.
+
+        `first` holds for each point the first position with a point of the same part, `repeats` the
+        number of points whose part is at an earlier position. `part_filter` marks the last bits of
+        the parts' hashes, so that `squared_distances` can tell quickly that a part is not there.
+        """
         parts = self.column("parts")
         slots = np.arange(self.capacity)
         _, first, inverse = np.unique(parts, return_index=True, return_inverse=True)
@@ -451,10 +463,11 @@ class RadiusIndex(nn.Module):
         self.part_filter[torch.from_numpy(parts & self.filter_mask)] = True
 
     def get_state(self) -> dict[str, NDArray[Any]]:
-        """Return copies of the index's arrays, by name, from which `from_state` makes it again.
+        """Return copies of the arrays of the index, by name, from which `from_state` restores it.
 
-        `points` is (d, n). `labels`, `spaces`, `parts` and `numbers` are (n,), in the order of the
-        points. `agreement` and `total` are (). The attributes of the class say what they are.
+        `points` is (d, n). `labels` (1 success, 0 failure), `spaces`, `parts` (hashes) and
+        `numbers` (of the labels) are (n,), in the order of the points. `agreement` (how strongly
+        repeated labels of a part agree) and `total` (points ever added) have no dimension.
         """
         names = ("labels", "spaces", "parts", "numbers")
         state = {"points": self.column("points").T.copy()}
@@ -463,11 +476,11 @@ class RadiusIndex(nn.Module):
 
     @classmethod
     def from_state(cls, state: Mapping[str, NDArray[Any]], capacity: int) -> Self:
-        """Return a new index with the points of a state; with the same capacity in the same slots.
+        """Return a new index for `capacity` points with the points of a state.
 
-        `state` is what `get_state` returned, and is not changed. With a smaller `capacity` the
-        newest points stay. With a larger one the oldest point is in the first slot, and `total` no
-        longer counts points that left.
+        `state` is what `get_state` returned, and is not changed. With the same capacity each point
+        has its old position. With a smaller `capacity` the newest points stay. With a larger one
+        the oldest point is at the first position, and `total` no longer counts points that left.
         """
         n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)
@@ -480,9 +493,10 @@ class RadiusIndex(nn.Module):
         return index
 
     def digest(self) -> str:
-        """Return the SHA-256 of points, labels and spaces, in slot order, as 64 hexadecimal digits.
+        """Return the SHA-256 of points, labels and embedding spaces as 64 hexadecimal digits.
 
-        The bytes are points (d, n) float32, labels float32 and spaces int64, one after the other.
+        The bytes are points (d, n) float32, labels float32 and spaces int64, one after the other,
+        each in the order of the points in the index.
         """
         points = self.column("points").T
         labels = self.column("labels").astype(np.float32)

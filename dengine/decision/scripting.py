@@ -60,7 +60,11 @@ def reason_of(error: Exception) -> str:
 
 
 def attributes_of(module: nn.Module) -> dict[str, Any]:
-    """Return parameters, buffers and plain attributes of one module, without its submodules."""
+    """Return parameters, buffers and plain attributes of one module by name, without submodules.
+
+    Plain attributes are those of the object itself, `training` among them, except the ones in which
+    torch keeps parameters, submodules and hooks.
+    """
     plain = dict(vars(module))
     for name in INTERNAL & plain.keys():
         del plain[name]
@@ -84,7 +88,8 @@ def register_tensors(module: nn.Module) -> None:
     These are attributes that hold a tensor, and buffers that are not persistent, also of its
     submodules. A tensor that is not contiguous is copied, since an expanded view, in which several
     numbers share memory, cannot be written to. Tensors in a list, tuple or dict stay as they are,
-    and so does a tensor whose name is an attribute of the module's class.
+    and so does a tensor whose name is an attribute of the class of its module. Modules are changed
+    in place.
     """
     for submodule in module.modules():
         for name, value in attributes_of(submodule).items():
@@ -113,7 +118,7 @@ def restore(module: nn.Module, arrays: Arrays) -> None:
     Parameters
     ----------
     module : nn.Module
-        The module to write to.
+        The module that is changed.
     arrays : mapping of str to array
         One array for each name in `module.state_dict()`; they are cast to the tensors' dtypes.
 

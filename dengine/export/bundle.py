@@ -101,8 +101,8 @@ def prepare_export(
 ) -> tuple[Exportable, DecisionModule]:
     """Check that an engine or a model can be exported, and build its decision module.
 
-    Nothing is written. The module shares references and rule with the model. Its decider is
-    compiled already; the module itself is not.
+    Nothing is written. The module shares references and decision rule with the model. Its decider
+    is compiled already; the module itself is not.
 
     Parameters
     ----------
@@ -119,6 +119,7 @@ def prepare_export(
     source : Exportable
         The model with its `TraceSpec`, audits and force limits.
     module : DecisionModule
+        Decides on traces and learns their outcomes; the content of a TorchScript file.
 
     Raises
     ------
@@ -167,9 +168,13 @@ def prepare_export(
 def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportable:
     """Return the model that decides at present, with the engine's settings, for an exporter.
 
-    The model is not copied, and goes on learning. `trace` replaces the `TraceSpec` of the engine or
-    the model. An `Exportable` is returned as it is, without `trace`. Raises ExportError before the
-    first training, for a baseline, and if the engine's store was changed from outside.
+    `engine_or_model` is a `DataEngine` or a `ModelPrediction`. Of an engine the result has the
+    audits, the seed, the force limits, the version, the recipe, eight labelled traces, and a
+    function that records events; of a model alone, which has none of these, it has some of the
+    traces it was trained on. The model is not copied, and goes on learning. `trace` replaces the
+    `TraceSpec` of the engine or the model. If an `Exportable` is given, it is returned as it is,
+    and `trace` is ignored. Raises ExportError before the first training, for a baseline, and if the
+    engine's store was changed from outside.
     """
     if isinstance(engine_or_model, Exportable):
         return engine_or_model
@@ -207,9 +212,12 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
 def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
-    It names the schema, the versions of dengine, torch and the model, the time, the `TraceSpec`,
-    the policy, the references (their number and SHA-256), the order of fields, actions and reasons,
-    the audit rate, the seed and the recipe. `metadata_of` reads it without loading the model.
+    `source` is what the file is made from. The dict has the schema (the version of its keys), the
+    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy, the limit of
+    novelty, the numbers of embedding spaces and of coordinates, the references (labelled points:
+    their number, their largest number and their SHA-256), the order of the fields of a decision, of
+    actions, reasons and safe modes, the audit rate, the seed and the recipe. `metadata_of` reads it
+    without loading the model.
     """
     model = source.model
     index = model.index
@@ -261,7 +269,9 @@ def write_export(
     Parameters
     ----------
     path : path-like
+        The file to write.
     content : bytes
+        What it shall hold.
     force : bool, default False
         Whether it may replace a file. Without a key the signature of the replaced file is removed.
     key : path-like, optional
@@ -312,8 +322,9 @@ def read_checked(path: Path, key: FilePath | None = None) -> bytes:
     Raises
     ------
     ExportError
-        If a file is missing or unreadable, the content does not have the sum in PATH.sha256, or it
-        was not signed with this key.
+        If the file or its checksum is missing or unreadable, or the content does not have the sum
+        in PATH.sha256. With a key also if the key or the signature is missing or unreadable, or the
+        content was not signed with this key.
     """
     _read(path, most=0)  # if both are missing, the error names the file itself
     expected = _first_word(_read(sibling_path(path, "sha256"), SUM_BYTES))
@@ -358,8 +369,8 @@ def _read(path: Path, most: int = -1) -> bytes:
 def metadata_of(content: bytes, path: Path) -> Metadata:
     """Return the description inside the content of a TorchScript file, a zip archive.
 
-    No code of the file is run. Raises ExportError, which names `path`, if there is none or it has
-    another schema.
+    No code of the file is run. Raises ExportError, which names `path`, if there is no description
+    in it, or one with another schema (version of its keys).
     """
     with (
         instead(
@@ -372,9 +383,10 @@ def metadata_of(content: bytes, path: Path) -> Metadata:
 
 
 def check_schema(metadata: Any, path: Path) -> Metadata:
-    """Return a description as it is if it has the present schema, `SCHEMA`.
+    """Return `metadata`, the description of an exported file, if it has the present schema, 2.
 
-    Raises ExportError, which names `path`, if it has another schema or is not a dict.
+    The schema is the version of its keys (`SCHEMA`). Raises ExportError, which names `path`, if it
+    has another schema or is not a dict.
     """
     fields = metadata if isinstance(metadata, dict) else {}
     if fields.get("schema") != SCHEMA:

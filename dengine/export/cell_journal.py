@@ -113,8 +113,9 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     Raises
     ------
     DataError
-        For a file that is no journal of this form, a line whose checksum fits but which cannot be
-        read as `spec` says, or a journal with neither an accepted nor a labelled part.
+        For a file that is no journal of format 4, the present one (`FORM`), a line whose checksum
+        fits but which cannot be read as `spec` says, or a journal with neither an accepted nor a
+        labelled part.
     OSError
         If the file cannot be read.
     """
@@ -196,12 +197,14 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
 
 
 def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
-    """Return the decision, trace and label of a part; `words` are its line without the first word.
+    """Return the decision, trace and label of a part from the words of its line in a journal.
 
-    The trace of a rejected part is empty, (1, 0); other traces are fitted as `spec.fit` says. A
-    line does not have the embedding, the model version and the propensity (the probability of this
-    action), which become None, 0 and 1. Raises ValueError, LookupError or TraceError for words that
-    are no such line.
+    The first word, "part", and the checksum are left out; `words` are id, label ("1", "0" or "" for
+    none), number of the part, action, predicted action, reason, lower, upper, n_success, n_failure,
+    and the samples, channel after channel. The trace of a rejected part is empty, (1, 0); other
+    traces are fitted as `spec.fit` says. The embedding, the model version and the propensity (the
+    probability of a check) are not in the line; they become None, 0 and 1. Raises ValueError,
+    LookupError or TraceError for words that are no such line.
     """
     id_, label, part, action, predicted, reason, *numbers = words
     lower, upper, n_success, n_failure, *samples = numbers

@@ -152,9 +152,12 @@ class DecisionModule(nn.Module):
     ) -> None:
         """Make this decision the pending one: the one whose outcome is not reported yet.
 
-        An earlier pending decision is discarded. `action` is `NONE_PENDING` for a faulty trace;
-        then no decision is pending. If `part` is 0, the part is unknown, and the hash `content` of
-        the trace is used as its part. Whether the trace was novel is read from `reason`.
+        An earlier pending decision is discarded. `action` and `predicted`, what the model alone
+        would have done, are `ActionCode`s (0 verify, 1 accept, 2 reject); `lower` and `upper` are
+        the bound on the success probability, and z (K, d), which is copied, is the embedding.
+        `action` is `NONE_PENDING` (-1) for a faulty trace; then no decision is pending. `part` is
+        the hash of the part; if it is 0, the part is unknown, and the hash `content` of the trace
+        takes its place. Whether the trace was novel is read from `reason`, a position in `Reason`.
         """
         self.pending_action = action
         self.pending_predicted = predicted
@@ -167,7 +170,7 @@ class DecisionModule(nn.Module):
 
     @torch.jit.export
     def learn(self, trace: Tensor, success: bool, part: int = 0) -> int:
-        """Learn the outcome of a part: update the rule, and make the trace a reference.
+        """Learn the outcome of a part: update the decision rule, and make the trace a reference.
 
         If the trace and its part are those of the pending decision, its bound is used, and no
         decision is pending afterwards. Otherwise the trace is first decided on, because a bound
@@ -186,7 +189,7 @@ class DecisionModule(nn.Module):
         Returns
         -------
         int
-            Number of references.
+            Number of references (labelled points) afterwards.
 
         Raises
         ------
@@ -227,8 +230,8 @@ class DecisionModule(nn.Module):
         """End the wait for the outcome of a pending accept; return whether it was learned as good.
 
         A pending accept is the part decided last, if it was accepted and nothing was reported on
-        it. With `stops_all` (every line stop is reported) it is learned as good: the rule is
-        updated, and the trace becomes a reference. Otherwise it counts as unreported. Then no
+        it. With `stops_all` (every line stop is reported) it is learned as good: the decision rule
+        is updated, and the trace becomes a reference. Otherwise it counts as unreported. Then no
         decision is pending. If the pending decision is no accept, or there is none, nothing
         changes.
         """
@@ -253,10 +256,11 @@ class DecisionModule(nn.Module):
         """Make an earlier decision, which a journal holds, the pending decision again.
 
         A pending accept is first settled by `settle`; any other pending decision is discarded. The
-        trace, (T,) or (C, T), is embedded anew. The other fields are taken as they are given;
-        `part` is a hash, 0 if unknown. What the model alone would have done follows from action,
-        reason and bound. After a faulty trace no decision is pending. Raises ValueError, or
-        torch.jit.Error if compiled, for another shape.
+        trace, (T,) or (C, T), is embedded anew. `action` (0 verify, 1 accept, 2 reject), `reason`
+        (a position in `Reason`) and the bound, `lower` and `upper`, are taken as they are given;
+        `part` is the hash of the part, 0 if unknown. What the model alone would have done follows
+        from action, reason and bound. After a faulty trace no decision is pending. Raises
+        ValueError, or torch.jit.Error if compiled, for another shape.
         """
         x = self.as_trace(trace)
         self.settle()
@@ -291,8 +295,8 @@ class DecisionModule(nn.Module):
     def learn_pending(self, success: bool) -> None:
         """Learn the outcome of the pending decision; afterwards no decision is pending.
 
-        The rule is updated, and the trace becomes a reference with the label `success`. It is not
-        checked whether a decision is pending.
+        The decision rule is updated, and the trace becomes a reference with the label `success`, as
+        in `learn_outcome`. It is not checked whether a decision is pending.
         """
         self.learn_outcome(
             self.pending_lower,
@@ -317,14 +321,16 @@ class DecisionModule(nn.Module):
         action: int,
         predicted: int,
     ) -> None:
-        """Update the rule with an outcome, and make the trace with embedding z (K, d) a reference.
+        """Update the decision rule with an outcome, and make the trace a reference.
 
-        `lower`, `upper`, `novel`, `action` and `predicted` are those of the decision, from before
-        the label was known. `part` is the hash of the part; it also gives the part's fold k, and
-        the reference is put into embedding space k. The rule gets as inclusion probability the
-        audit rate if the part was audited, 1 if it was verified for another reason, and 0 if it was
-        accepted or rejected. It also gets `n_unreported`, which restarts at 0. If the index is
-        full, its oldest reference is dropped.
+        `success` is the label, and z (K, d) the embedding of the trace. `lower` and `upper` (the
+        bound), `novel` (whether the trace was novel), `action` and `predicted` (what the model
+        alone would have done; `ActionCode`s) are those of the decision, from before the label was
+        known. `part` is the hash of the part; it also gives the part's fold k, and the reference is
+        put into embedding space k. The rule gets as inclusion probability the audit rate if the
+        part was audited, 1 if it was verified for another reason, and 0 if it was accepted or
+        rejected. It also gets `n_unreported`, the number of accepted parts without a report since
+        the last label, which restarts at 0. If the index is full, its oldest reference is dropped.
         """
         inclusion_probability = 0.0
         if action == ActionCode.VERIFY.value:
@@ -338,7 +344,7 @@ class DecisionModule(nn.Module):
         self.n_unreported = 0
 
     def as_trace(self, trace: Tensor) -> Tensor:
-        """Return the trace as (C, T) float32 with the number of samples that the decider takes.
+        """Return a trace (T,) or (C, T) as (C, T) float32 with the samples that the decider takes.
 
         Another number of samples is cut, padded or resampled, as `TraceSpec.fit` says. Raises
         ValueError, or torch.jit.Error if compiled, for a number of samples that cannot be fitted in

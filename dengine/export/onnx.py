@@ -92,12 +92,15 @@ def export_onnx(
     ------
     ExportError
         If the engine audits (checks some parts that the model is certain of), has force limits or a
-        rule other than that of the guarantee "local" with stops "some", or if a part is among the
-        references more than once; the message names all of these that apply. Also if nothing was
-        trained yet; for a baseline; if the reducer, the interval or the rule cannot be exported; if
-        the rule is stale, because an update of it failed; if the store was changed from outside; if
-        the key cannot be read; if a package is missing; and if onnxruntime does not decide like the
+        decision rule other than that of the guarantee "local" with stops "some", or if a part is
+        among the references more than once; the message names all of these that apply. Also if
+        nothing was trained yet; for a baseline; if the reducer, the interval or the rule cannot be
+        exported; if the compiled decision and the reducer map a trace to different points; if the
+        rule is stale, because an update of it failed; if the store was changed from outside; if the
+        key cannot be read; if a package is missing; and if onnxruntime does not decide like the
         model.
+    SettingError
+        If the engine's force limits do not fit `trace`.
     OutputError
         If a file exists, without `force`, or cannot be written.
     """
@@ -116,7 +119,7 @@ def export_onnx(
 
 
 def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
-    """Check an ONNX file, load it into onnxruntime on one thread, and warm it up.
+    """Check an ONNX file, load it into onnxruntime on one thread, and decide once.
 
     Unlike `load_exported` it does not compare the embedding of a test trace with the file's.
 
@@ -135,7 +138,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     ------
     ExportError
         For a file that is missing, damaged or not signed with the key, that is no ONNX export or
-        has another schema, and if a package for ONNX is missing.
+        has another schema, and if a package for ONNX is missing. Errors of onnxruntime are raised
+        as they are.
     """
     onnx = _import_package("onnx")
     target = Path(path)
@@ -151,8 +155,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
 def _refuse_unsupported(source: Exportable) -> None:
     """Raise ExportError if the decision needs something that ONNX cannot carry, and name it all.
 
-    That is an audit rate above 0, a rule other than that of the guarantee "local" with stops
-    "some", a part that is among the references more than once, and force limits.
+    That is an audit rate above 0, a decision rule other than that of the guarantee "local" with
+    stops "some", a part that is among the references more than once, and force limits.
     """
     rule = type(source.model.rule)  # a user's own as well: `OnnxDecision` knows the paper's alone
     n_repeats = int(source.model.index.repeats)
@@ -194,9 +198,10 @@ class OnnxModel:
     def decide(self, trace: ArrayLike) -> ExportedDecision:
         """Decide on one trace, (T,) or (C, T), and keep nothing of it.
 
-        Another T is cut, padded or resampled, or refused, as `TraceSpec.fit` says. A faulty or a
-        novel trace (unlike all references) is verified, and its reason says so. Raises TraceError
-        for a wrong shape.
+        Returns action, reason, lower, upper, n_success, n_failure and embedding. Another T is cut,
+        padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace, or a novel one,
+        which is unlike all traces of the training, is verified, and its reason says so. Raises
+        TraceError for a wrong shape.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, *counted, z = outputs
@@ -232,10 +237,12 @@ class OnnxDecision(nn.Module):
         self.register_buffer("labels", torch.from_numpy(labels))
 
     def forward(self, trace: Tensor) -> tuple[Tensor, ...]:
-        """Decide on one trace (C, T) of float32; return tensors in the order of `FIELDS`.
+        """Decide on one trace (C, T) of float32; return a tuple of seven tensors.
 
-        They have no dimension, except the embedding (K, d), which is NaN for a faulty trace. A
-        faulty or a novel trace is verified, with the bound (0, 1) and no labels.
+        They are action (0 verify, 1 accept, 2 reject), reason (position in `Reason`), lower, upper,
+        n_success, n_failure and embedding. They have no dimension, except the embedding (K, d),
+        which is NaN for a faulty trace. A faulty or a novel trace is verified, with the bound
+        (0, 1) and no labels.
         """
         fault = self.fault(trace)
         is_sound = fault == 0
@@ -265,7 +272,7 @@ class OnnxDecision(nn.Module):
         """Return the position in `Reason` of what is wrong with a trace, () int64; 0 if nothing is.
 
         Only the first fault that applies is returned: not finite, constant, at the sensor's limit,
-        too large. The result is the same as that of `TraceGate`.
+        too large. The result is the same as in an engine (`TraceGate`).
         """
         low = trace.min()
         high = trace.max()
@@ -280,7 +287,8 @@ class OnnxDecision(nn.Module):
         """Count the labels within the radius; return action, lower, upper, n_success, n_failure.
 
         `distances` are the squared distances to the references, (n,). The results are tensors
-        without a dimension; the action is 0 verify, 1 accept or 2 reject.
+        without a dimension. The action, 0 verify, 1 accept or 2 reject, follows from the bound
+        (`lower`, `upper`) by the paper's rule.
         """
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).to(torch.int64).sum()
@@ -293,11 +301,11 @@ class OnnxDecision(nn.Module):
 
 
 def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
-    """Return the ONNX program of a decision on traces of this shape, a protobuf `ModelProto`.
+    """Return the ONNX program of a decision on traces like `spec`, a protobuf `ModelProto`.
 
     torch.export makes it, without TorchScript. Meanwhile Python's warnings, and log messages up to
     level WARNING, are off in the whole process, because torch reports optional packages that are
-    missing. Raises ExportError if torch makes no program.
+    missing. Raises ExportError if torch makes no program; errors of torch are raised as they are.
     """
     example = (torch.from_numpy(golden_trace(spec)),)
     options: dict[str, Any] = {"dynamo": True, "opset_version": OPSET, "verbose": False}
@@ -319,10 +327,11 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
     """Compare an ONNX model with the model that it was made from, on 64 traces of noise.
 
-    The noise has amplitudes from 0.01 to 100. Raises ExportError if embeddings differ by more than
-    `TOLERANCE`, if counts of labels differ by more than two, or if counts are equal but action or
-    bound differ. Smaller differences of counts are allowed, since references may lie exactly at the
-    radius.
+    The noise has amplitudes from 0.01 to 100, and stays within 0.9 times the sensor's limit in
+    `spec`, if there is one. Raises ExportError if embeddings differ by more than 0.0001, if the
+    counts of good and bad labels together differ by more than two, or if counts are equal but
+    action or bound differ. Smaller differences of counts are allowed, since references may lie
+    exactly at the radius.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)
@@ -345,9 +354,9 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
 
 
 def _import_package(name: str) -> ModuleType:
-    """Import and return the package `name`, one of those in `NEEDED`.
+    """Import and return the package `name`: "onnx", "onnxruntime" or "onnxscript".
 
-    Raises ExportError, with what to install, if any of the packages in `NEEDED` is missing.
+    Raises ExportError, with what to install, if any of these three packages is missing.
     """
     missing = [needed for needed in NEEDED if find_spec(needed) is None]
     if missing:

@@ -120,9 +120,10 @@ def export_torchscript(
     Raises
     ------
     ExportError
-        If nothing was trained yet, for a baseline, if the reducer, the interval or the rule cannot
-        be compiled, if the rule is stale, because an update of it failed, if the store was changed
-        from outside, and if the key cannot be read.
+        If nothing was trained yet, for a baseline, if the reducer, the interval or the decision
+        rule cannot be compiled, if the compiled decision and the reducer map a trace to different
+        points, if the rule is stale, because an update of it failed, if the store was changed from
+        outside, and if the key cannot be read.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
@@ -216,11 +217,13 @@ class ExportedModel:
         Returns
         -------
         ExportedDecision
+            Action, reason, bound of the success probability, label counts and embedding.
 
         Raises
         ------
         TraceError
-            For a wrong shape, or a part that is neither a whole number nor a short text.
+            For a wrong shape, or a part that is neither a whole number nor a text of 1 to 200
+            printable characters.
         """
         x = torch.from_numpy(as_trace(trace, self.trace))
         with torch.inference_mode():
@@ -233,10 +236,10 @@ class ExportedModel:
     def learn(self, trace: ArrayLike, success: bool, part: PartNumber = None) -> int:
         """Learn the outcome of a part, after its `decide` and before the next.
 
-        The trace becomes a reference, the rule is updated, and `metadata["references"]` becomes the
-        new number of references. The file on the disk is not changed; see `save`. A faulty trace is
-        ignored. If the trace or the part is not that of the pending decision, the model first
-        decides on the trace, and the earlier decision stays pending.
+        The trace becomes a reference, the decision rule is updated, and `metadata["references"]`
+        becomes the new number of references. The file on the disk is not changed; see `save`. A
+        faulty trace is ignored. If the trace or the part is not that of the pending decision, the
+        model first decides on the trace, and the earlier decision stays pending.
 
         Parameters
         ----------
@@ -255,7 +258,8 @@ class ExportedModel:
         Raises
         ------
         TraceError
-            For a wrong shape, or a part that is neither a whole number nor a short text.
+            For a wrong shape, or a part that is neither a whole number nor a text of 1 to 200
+            printable characters.
         ReportError
             For a label that is not True, False, 1 or 0.
         """
@@ -345,7 +349,8 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
 def _check_golden(model: ExportedModel, path: Path) -> None:
     """Warm a model up on the test trace in its file; raise ExportError for another embedding.
 
-    The model decides on the trace and learns it several times, so pass a copy.
+    The test trace and its expected embedding are the entry "golden" of the description. The model
+    decides on the trace and learns it several times, so pass a copy. `path` is named in the error.
     """
     golden = model.metadata["golden"]
     trace = np.array(golden["trace"], dtype=np.float32)

@@ -193,10 +193,11 @@ class EngineModel(ABC):
         return verdict
 
     def decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Return the decider for these conditions, and keep it for the next call.
+        """Return the module that decides under these conditions, and keep it for the next call.
 
-        It is built anew if none is kept, or if the kept one is for other conditions; this raises
-        what `build_decider` raises. None, which only a `ModelPrediction` takes, stands for no force
+        The conditions are the force limits, the range of the sensor and the audits. The decider is
+        built anew if none is kept, or if the kept one is for other conditions; this raises what
+        `build_decider` raises. None, which only a `ModelPrediction` takes, stands for no force
         limits, a sensor without a known range, and no audits.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
@@ -378,9 +379,9 @@ class PythonPredictor(nn.Module):
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """Predict one trace (C, T) by the model's `predict_one`; `part` is the hash of its part.
 
-        Returns the positions of action and reason in `ACTIONS` and `REASONS`, lower, upper,
-        n_success, n_failure, and an embedding that is always empty, shape (0, 0). Raises what
-        `predict_one` raises.
+        Returns the positions of action and reason in `ACTIONS` and `REASONS`, the bounds of the
+        success probability, the label counts n_success and n_failure, and an embedding that is
+        always empty, shape (0, 0). Raises what `predict_one` raises.
         """
         prediction = self.model.predict_one(x.numpy(), part)
         action = ACTIONS.index(prediction.action)
@@ -398,7 +399,7 @@ def as_engine_model(model: Model) -> EngineModel:
     """Return the model itself if it is an `EngineModel`, else a baseline in a `BaselineAdapter`.
 
     The baseline is not copied. Raises SettingError for a class, and for an object that lacks a
-    method of `Model`.
+    method of `Model`: fit, add, count, predict_interval or decide.
     """
     if isinstance(model, EngineModel):
         return model
@@ -438,12 +439,14 @@ class BaselineAdapter(EngineModel):
         return self
 
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
-        """Return the baseline's decision on one trace (channels, samples), with bounds and counts.
+        """Return the decision of the baseline on one trace (channels, samples), as a `Prediction`.
 
-        The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding. `hash_` has no
-        effect, because a baseline knows nothing of parts. Raises ValueError for an unknown action
-        and for counts that are not whole numbers from 0 to 2**63 - 1 (OverflowError for an infinite
-        count). What the baseline raises passes, and bounds are not checked.
+        It has the action, the bounds of the success probability and the label counts of the
+        baseline. The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding.
+        `hash_` has no effect, because a baseline knows nothing of parts. Raises ValueError for an
+        unknown action and for counts that are not whole numbers from 0 to 2**63 - 1 (OverflowError
+        for an infinite count). Errors of the baseline are raised as they are, and bounds are not
+        checked.
         """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)

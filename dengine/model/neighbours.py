@@ -131,10 +131,12 @@ class Predictor(nn.Module):
     def forward(self, x: Tensor, part: int = 0) -> Predicted:
         """Predict one trace (C, T) of float32.
 
-        `part` is the hash of its part, whose references are not counted; 0 excludes none. Returns
-        the positions of action and reason in `ACTIONS` and `REASONS`, lower, upper, n_success,
-        n_failure, and the scaled embedding (K, d). A novel trace is verified without counting: its
-        bounds are 0 and 1, its counts are 0.
+        `part` is the hash of the part that the trace is of; references of this part are not
+        counted, and 0 excludes none. Returns the positions of action and reason in `ACTIONS` and
+        `REASONS`, the bounds lower and upper of the success probability, the counts n_success and
+        n_failure of the labels within the radius, and the embedding (K, d), divided by the scale of
+        each embedding space. A novel trace is verified without counting: its bounds are 0 and 1,
+        its counts are 0.
         """
         z = self.embed(x)
         if self.novelty(x):
@@ -165,11 +167,12 @@ _COMPILED: dict[Any, Any] = {}
 def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     """Return the template of a decider: a compiled decider of the same structure (`structure_of`).
 
-    If the process keeps none of this structure, `eager` is compiled, which takes tens of
-    milliseconds. The new template decides three times on a ramp of `warm_up_shape` (C, T), so that
-    later calls are fast. The process keeps it, and drops the oldest if there were `KINDS` before.
-    All deciders of a structure have the same template, so do not change it: `compiled` copies it.
-    Raises what `script` raises if TorchScript cannot compile the decider.
+    If the process keeps none of this structure, `eager`, a decider in Python, is compiled, which
+    takes tens of milliseconds. The new template then decides three times on a trace of shape
+    `warm_up_shape` (C, T) whose samples rise from 0 to 1, so that later calls are fast. The process
+    keeps it, and drops the oldest if there were 16 (`KINDS`) before. All deciders of a structure
+    have the same template, so do not change it: `compiled` copies it. Raises what `script` raises
+    if TorchScript cannot compile the decider.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -187,9 +190,10 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     """Return a hashable key, equal for two modules if one compiled module can serve for both.
 
-    The key holds the class and the attributes of all submodules; of a tensor it holds only the
-    shape, because `compiled` sets the values. The module of the force limits is left out. The class
-    itself is in the key, not its name: a notebook cell that is run again defines another class.
+    The key holds the class and the attributes of all submodules of `eager`, a module in Python; of
+    a tensor it holds only the shape, because `compiled` sets the values. The module of the force
+    limits is left out, so that their number makes no difference. The class itself is in the key,
+    not its name: a notebook cell that is run again defines another class.
     """
     parts = [
         (path, type(module), _as_key(attributes_of(module)))
@@ -200,7 +204,7 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
 
 
 def _as_key(value: object) -> object:
-    """Return the part of `structure_of` for a value; None if the value makes no difference.
+    """Return a hashable key of an attribute for `structure_of`; None if it makes no difference.
 
     A list, tuple or dict gives its type and the sorted names and keys of its items. The key of an
     item is the text of a constant, the shape of a tensor, and else its own `_as_key`. A function is
@@ -249,7 +253,7 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     Parameters
     ----------
     decider : Decider
-        Compiled or not. It decides on each trace as on a new part.
+        Compiled or not. It decides on each trace as on a trace of an unknown part.
     X : array of float32, shape (n, C, T)
     points : array of float32, shape (n, K, d)
         The scaled embeddings that the reducer gives.
@@ -257,8 +261,8 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     Yields
     ------
     str
-        What is wrong; "" if the two agree within `SAME_POINTS`, and for a trace in which the
-        decider finds a fault.
+        For each trace a sentence on what is wrong; "" if the two agree within 0.001
+        (`SAME_POINTS`), and for a trace in which the decider finds a fault.
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
@@ -400,11 +404,12 @@ class ModelPrediction(EngineModel):
         return replace(report, note="; ".join(filter(None, (report.note, self._note))))
 
     def fit(self, X: ArrayLike, y: ArrayLike, *, hashes: Ints | None = None) -> Self:
-        """Train the reducer from scratch, and replace the references by the traces.
+        """Train the reducer from scratch, and make the traces the references in place of the old.
 
         If there are more traces than the classifier's capacity, only the last become references.
-        The scales and the novelty gate are computed anew as well, the rule stays as it is. If the
-        training raises, the reducer is left untrained: call `fit` again.
+        The scales of the embedding spaces and the novelty gate are computed anew as well, the
+        decision rule stays as it is. If the training raises, the reducer is left untrained: call
+        `fit` again.
 
         Parameters
         ----------
@@ -446,12 +451,14 @@ class ModelPrediction(EngineModel):
         """Train the reducer on traces (n, C, T), and replace the references by them; return self.
 
         A reducer that can go on from its last training does so. If there are more traces than the
-        classifier's capacity, only the last become references. `index`, `scale`, `gate` (the
-        novelty gate), `examples` and `trace_shape` are replaced, the decider is dropped, and the
-        rule stays as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds;
-        `numbers` (n,), of the labels, are kept with the references; `stop` may end the reducer's
-        training early. Extreme samples are clipped first. Raises SettingError if the reducer cannot
-        be trained on these traces, and if 20 traces or more are all of one part. If the reducer
+        classifier's capacity, only the last become references. `index`, `scale` (the divisor of the
+        points in each embedding space), `gate` (the novelty gate, disabled if `novelty` is 0),
+        `examples` (up to 8 of the traces), the note on repeated parts and `trace_shape` are
+        replaced, the decider is dropped and built anew when it is used, and the decision rule stays
+        as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds; `numbers`
+        (n,), of the labels, are kept with the references; `stop` may end the reducer's training
+        early. Extreme samples are clipped first. Raises SettingError if the reducer cannot be
+        trained on these traces, and if 20 traces or more are all of one part. If the reducer
         raises, it may be changed already; all else is not.
         """
         X = clip_extremes(X)
@@ -486,9 +493,9 @@ class ModelPrediction(EngineModel):
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
         `numbers` are the labels' sequence numbers, by which the reducer finds its results again. It
-        computes in a thread of its own. Before the first training, if reducer and rule can be
-        compiled, the caller's thread compiles a decider meanwhile, because the first retrain has no
-        time for that; the process keeps it as a template (`template_of`). The call returns when
+        computes in a thread of its own. Before the first training, if reducer and decision rule can
+        be compiled, the caller's thread compiles a decider meanwhile, because the first retrain has
+        no time for that; the process keeps it as a template (`template_of`). The call returns when
         both are done, and raises what either raised.
         """
         X = clip_extremes(X)
@@ -502,10 +509,11 @@ class ModelPrediction(EngineModel):
             computing.result()
 
     def _compile_template(self, encoder: Any, trace_shape: tuple[int, ...]) -> None:
-        """Compile a decider for traces of this shape (C, T), with empty references.
+        """Compile a decider for traces of this shape (C, T), without references.
 
-        The process keeps it as a template, from which `compiled` copies later deciders. Nothing in
-        the model changes.
+        `encoder` is the module of the untrained reducer. The process keeps the compiled decider as
+        a template, from which `compiled` copies later deciders. Nothing in the model changes.
+        Raises what `template_of` raises.
         """
         channels, samples = trace_shape
         gate = NoveltyGate(channels, samples)
@@ -518,7 +526,7 @@ class ModelPrediction(EngineModel):
         template_of(decider.eval(), trace_shape)
 
     def prepare(self, previous: EngineModel) -> None:
-        """Share the rule object of the previous model, and build the decider.
+        """Take over the decision rule object of the previous model, and build the decider.
 
         If the rule of either model is stale, because an update of it failed, this model is stale
         afterwards. The decider is built for the `DecisionConditions` under which the previous model
@@ -538,7 +546,7 @@ class ModelPrediction(EngineModel):
             self._conditions = conditions
 
     def build_decider(self, conditions: DecisionConditions | None) -> Decider:
-        """Build a decider that shares the references and the rule of this model.
+        """Build a decider, which shares the references and the decision rule of this model.
 
         It is returned, not kept; `decider` keeps one.
 
@@ -578,7 +586,10 @@ class ModelPrediction(EngineModel):
 
     @property
     def trace_spec(self) -> TraceSpec:
-        """`TraceSpec` with the shape of the training traces; ValueError if nothing was fitted."""
+        """`TraceSpec` with the shape of the training traces, all else as by default.
+
+        Raises ValueError if nothing was fitted.
+        """
         if "index" not in vars(self):
             raise ValueError("Expected a fitted model; call fit(X, y) first.")
         channels, samples = self.trace_shape
@@ -613,13 +624,14 @@ class ModelPrediction(EngineModel):
         embedding: Embedding | None = None,
         point: Floats | None = None,
     ) -> Floats:
-        """Add one labelled trace (channels, samples) to the index, in the space of its fold.
+        """Make one labelled trace (channels, samples) a reference in the space of its fold.
 
-        The hash of its part, `hash_`, gives the fold. The reference is `point` if given, otherwise
-        the row of `embedding` for that space; without both it is computed from the trace. A full
-        index drops its oldest reference. `number` is the label's sequence number. Returns the
-        reference point, float32 (d,), scaled. Raises ValueError if it must be computed and nothing
-        was fitted.
+        The hash of its part, `hash_`, gives the fold, which is also the number of the embedding
+        space. The reference is `point` if given, otherwise the row of `embedding` for that space;
+        without both it is computed from the trace. A full index drops its oldest reference. `y` is
+        1 for success, 0 for failure; `number` is the sequence number of this label. Returns the
+        reference point, float32 (d,), divided by the scale of the space. Raises ValueError if it
+        must be computed and nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
@@ -647,12 +659,14 @@ class ModelPrediction(EngineModel):
         predicted: int = 0,
         inclusion_probability: float = 1.0,
     ) -> None:
-        """Update the rule in place with the outcome of one part and the novelty of its trace.
+        """Update the decision rule, in place, with the outcome of one part.
 
         The rule's `observe` gets `n_unreported`, the number of accepted parts without a known
-        outcome since the last update, and `novel`; then its `update` gets the other arguments, see
-        `EngineModel.update_rule`. The decider decides by the new state at once. If one of the two
-        raises, `rule_is_stale` is set and the exception is passed on.
+        outcome since the last update, and `novel`, whether its trace was novel; then its `update`
+        gets the bound by which the part was decided (`lower`, `upper`), the label `success`, what
+        the model alone would have done (`predicted`, an `ActionCode`), and the probability, fixed
+        beforehand, that the outcome would be asked for. The decider decides by the new state at
+        once. If one of the two raises, `rule_is_stale` is set and the exception is passed on.
         """
         was_stale = self.rule_is_stale
         self.rule_is_stale = True
@@ -682,11 +696,11 @@ class ModelPrediction(EngineModel):
         return self.rule.learns()
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model under another policy that shares the references and the reducer.
+        """Return a model under another policy; it shares the references and the reducer.
 
-        Its rule is new, has learned nothing and is not stale; its decider is not built yet. This
-        model does not change, except that a reference that is added to either is in both. Raises
-        SettingError if the rule cannot be made.
+        Its decision rule is new, has learned nothing and is not stale; its decider is not built
+        yet. This model does not change, except that a reference that is added to either is in both.
+        Raises SettingError if the rule cannot be made.
         """
         settings = {name: getattr(policy, name) for name in ("alpha", "lower_bound", "interval")}
         model = copy.copy(self)
@@ -703,9 +717,10 @@ class ModelPrediction(EngineModel):
     def predict_one(self, x: Floats, hash_: int = 0) -> Prediction:
         """Predict one trace (channels, samples) without fault checks, force limits and audits.
 
-        References of the part with this hash are not counted; 0 excludes none. The trace's shape is
-        not checked. Raises RuntimeError if the rule is stale, because an update of it failed, and
-        ValueError if nothing was fitted.
+        Returns action, bounds of the success probability, label counts, embedding (K, d) and
+        reason, as a `Prediction`. References of the part with the hash `hash_` are not counted; 0
+        excludes none. The trace's shape is not checked. Raises RuntimeError if the decision rule is
+        stale, because an update of it failed, and ValueError if nothing was fitted.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -720,20 +735,21 @@ class ModelPrediction(EngineModel):
         """Decide on one raw trace x (C, T), in the unit of the sensor, under these conditions.
 
         The decider, the module that decides, is built first if the one that the model keeps is for
-        other conditions. References of the part with this hash are not counted. 0 stands for an
-        unknown part: then references with the same content hash as the trace are not counted.
+        other conditions. References of the part with the hash `part_hash` are not counted. 0 stands
+        for an unknown part: then references with the same content hash as the trace are not
+        counted.
 
         Returns
         -------
         Verdict
             The tuple that `Decider.forward` returns. Its embedding (K, d) has a point in each of
-            the K spaces, divided by the space's scale.
+            the K embedding spaces, divided by the scale of the space.
 
         Raises
         ------
         RuntimeError
-            If the rule is stale, because an update of it failed, and the trace has no fault. A
-            faulty trace is verified without the rule.
+            If the decision rule is stale, because an update of it failed, and the trace has no
+            fault. A faulty trace is verified without the rule.
         ValueError, ...
             As in `build_decider`.
         """
@@ -789,8 +805,9 @@ class ModelPrediction(EngineModel):
     def successor(self) -> "ModelPrediction":
         """Return a model to train next, with a copy of this one's reducer to start from.
 
-        The successor shares rule, references, scale and novelty gate with this model. Training
-        replaces the last three in the successor only, so this model goes on deciding.
+        The successor has no decider yet. It shares decision rule, references, scale (the divisor of
+        the points in each embedding space) and novelty gate with this model. Training replaces the
+        last three in the successor only, so this model goes on deciding.
         """
         model = copy.copy(self)
         model.spaces = copy.deepcopy(self.spaces)
@@ -803,8 +820,10 @@ class ModelPrediction(EngineModel):
 
         The references must be finite, and so must the points to which the reducer maps `examples`,
         some training traces. A reducer that is restored from the state of this one must map
-        `examples` to the same points, each of two times; if a reducer gives no state, it must do
-        so itself. The scaled points are kept for `check_answers`.
+        `examples` to the same points, each of two times; if a reducer gives no state, it must do so
+        itself. The points, divided by the scale of their embedding space, are kept for
+        `check_answers`. If restoring raises a StoreError, that is a defect; other errors are
+        raised.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -832,11 +851,11 @@ class ModelPrediction(EngineModel):
     def get_state(self) -> State:
         """Return the state as arrays by name, which `set_state` takes.
 
-        Trace shape, references and scale (the divisor of the points in each space) are always in
-        it. The names of the arrays of the reducer, the rule and the novelty gate begin with
-        "reducer.", "rule." and "novelty.". A reducer without a state and a disabled gate have no
-        arrays. In place of a stale rule there is "rule_is_stale". Arrays of the scale and the
-        reducer may be views. Raises AttributeError before the first training.
+        Trace shape, references and scale (the divisor of the points in each embedding space) are
+        always in it. The names of the arrays of the reducer, the decision rule and the novelty gate
+        begin with "reducer.", "rule." and "novelty.". A reducer without a state and a disabled gate
+        have no arrays. In place of a stale rule there is "rule_is_stale". Arrays of the scale and
+        the reducer may be views. Raises AttributeError before the first training.
         """
         state: State = {"trace_shape": np.array(self.trace_shape), "scale": self.scale}
         state |= self.index.get_state()
@@ -852,12 +871,13 @@ class ModelPrediction(EngineModel):
     def set_state(self, state: Arrays) -> Self:
         """Restore the state that `get_state` returned; returns self.
 
-        References, scale, rule and novelty gate are restored, and the reducer if the state holds
-        it. If it does not (`needs_refit`), train this model on the same traces before this call.
-        The decider is dropped. If the rule was stale, the state does not hold it, and this model's
-        rule stays as it is; `rule_is_stale` always stays as it is. Raises StoreError if the state
-        holds no reducer although this fitted reducer gives a state, and for a rule or gate of other
-        sizes. For the state of another reducer it raises StoreError, KeyError, ValueError or
+        References, scale (the divisor of the points in each embedding space), decision rule (in
+        place) and novelty gate are restored, and the reducer if the state holds it. If it does not
+        (`needs_refit`), train this model on the same traces before this call. The decider is
+        dropped. If the rule was stale, the state does not hold it, and this model's rule stays as
+        it is; `rule_is_stale` always stays as it is. Raises StoreError if the state holds no
+        reducer although this fitted reducer gives a state, and for a rule or gate of other sizes.
+        For the state of another reducer it raises StoreError, KeyError, ValueError or
         NotImplementedError. After an error do not use the model.
         """
         if not self.needs_refit(state):
@@ -886,19 +906,21 @@ class ModelPrediction(EngineModel):
 
 
 def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
-    """Count those of the newest `NEWEST` traces that nearly repeat one of another part among them.
+    """Count those of the newest 500 traces that nearly repeat one of another part among them.
 
     Labels are counted as independent trials, so the number of a part that is inserted again must be
     given (`part=`). This function notices plain cases in which it was not; no decision depends on
-    it. A trace is compared with the traces of other parts only. It nearly repeats one if the
-    nearest of them is nearer than `NEAR` times the distance to the next after the `NEIGHBOURS`
-    nearest. So a trace with more than `NEIGHBOURS` near repeats does not count, and a trace that
-    has only 1 to `NEIGHBOURS` traces of other parts to compare with counts.
+    it. A trace is compared with the traces of other parts only, by the distance between the means
+    of about 50 stretches of samples. It nearly repeats one if the nearest of them is nearer than
+    0.12 times the distance to the eleventh nearest (`NEAR`, `NEIGHBOURS`). So a trace with more
+    than 10 near repeats does not count, and a trace that has only 1 to 10 traces of other parts to
+    compare with counts.
 
     Parameters
     ----------
     traces : array of float32, shape (n, channels, samples)
-        Oldest first; only the newest `NEWEST` are read, and they are compared with each other.
+        Oldest first; only the newest 500 (`NEWEST`) are read, and they are compared with each
+        other.
     parts : array of int64, shape (n,)
         Hash of each trace's part.
 
@@ -930,7 +952,8 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
 def repeats_note(traces: Floats, parts: NDArray[np.int64]) -> str:
     """Return a note for the report of a retrain if `near_repeats` counts many traces, else "".
 
-    It takes the arguments of `near_repeats`. More than `MANY_REPEATS` traces are many.
+    It takes the arguments of `near_repeats`: traces (n, C, T), and `parts`, the hash of the part of
+    each. More than 25 traces (`MANY_REPEATS`) are many.
     """
     n_repeats = near_repeats(traces, parts)
     if n_repeats <= MANY_REPEATS:

@@ -97,7 +97,7 @@ def make_reducer(name: str, **params: Any) -> Any:
     SettingError
         If there is no such name, module or class, or it is no scikit-learn transformer; if a
         parameter is unknown, or a value does not pass the check. What the constructor of
-        `module:Class` raises passes.
+        `module:Class` raises is raised as it is.
     """
     cls = reducer_class(name)
     allowed = signature(cls).parameters

@@ -160,7 +160,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         """
 
     def transform(self, X: ArrayLike) -> Floats:
-        """Embed each trace as one point, the mean over all spaces, for pictures.
+        """Embed each trace as one point, the mean over all embedding spaces, for pictures.
 
         Decisions use `embed`, which gives a point in each space. A subclass defines this method or
         `embed`. Traces are embedded one by one, as in a cell, since in a batch the last bits of a
@@ -402,17 +402,20 @@ def points_in_fold_space(Z: Floats, folds: Ints) -> Floats:
 
 
 def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
-    """Return the scale of each space: the root mean square distance of its points from their mean.
+    """Return the scale of each embedding space: the root mean square radius of its points.
 
-    Space k has the points of fold k. Outliers are left out, since a single one would draw all other
-    points together. Outliers are the points more than 50 times as far from the median as the median
-    distance. If these are several, and more than 5 % of the fold's points, none is left out.
+    The radius is the distance from their mean. Space k has the points of fold k. Outliers are left
+    out, since a single one would draw all other points together. Outliers are the points more than
+    50 times as far from the median as the median distance; distances are measured along the axis on
+    which they are largest. If these are several, and more than 5 % of the fold's points, none is
+    left out.
 
     Parameters
     ----------
     points : array of float32, shape (n, d)
         Row i lies in space ``folds[i]``.
     folds : array of int64, shape (n,)
+        Fold of each point, which is also its space.
     n_spaces : int
         K.
 
@@ -551,7 +554,7 @@ def uses_labels(transformer: Any) -> bool:
 def as_reducer(transformer: Any, folds: int) -> Reducer:
     """Return a transformer as a `Reducer`.
 
-    A `Reducer` that has several spaces, or uses no labels, is returned as it is. Another
+    A `Reducer` that has several embedding spaces, or uses no labels, is returned as it is. Another
     transformer whose tag says that it needs labels (`uses_labels`) is wrapped in `CrossFitted`,
     which fits `folds` clones. A transformer without that tag is wrapped in `LabelFree` and never
     gets labels, so its single space has seen none. Nothing is fitted here. Raises AttributeError
@@ -658,7 +661,8 @@ class CrossFitted(_Wrapping):
             If K is below 2, the labels are missing or not of two classes, or the traces outside a
             fold have a single class.
         TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite.
+            If X is not of one of these shapes, or a value is not finite. Errors of the clones are
+            raised as they are.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

@@ -18,10 +18,11 @@ SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names of parameters in
 
 
 def save_checkpoint(members: Members, path: str | Path) -> None:
-    """Write the weights of a `Members` with one copy of the network to a file.
+    """Write the weights of `members`, a single copy of a network, to a file.
 
-    An existing file is replaced. The file is written as a whole or not at all. Raises SettingError
-    if there is more than one copy, OutputError if the file cannot be written.
+    An existing file is replaced. The file is written as a whole or not at all. Buffers, such as the
+    statistics of batch normalisation, are written as well. Raises SettingError if `members` holds
+    more than one copy, OutputError if the file cannot be written.
     """
     expect(members.count == 1, "a single copy of the network", members.count)
     content = BytesIO()  # torch's own writer aborts the process on a full disk
@@ -30,9 +31,10 @@ def save_checkpoint(members: Members, path: str | Path) -> None:
 
 
 def load_checkpoint(members: Members, path: str | Path) -> None:
-    """Copy the weights of a checkpoint into every copy of the network in `members`, in place.
+    """Copy the weights in a file into every copy of the network in `members`, in place.
 
-    Buffers, such as the statistics of batch normalisation, are copied as well.
+    The file is a checkpoint, which `save_checkpoint` wrote. Buffers, such as the statistics of
+    batch normalisation, are copied as well.
 
     Raises
     ------

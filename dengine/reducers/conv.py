@@ -89,9 +89,10 @@ class ConvNetwork(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Preprocessed traces (B, members * channels, L) -> features (B, members * features).
 
-        The outputs of the convolutions are pooled to the mean and maximum of each region and of the
-        whole trace, and then pass the hidden layer and a ReLU. In training mode dropout makes the
-        result random.
+        The module computes `members` separate networks at once. The outputs of their convolutions
+        are pooled to the mean and maximum of each region of the trace (early, middle, late) and of
+        the whole trace, and then pass the hidden layer and a ReLU. In training mode dropout makes
+        the result random.
         """
         h = self.convolutions(x)  # (B, members * C * 2 * width, P)
         mean = F.avg_pool1d(h, self.window, self.stride)  # (B, ..., regions)
@@ -109,8 +110,8 @@ def conv_layers(
 ) -> list[nn.Module]:
     """Return a list of three layers: convolution, batch normalisation and ReLU.
 
-    `inputs` and `outputs` are channels of each group. The convolution has no bias and pads kernel
-    // 2 zeros at both ends.
+    The convolution has `groups` groups, which it keeps apart; `inputs` and `outputs` are channels
+    of each group. It has no bias and pads `kernel` // 2 zeros at both ends.
     """
     convolution = nn.Conv1d(
         groups * inputs,
@@ -210,9 +211,12 @@ class ConvReducer(TorchReducer):
         self.rocket_.init_encoder(traces)
 
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
-        """Make `rocket_`, then all that `TorchReducer._build` makes, for traces of this shape.
+        """Build `rocket_`, preprocessor and networks for traces of this shape.
 
-        The kernels and classifier heads of `rocket_` are 0 as yet.
+        It does what `TorchReducer._build` does, after making `rocket_`, a `RocketReducer` whose
+        kernels and classifier heads are 0 as yet. The networks have initial weights. `average` is
+        the number of samples that are averaged to one. Without `seed` the seed of the networks
+        comes from `random_state`. Raises SettingError as `TorchReducer._build` does.
         """
         # Before `encoder_`, by which other threads see that there is a module.
         self.rocket_ = RocketReducer(
@@ -263,7 +267,8 @@ class ConvReducer(TorchReducer):
         """Restore what `get_state` returned, `rocket_` included; return self.
 
         The constructor's parameters must be the same. Raises StoreError if the state is of another
-        network, or of an older release, which stored no `rocket_`. After an error do not use it.
+        network, or of an older release, which stored no `rocket_`. Raises what
+        `TorchReducer.set_state` raises. After an error do not use the reducer.
         """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone

@@ -162,7 +162,7 @@ class Encoder(nn.Module):
         """Preprocessed traces for each copy of the network (B, K, C', L) -> embedding (B, K, dim).
 
         The first coordinate is the probability of success. The second, if `dim` is 2, is 0.1 times
-        the difference of the copy's two units, see `Members`.
+        the difference between the two sigmoid units from which the copy computes the probability.
         """
         units = self.members.units(x)
         probability = self.members.logits(units).sigmoid()
@@ -201,11 +201,11 @@ def count_trained(module: nn.Module) -> int:
 def count_features(networks: nn.Module, count: int, channels: int, samples: int) -> int:
     """Return how many features a copy of a network gives, by a trial on three traces of zeros.
 
-    `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K. The trial is in
-    evaluation mode, so that no statistics change; afterwards the networks are in training mode.
-    Raises ValueError unless the output, which must be a tensor, holds floats and has three
-    dimensions, three rows and at least one feature. What the networks' `forward` raises passes, and
-    they stay in evaluation mode then.
+    `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K, the number of
+    copies. The trial is in evaluation mode, so that no statistics change; afterwards the networks
+    are in training mode. Raises ValueError unless the output, which must be a tensor, holds floats
+    and has three dimensions, three rows and at least one feature. What the networks' `forward`
+    raises is raised as it is; they stay in evaluation mode then.
     """
     networks.eval()
     with torch.no_grad():

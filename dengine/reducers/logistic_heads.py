@@ -73,7 +73,7 @@ class RidgeProblem:
 
         Head k, the logistic regression of fold k, is trained on the rows that mask k selects. A
         column of ones is appended to the features. `l2` is the ridge of every weight but the bias,
-        whose ridge is `BIAS_RIDGE`.
+        whose ridge is 0.001 (`BIAS_RIDGE`).
         """
         g32 = torch.cat([g, torch.ones(len(g), 1)], 1)
         ridge = torch.full((len(outside), g32.size(1)), l2, dtype=torch.float64)
@@ -91,10 +91,11 @@ class RidgeProblem:
         return (self.mask * (p - self.y)) @ self.g + self.ridge * w
 
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
-        """Return the lower Cholesky factor of the Hessian for head k, float64 (W + 1, W + 1).
+        """Return the lower Cholesky factor of the Hessian of classifier head k.
 
-        The Hessian of logistic regression k depends on `p` (n,), the probabilities that head k
-        gives. The product of features is computed in float32, since a Newton step may be inexact.
+        The factor is float64 (W + 1, W + 1). The head is a logistic regression, whose Hessian
+        depends on `p` (n,), the probabilities that head k gives. The product of features is
+        computed in float32, since a Newton step may be inexact.
         """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact
@@ -116,10 +117,12 @@ def fit_heads(
 
     Head k, trained without the labels of fold k, minimises the sum of its log losses plus
     ``l2 / 2 * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the
-    same weights wherever it starts, unless the steps are limited. If the leave-one-out loss of a
-    head is above the loss of its base rate, the share of successes among its rows, the head is
-    replaced by the base rate. This is decided for each head alone, since a common decision would
-    let the labels of fold k choose head k.
+    same weights wherever it starts, unless the steps are limited. A step that raises the loss of a
+    head is halved up to six times, and then left out. A head has converged when its next step would
+    change no weight by more than about 0.0002. If the leave-one-out loss of a head is above the
+    loss of its base rate, the share of successes among its rows, the head is replaced by the base
+    rate. This is decided for each head alone, since a common decision would let the labels of fold
+    k choose head k.
 
     Parameters
     ----------
@@ -226,7 +229,7 @@ def base_rate_if_better(
 
 
 def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Tensor:
-    """Approximate the logit of each row by each head as if the head was fitted without the row.
+    """Approximate the logit of each row by each classifier head fitted without the row.
 
     Parameters
     ----------

@@ -100,7 +100,8 @@ class PcaReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
-        The arrays are copied.
+        The arrays are copied; the shape of the traces is set from "shape". Raises KeyError if an
+        array is missing.
         """
         self.mean_ = np.array(state["mean"])
         self.components_ = np.array(state["components"])

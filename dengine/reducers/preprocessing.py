@@ -63,7 +63,8 @@ class Preprocessor(nn.Module):
         """Raw traces (B, C, T) -> averaged, standardised, with differences: (B, 2 * C, L).
 
         Channel 2 c + 1 holds the differences of channel 2 c in time, of which the first is 0. All
-        values are clipped at ±8. If T is no multiple of `average`, the first samples are left out.
+        values are clipped at ±8. L is T // `average`. If T is no multiple of `average`, the first
+        samples are left out.
         """
         x = self.standardise(self.average_samples(x))
         differences = (x[:, :, 1:] - x[:, :, :-1]) * self.difference_scale

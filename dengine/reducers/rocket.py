@@ -117,7 +117,7 @@ class FeatureEmbedding(nn.Module):
         return self.embed_features(self.encoder(x))
 
     def embed_features(self, f: Tensor) -> Tensor:
-        """Scaled features (B, P) -> embedding (B, K, d), a point in each of the K spaces.
+        """Scaled features f (B, P) -> embedding (B, K, d), a point in each embedding space.
 
         Head k, the classifier that is trained without the labels of fold k, gives the first
         coordinate in space k: the probability of success, from 0 to 1. If d is 2, the second
@@ -180,7 +180,7 @@ class Tower(NamedTuple):
         -------
         Tower
             Its components are sorted by variance, the largest first. The axes of components that
-            are no more than noise are 0.
+            are no more than noise, with less than a millionth of the largest variance, are 0.
         """
         centred = f - f.mean(0)
         # In float32, in half the time: components are told from noise to 1e-6.
@@ -213,10 +213,11 @@ def weigh_towers(
 ) -> tuple[list[Tensor], Tensor]:
     """Choose for each fold the shares by which the logits of several towers are mixed to one logit.
 
-    Each `Tower` has a head k, trained without the labels of fold k. The first tower starts with a
-    share of 1. Then each further tower gets a share of 0 to 1 in steps of 0.1, and the shares of
-    the towers before it are multiplied by the rest. The share is chosen that has the smallest
-    penalised log loss on the rows outside fold k, so that labels of fold k do not reach space k.
+    Each `Tower`, a group of features, has a classifier head k, trained without the labels of fold
+    k. The first tower starts with a share of 1. Then each further tower gets a share of 0 to 1 in
+    steps of 0.1, and the shares of the towers before it are multiplied by the rest. The share is
+    chosen that has the smallest penalised log loss on the rows outside fold k, so that labels of
+    fold k do not reach embedding space k.
 
     Parameters
     ----------
@@ -358,15 +359,16 @@ class RocketReducer(Reducer):
     ) -> Floats:
         """Fit the classifier heads, starting from their last weights; return the reference points.
 
-        The kernels are drawn at the first call of `train` or `precompute` and stay. X are traces
-        (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds. `numbers` (n,) identify the
-        traces: a trace that was in the last call has its features in a cache. `stop` may end the
-        Newton steps, but in the first fit its deadline leaves them three. If there are more than
-        4000 traces, the heads are fitted to 4000 of them, chosen by a hash of the numbers. The
-        module `net_`, and so the module that `module` returned before, is changed in place. The
-        points are float32 (n, d), row i in space ``folds[i]``. Raises SettingError for fewer than
-        20 traces, if the traces outside a fold have a single class, and at the first call for a
-        parameter out of its range or fewer than 2 samples.
+        The kernels are drawn at the first call of `train`, `precompute` or `untrained_module` and
+        stay. X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds.
+        `numbers` (n,), those of the labels, identify the traces: a trace that was in the last call
+        has its features in a cache. `stop` may end the Newton steps, but in the first fit its
+        deadline leaves them three. If there are more than 4000 traces, the heads are fitted to 4000
+        of them, chosen by a hash of the numbers. The module `net_`, and so the module that `module`
+        returned before, is changed in place. The points are float32 (n, d), row i in embedding
+        space ``folds[i]``. Raises SettingError for fewer than 20 traces, if the traces outside a
+        fold have a single class, and at the first call for a parameter out of its range or fewer
+        than 2 samples.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -386,9 +388,10 @@ class RocketReducer(Reducer):
         """Fit the classifier heads like `train`, but without checking the input.
 
         Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
-        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `net_`
-        is changed in place. Returns the points of the traces, float32 (n, d), row i in space
-        ``folds[i]``, whose head did not see the label of row i.
+        without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
+        and `numbers` are those of `train`. `net_` is changed in place. Returns the points of the
+        traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did not see the
+        label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -401,9 +404,9 @@ class RocketReducer(Reducer):
 
         It is `net_`, which later trainings change in place; before the first training its
         classifier heads are 0. If no kernels are drawn yet, they are drawn here from the traces X
-        (n, C, T). If these are fewer than `MIN_TRACES`, the kernels are drawn in a clone, whose
-        module is returned, and this reducer stays as it is. Raises SettingError for a parameter out
-        of its range or fewer than 2 samples.
+        (n, C, T). If these are fewer than 20 (`MIN_TRACES`), the kernels are drawn in a clone,
+        whose module is returned, and this reducer stays as it is. Raises SettingError for a
+        parameter out of its range or fewer than 2 samples.
         """
         is_initialized = "net_" in vars(self)
         reducer: Self = self if len(X) >= MIN_TRACES or is_initialized else clone(self)
@@ -449,9 +452,9 @@ class RocketReducer(Reducer):
     def build(self, channels: int, samples: int, average: int) -> None:
         """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
-        Towers, counters and the cache of features become empty. `average` is the number of samples
-        that are averaged to one. Raises SettingError for a parameter out of its range or fewer than
-        2 samples.
+        `towers_` and the cache of features become empty, the counters 0. `average` is the number of
+        samples that are averaged to one. Raises SettingError for a parameter out of its range or
+        fewer than 2 samples.
         """
         self.check()
         self.trace_shape_ = (channels, samples)
@@ -489,8 +492,11 @@ class RocketReducer(Reducer):
         features `raw` (n, P); if there are more than 4000 rows, on 4000 of them (`sample_rows`).
         `stop` may end the Newton steps; at the first fit its deadline does so after three steps at
         the earliest. The principal components are computed anew at the first fit, after every 20
-        fits, and if there are at least 1.5 times as many rows as when they were computed last. It
-        sets `towers_`, `n_iter_`, `holdout_losses_`, `n_fits_` and `note_`.
+        fits, and if there are at least 1.5 times as many rows as when they were computed last.
+        `labels` (n,) are 1 or 0, `folds` (n,) the folds, `numbers` (n,) the numbers of the labels.
+        It sets `towers_`, `n_iter_` (steps of this fit), `holdout_losses_` (leave-one-out loss of
+        each embedding space), `n_fits_` and `note_` (the heads that are no better than their base
+        rate in every tower; "" if there are none).
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -530,11 +536,11 @@ class RocketReducer(Reducer):
         self.note_ = note if useless else ""
 
     def _set_heads(self, towers: list[Tower], shares: list[Tensor]) -> None:
-        """Write the classifier heads of all towers to `net_`, so that it gives a logit per space.
+        """Write the classifier heads of all towers to `net_`, which then gives K logits.
 
-        Logit k of `net_` becomes the sum over the towers of share k times the tower's own logit k.
-        `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns them. The heads in
-        `net_` are overwritten.
+        Logit k of `net_`, for embedding space k, becomes the sum over the towers of share k times
+        the tower's own logit k. `shares` has a tensor (K,) for each `Tower`; `weigh_towers` returns
+        them. The heads in `net_` are overwritten.
         """
         net = self.net_
         logit_columns = slice(0, net.n_scores, self.n_components)
@@ -559,9 +565,9 @@ class RocketReducer(Reducer):
         return np.asarray(folds != np.arange(self.folds)[:, None])
 
     def _compute_components(self, raw: Tensor) -> None:
-        """Compute feature scales and principal components anew from raw features (n, P).
+        """Compute feature scales and principal components anew from unscaled features (n, P).
 
-        At most 1000 rows, evenly spaced, are read; `n_component_traces_` becomes n.
+        At most 1000 rows of `raw`, evenly spaced, are read; `n_component_traces_` becomes n.
 
         A `Tower` holds a group of features, their principal components, and one linear classifier,
         a head, for each fold. `towers_` gets a new tower for each group; its heads are the ones
@@ -611,7 +617,7 @@ class RocketReducer(Reducer):
 
         `axis` (p,) is the axis of the component on the features `f` (n, p) of the first `Tower`.
         Before the sigmoid the component is scaled to mean 0 and standard deviation 2 over `f`. Its
-        sign is changed if it would point against the last second coordinate.
+        sign is changed if it would point against the second coordinate that `net_` had before.
         """
         net = self.net_
         columns = net.encoder.towers[0]
@@ -621,11 +627,12 @@ class RocketReducer(Reducer):
         net.bias[1 : net.n_scores : 2] = -(f.mean(0) @ second)
 
     def raw_features(self, traces: Floats, numbers: Ints | None = None) -> Tensor:
-        """Return the raw features (n, P) of traces (n, C, T), from the cache as far as it has them.
+        """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
 
-        `numbers` (n,), increasing, identify the traces. Afterwards the cache holds the features of
-        these traces and no others; the tensor that is returned shares its memory. Without numbers
-        the cache is neither read nor written.
+        They are float32, computed from the outputs of the kernels. `numbers` (n,), those of the
+        labels, increasing, identify the traces: only features that the cache lacks are computed.
+        Afterwards the cache holds the features of these traces and no others; the tensor that is
+        returned shares its memory. Without numbers the cache is neither read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -668,7 +675,7 @@ class RocketReducer(Reducer):
         return FitReport(self.n_iter_, self.note_)
 
     def embed(self, X: ArrayLike) -> Floats:
-        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
+        """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
         The points in space k come from head k, the classifier that was fitted without the labels of
         fold k. If kernels were drawn (`precompute`, `untrained_module`) but nothing was fitted, all
@@ -711,8 +718,9 @@ class RocketReducer(Reducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         Afterwards the cache of features is empty and `note_`, a line for the operator, is "".
-        Raises StoreError if the sizes do not follow from the parameters; the fitted model is lost
-        then.
+        Raises SettingError for a parameter out of its range, and StoreError if the sizes do not
+        follow from the parameters; then the fitted model is lost. Raises KeyError if shape,
+        counters or losses are missing.
         """
         channels, samples = self.restore_shape(state)
         average, n_fits, n_component_traces, n_iter = map(int, state["counts"])
@@ -731,9 +739,9 @@ class RocketReducer(Reducer):
     def check(self) -> None:
         """Raise SettingError for a parameter out of its range.
 
-        `kernels`, `dilations`, `width` and `max_iter` are integers of at least 1, `regions` is an
-        integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1 or 2, and `folds` at
-        least 2. `l2` is above 0.
+        `kernels`, `dilations`, `width` and `max_iter` are integers of at least 1 and at most a
+        billion, `regions` is an integer from 1 to 16 and `groups` from 0 to 64, `n_components` is 1
+        or 2, and `folds` at least 2. `l2` is above 0.
         """
         integers = (
             "n_components",

@@ -151,8 +151,10 @@ class RocketEncoder(nn.Module):
     def raw_features(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> unscaled features (B, P) of tower 1, then those of tower 2.
 
-        Tower 1 are the means of ramps, tower 2 the competing kernels, see the module. If `groups`
-        is 0, there is no tower 2. `scale_features` standardises the features.
+        The features of tower 1 are means of the outputs of kernels, limited to 0 to 1
+        (`ramp_features`). Those of tower 2 say which kernels of a group have the largest and the
+        smallest outputs (`competition_features`). If `groups` is 0, there is no tower 2.
+        `scale_features` standardises the features.
         """
         values = self.read_taps(self.average_samples(x))
         n_dense = self.n_dense_taps
@@ -186,10 +188,10 @@ class RocketEncoder(nn.Module):
     def read_taps(self, x: Tensor) -> Tensor:
         """Read the inputs of the kernels from averaged traces (B, C, L): (C, taps, B).
 
-        A tap is an input of a kernel at a place. For each tap, `taps` has an index into a row of L
-        frames (the means of `average` samples), then the L - 1 differences of successive frames,
-        then a 0, which stands for what lies beyond the ends. The batch is the last axis, so that
-        reading a tap copies a row.
+        A tap is an input of a kernel at one place in the trace; L counts the frames (the means of
+        `average` samples). For each tap, `taps` has an index into a row of L frames, then the L - 1
+        differences of successive frames, then a 0, which stands for what lies beyond the ends. The
+        batch is the last axis, so that reading a tap copies a row.
         """
         batch = x.size(0)
         differences = x[:, :, 1:] - x[:, :, :-1]
@@ -199,10 +201,11 @@ class RocketEncoder(nn.Module):
         return rows.permute(1, 2, 0).contiguous().index_select(1, self.taps)
 
     def as_windows(self, values: Tensor, n: int) -> Tensor:
-        """Arrange the inputs (C, n * 9 * P, B) of n dilations as windows (n, C * 9, P * B).
+        """Arrange inputs of n dilations, `values` (C, n * 9 * P, B), as (n, C * 9, P * B).
 
-        A column holds all inputs of a kernel at one place of one trace, so that a convolution is a
-        matrix product.
+        P is the number of places in a trace, 9 the number of inputs of a kernel in a channel. A
+        column of the result, a window, holds all inputs of a kernel at one place of one trace, so
+        that a convolution is a matrix product.
         """
         channels = values.size(0)
         taps = self.kernel_size
@@ -213,12 +216,13 @@ class RocketEncoder(nn.Module):
         return by_dilation.reshape(n, channels * taps, columns)
 
     def ramp_features(self, windows: Tensor, batch: int) -> Tensor:
-        """Compute the features of tower 1: (B, D * F * R).
+        """Compute the features of tower 1, ramps of kernels: (B, D * F * R).
 
-        `windows` (D, C * 9, P * B) are the inputs from `batch` = B traces, see `as_windows`. The
-        output of a kernel at a place goes through a ramp from 0 to 1 around its threshold. A
-        feature is the mean of the ramp over a region, plus twice its mean over the whole trace. In
-        the order of the features, dilations vary slowest and regions fastest.
+        `windows` (D, C * 9, P * B) are the inputs from `batch` = B traces, see `as_windows`, of F
+        kernels at each of D dilations and P places. R regions divide the trace. The output of a
+        kernel at a place goes through a ramp from 0 to 1 around its threshold. A feature is the
+        mean of the ramp over a region, plus twice its mean over the whole trace. In the order of
+        the features, dilations vary slowest and regions fastest.
         """
         h = torch.baddbmm(self.threshold, self.kernel, windows).clamp_(0.0, 1.0)  # (D, F, P * B)
         if batch == 1:  # one product whose columns are the regions takes four times as long
@@ -230,7 +234,7 @@ class RocketEncoder(nn.Module):
         return h.reshape(self.n_dilations * self.n_kernels * self.n_regions, batch).t()
 
     def competition_features(self, windows: Tensor, batch: int) -> Tensor:
-        """Compute the features of tower 2: (B, 4D * G * 8).
+        """Compute the features of tower 2, competing kernels: (B, 4D * G * 8).
 
         `windows` (2D, C * 9, Q * B) are the inputs from `batch` = B traces, see `as_windows`: D
         dilations of the trace, then D of its differences. G groups of 8 kernels compete at each of
@@ -275,9 +279,11 @@ class RocketEncoder(nn.Module):
         """Draw the kernels, and set their scales and thresholds from their outputs on traces.
 
         `x`, float32 (n, C, T), are traces whose channels are scaled by `shift` and `scale`, which
-        must be set before. It writes the buffers `kernel`, `threshold` and, if there are groups,
-        `competing_kernel`. A kernel of tower 1 is scaled so that its ramp is two standard
-        deviations of its outputs wide, those of tower 2 so that this deviation is 1.
+        must be set before. `rng` draws the kernels. The method writes the buffers `kernel`,
+        `threshold` and, if there are groups, `competing_kernel`. Thresholds, which only tower 1
+        has, are quantiles of the outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that its
+        ramp is two standard deviations of its outputs wide, those of tower 2 so that this deviation
+        is 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)
@@ -308,9 +314,10 @@ class RocketEncoder(nn.Module):
     def learn_feature_scales(self, raw: Tensor) -> None:
         """Set `gain` and `offset` so that `offset + gain * raw` is standardised.
 
-        They are computed from raw features (n, P). All features of tower 2 are divided by the same
-        standard deviation, the root mean square of theirs. A small floor is added to each deviation
-        so that a feature that never varied does not explode.
+        Both are changed in place. They are computed from the unscaled features `raw` (n, P). All
+        features of tower 2 are divided by the same standard deviation, the root mean square of
+        their standard deviations. A small floor is added to each deviation so that a feature that
+        never varied does not become huge.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more
@@ -321,10 +328,10 @@ class RocketEncoder(nn.Module):
 
 
 def compute_raw_features(encoder: RocketEncoder, traces: Floats) -> Tensor:
-    """Compute the raw features of traces (n, C, T): float32 (n, P).
+    """Compute the unscaled features of traces (n, C, T): float32 (n, P).
 
-    The features of a trace are the same to the bit whatever other traces it comes with, since every
-    chunk is full; the last chunk is filled up with zeros.
+    The encoder computes 32 traces at a time. The features of a trace are the same to the bit
+    whatever other traces it comes with, since the last 32 are filled up with traces of zeros.
     """
     out = torch.empty(len(traces), len(encoder.gain))
     for start in range(0, len(traces), CHUNK):
@@ -353,8 +360,8 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
     """Return the frame that each tap of a kernel reads, int64 (D, 9, P), for P places in a trace.
 
     A tap is one of the nine inputs of a kernel. `dilations` is the largest D; D is smaller for
-    short traces. For a tap beyond the ends of the trace the position is ``2 * frames - 1``, at
-    which `RocketEncoder.read_taps` has a zero.
+    short traces. For a tap beyond the ends of the trace the position is
+    ``2 * frames - 1``, at which `RocketEncoder.read_taps` finds a zero.
     """
     steps = np.array(dilation_steps(frames, dilations), dtype=np.int64)
     middle = ((np.arange(places) + 0.5) / places * frames).astype(np.int64)
@@ -365,9 +372,10 @@ def tap_positions(frames: int, dilations: int, places: int) -> NDArray[np.int64]
 def draw_kernels(channels: int, n: int, choices: Tensor, rng: np.random.Generator) -> Tensor:
     """Draw n kernels from `choices` (N, 9), and the channels that each reads: float32 (n, C * 9).
 
-    Each of the N choices is drawn n / N times, rounded up or down, so none twice unless n exceeds
-    N. A kernel reads one to all channels; a small number of channels is more likely. It is the same
-    in all channels that it reads, and 0 in the others. Each row of the result has the norm 1.
+    `rng` draws them. Each of the N choices is drawn n / N times, rounded up or down, so none twice
+    unless n exceeds N. A kernel reads one to all channels; a small number of channels is more
+    likely. It is the same in all channels that it reads, and 0 in the others. Each row of the
+    result has the norm 1.
     """
     drawn = rng.permutation(max(n, len(choices)))[:n] % len(choices)
     kernels = choices[torch.from_numpy(drawn)]

@@ -245,9 +245,9 @@ class TorchReducer(Reducer):
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
         the last training, or from initial weights the first time. `numbers` is not read. Returns
-        the points of the traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError
-        for fewer than two traces outside a fold, and at the first training for fewer than 20
-        traces, or a parameter, network or checkpoint that cannot be used.
+        the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises
+        SettingError for fewer than two traces outside a fold, and at the first training for fewer
+        than 20 traces, or a parameter, network or checkpoint that cannot be used.
         """
         traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
@@ -274,8 +274,9 @@ class TorchReducer(Reducer):
     def _check_and_initialize(self, X: Floats) -> Floats:
         """Check traces and return them as (n, C, T); build the networks at the first call.
 
-        The first traces set the shape and the scales of the channels; no label is read. Raises
-        SettingError if the first call has fewer than 20 traces, or a parameter is not usable.
+        The first traces set the shape and the scales of the channels; no label is read. The first
+        call raises SettingError for fewer than 20 traces, and for a parameter, network or
+        checkpoint that cannot be used. Raises the errors of `check_traces`.
         """
         if not vars(self).get("is_initialized_"):
             do = "verify more parts first"
@@ -286,10 +287,11 @@ class TorchReducer(Reducer):
     def _initialize(self, traces: Floats) -> None:
         """Build preprocessor, networks and `encoder_` anew for traces (n, C, T).
 
-        Earlier trainings are discarded; no label is read. The scales of the channels are read from
-        the traces, the weights from the checkpoint, if one is given. Raises SettingError for a
-        parameter out of its range, fewer than 2 samples, a network that does not give
-        (B, features), or a checkpoint that cannot be used.
+        Earlier trainings are discarded; no label is read. The preprocessor averages and scales the
+        samples; its scales are computed from the traces. The weights are read from the checkpoint,
+        if one is given, and otherwise drawn. Raises SettingError for a parameter out of its range,
+        fewer than 2 samples, a network that does not give (B, features), or a checkpoint that
+        cannot be used.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -341,9 +343,10 @@ class TorchReducer(Reducer):
 
         The networks with averaged weights and new statistics of batch normalisation become
         `encoder_`. `n_steps_left_` becomes 0 if `stop` limits the number of steps, else the number
-        of steps that are missing until training is complete. `numbers` is not read. Returns the
-        points of the traces, float32 (n, d), row i in space ``folds[i]``. Raises SettingError for
-        fewer than two traces outside a fold; `encoder_` stays then.
+        of steps that are missing until training is complete. `labels` (n,) are 1 or 0, `folds` (n,)
+        the folds; `numbers` is not read. Returns the points of the traces, float32 (n, d), row i in
+        embedding space ``folds[i]``. Raises SettingError for fewer than two traces outside a fold;
+        `encoder_` stays then.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -397,10 +400,11 @@ class TorchReducer(Reducer):
         self.loss_ = float(np.mean(losses)) if losses else float("nan")
 
     def train_step(self, optimizer: torch.optim.Optimizer, x: Tensor, y: Tensor) -> float:
-        """Take one step on x (B, K, C', L) and y (B, K); return the mean loss, in nats.
+        """Take one step on traces x (B, K, C', L), labels y (B, K); return the loss, in nats.
 
-        The averaged weights move as well, and `n_steps_` grows by 1. The loss is the one before the
-        step, the mean over the batch and over the K copies of the network.
+        `optimizer` is that of `make_optimizer`. The averaged weights move as well, and `n_steps_`
+        grows by 1. The loss is the one before the step, the mean over the batch and over the K
+        copies of the network.
         """
         logits = self.members_(x)  # (B, K)
         loss = F.binary_cross_entropy_with_logits(logits, y)
@@ -415,8 +419,9 @@ class TorchReducer(Reducer):
     def make_optimizer(self) -> torch.optim.Optimizer:
         """Return a new AdamW for `members_`, with the moments that the last training left.
 
-        The moments are not copied: a step of the optimiser changes `optimizer_state_`. Weight decay
-        is for weights only, not for biases and the parameters of batch normalisation.
+        The moments are the running means of gradients and of their squares. They are not copied: a
+        step of the optimiser changes `optimizer_state_`. Weight decay is for weights only, not for
+        biases and the parameters of batch normalisation.
         """
         decayed: list[nn.Parameter] = []
         others: list[nn.Parameter] = []
@@ -437,8 +442,8 @@ class TorchReducer(Reducer):
         """Move the parameters of `averaged_members_`, in place, towards those of `members_`.
 
         An averaged parameter becomes `weight_averaging` times itself plus the rest of the trained
-        one; in the first steps the factor is smaller. Statistics of batch normalisation are not
-        averaged.
+        one; in the first steps the factor is smaller, (1 + n) / (10 + n) after n steps. Statistics
+        of batch normalisation are not averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
         averages = self.averaged_members_.parameters()
@@ -475,9 +480,10 @@ class TorchReducer(Reducer):
 
     @torch.inference_mode()
     def _embed_in_fold_space(self, x: Tensor, folds: Ints) -> Floats:
-        """Embed preprocessed traces (n, C', L): float32 (n, d), row i in space ``folds[i]``.
+        """Embed preprocessed traces (n, C', L), each in one embedding space: float32 (n, d).
 
-        Network k computes the rows of fold k alone, so this takes 1 / K of the time of `embed`.
+        Row i is in space ``folds[i]``, as a reference. Network k computes the rows of fold k alone,
+        so this takes 1 / K of the time of `embed`.
         """
         rows_of_fold = [np.flatnonzero(folds == k) for k in range(self.folds)]
         longest = max(map(len, rows_of_fold))
@@ -497,7 +503,7 @@ class TorchReducer(Reducer):
 
     @torch.inference_mode()
     def embed(self, X: Floats) -> Floats:
-        """Embed traces (n, T) or (n, C, T) in every space; return float32 (n, K, d).
+        """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
         The points in space k come from network k, which was trained without the labels of fold k.
         Raises NotFittedError before there are networks, ValueError for traces of another shape and
@@ -584,7 +590,8 @@ class TorchReducer(Reducer):
 
         The constructor's parameters must be the same. Raises StoreError if the sizes are others, or
         if the network gives other points for a fixed trace than when the state was taken; a state
-        without these points is not checked so. After an error do not use the reducer.
+        without these points is not checked so. Raises KeyError if an array of counts, shape or loss
+        is missing. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
@@ -608,9 +615,10 @@ class TorchReducer(Reducer):
         return self
 
     def _modules(self) -> dict[str, nn.Module]:
-        """Return the modules whose tensors are in the state.
+        """Return the modules whose tensors `get_state` returns.
 
-        The keys are the prefixes that the names of these tensors have in the state.
+        They are the preprocessor, the trained copies of the network and their averages. The keys
+        are the prefixes of the names of these tensors in the state.
         """
         return {
             "preprocessor.": self.preprocessor_,
@@ -719,7 +727,8 @@ def compile_fault(network: NetworkFactory, channels: int, samples: int) -> str:
     """Return why TorchScript cannot compile a network, and log it as a warning; "" if it can.
 
     A user's network may hold Python that TorchScript does not support. To find out, two copies of
-    it are built, compiled and run. A process keeps the answers for the last 32 networks and shapes,
+    it for preprocessed traces (channels, samples) are built, compiled and run; any exception counts
+    as a fault, and none is raised. A process keeps the answers for the last 32 networks and shapes,
     and logs nothing when it gives such an answer again. The state of torch's global random
     generator does not change.
     """

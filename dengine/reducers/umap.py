@@ -127,8 +127,8 @@ class UmapEncoder(nn.Module):
         """Embed traces, each a vector of F frames, among the references: (B, F) -> (B, dim).
 
         A trace starts at the mean of its nearest references' points, weighted by their membership
-        strengths. It is then moved five times to the mean of the same points, weighted by the
-        coefficients of attraction at its current distances.
+        strengths. It is then moved five times to the mean of the same points, weighted by how
+        strongly UMAP attracts it to each of them at its current distances.
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
@@ -264,12 +264,12 @@ class UmapReducer(Reducer):
     ) -> Floats:
         """Compute a layout of traces X (n, C, T), and make them the references of a new `encoder_`.
 
-        `numbers` (n,), increasing, identify the traces from training to training; labels and folds
-        are not read. The layout goes on from the last one if at least half of the traces were in
-        it; otherwise, or without `numbers`, it starts anew. `stop` may end the epochs; after its
-        deadline at most ten more are taken. Returns the points of the traces, float32 (n,
-        n_components), which share their memory with `embedding_`. Raises SettingError for a
-        parameter out of its range, or too few traces.
+        `numbers` (n,), those of the labels, increasing, identify the traces from training to
+        training; labels and folds are not read. The layout goes on from the last one if at least
+        half of the traces were in it; otherwise, or without `numbers`, it starts anew. `stop` may
+        end the epochs; after its deadline at most ten more are taken. Returns the points of the
+        traces, float32 (n, n_components), which share their memory with `embedding_`. Raises
+        SettingError for a parameter out of its range, or too few traces.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
@@ -295,8 +295,9 @@ class UmapReducer(Reducer):
         """Search the neighbours of traces X (n, C, T), and keep them for the next training.
 
         `train` finds them again by `numbers`, the numbers of the traces' labels; without numbers
-        nothing is done. Before the first training it also sets the shape, draws the seed and fits
-        the frames. Raises SettingError for a parameter out of its range, or too few traces.
+        nothing is done. Before the first training it also sets the shape, draws the seed and sets
+        up the frames, the sums of samples between which distances are measured. Raises SettingError
+        for a parameter out of its range, or too few traces.
         """
         if numbers is None:
             return
@@ -323,11 +324,12 @@ class UmapReducer(Reducer):
         return bool(np.isin(numbers, neighbors.numbers).any())
 
     def _initialize(self, traces: Floats) -> None:
-        """Discard all trainings, draw the seed, and set up the frames for traces (n, C, T).
+        """Discard all trainings, draw the seed, and set up the frames of traces (n, C, T).
 
-        `random_state` gives the seed. The number of frames and their centre and scale come from at
-        most 256 of the traces, evenly spaced. An earlier `encoder_` stays until the next training
-        replaces it.
+        `random_state` gives the seed; the counters of epochs become 0. A frame is the sum of a
+        short stretch of samples. The number of frames of a trace and their centre and scale come
+        from at most 256 of the traces, evenly spaced. An earlier `encoder_` stays until the next
+        training replaces it.
         """
         sample = traces[:: 1 + len(traces) // CHUNK]
         self.make_frames_ = frames_for(sample)
@@ -377,9 +379,10 @@ class UmapReducer(Reducer):
     ) -> Tensor:
         """Return the points (n, n_components), float32, at which a layout starts.
 
-        If at least half of the traces were in the last training, they start at their last points,
-        and a new trace starts where the encoder puts it, plus a little noise. Otherwise all start
-        at the points of `spectral_start`, and `n_epochs_` becomes 0.
+        `neighbors` and `graph` are those of the n traces; `rng` draws the noise. If at least half
+        of the traces were in the last training, they start at their last points, and a new trace
+        starts where the last `encoder_` puts it, plus a little noise. Otherwise all start at the
+        points of `spectral_start`, and `n_epochs_` becomes 0.
         """
         last_rows = self.neighbors_.rows_of(neighbors.numbers)
         is_old = last_rows >= 0
@@ -395,9 +398,10 @@ class UmapReducer(Reducer):
         return points
 
     def _set_references(self, neighbors: Neighbors, points: Tensor) -> None:
-        """Make these traces and their points (n, n_components) the references of a new encoder.
+        """Make traces and their points (n, n_components) the references of a new encoder.
 
-        It replaces `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
+        `neighbors` holds the frames of the traces and their nearest neighbours. It replaces
+        `neighbors_`, `embedding_` and `encoder_`, and drops what `precompute` found.
         """
         self.neighbors_ = neighbors
         self.precomputed_neighbors_ = None
@@ -460,9 +464,9 @@ class UmapReducer(Reducer):
     def get_state(self) -> State:
         """Return arrays from which `set_state` restores the reducer bit for bit, by name.
 
-        They are shape and counters, and the numbers, frames, neighbours, distances and points of
-        the last training. Not all of them are copies. Neighbours that `precompute` found are not
-        among them. Raises NotFittedError before a fit.
+        They are shape and counters, and the numbers (of the labels), frames, neighbours, distances
+        and points of the last training. Not all of them are copies. Neighbours that `precompute`
+        found are not among them. Raises NotFittedError before a fit.
         """
         check_is_fitted(self, "encoder_")
         counts = [self.make_frames_.n_frames, self.seed_]
@@ -481,7 +485,8 @@ class UmapReducer(Reducer):
         """Restore what `get_state` returned, and return self; the parameters must be the same.
 
         What `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module
-        that averages traces, have other sizes than the shape of the traces in `state` asks for.
+        that averages traces, have other sizes than the shape of the traces in `state` asks for,
+        KeyError if another array is missing.
         """
         channels, samples = self.restore_shape(state)
         n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])

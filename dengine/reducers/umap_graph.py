@@ -110,7 +110,7 @@ class Neighbors:
     def empty(cls, n_features: int, k: int) -> Self:
         """Return an object without traces, whose `update` finds k neighbours of each trace.
 
-        `n_features` is F, the number of frames of a trace.
+        `n_features` is F, the number of frames (sums of short stretches of samples) of a trace.
         """
         return cls(
             numbers=np.zeros(0, dtype=np.int64),
@@ -136,8 +136,8 @@ class Neighbors:
         traces : array of float32, shape (n, C, T)
             More than k.
         numbers : array of int64, shape (n,)
-            Increasing; the same number stands for the same trace as before. A trace of this object
-            whose number is not among them is dropped.
+            Numbers of the labels, increasing; the same number stands for the same trace as before.
+            A trace of this object whose number is not among them is dropped.
         make_frames : Frames
             The module that computed `frames`.
 

@@ -171,9 +171,10 @@ class Edges:
 
     @classmethod
     def from_graph(cls, graph: csr_matrix) -> Self:
-        """Return the edges of a symmetric graph (n, n), whose row i holds the edges with head i.
+        """Return the edges of a symmetric graph (n, n) of points, each edge in both directions.
 
-        The strengths are divided by the largest strength.
+        An edge joins a point, its `head`, to another, its `tail`; row i of the graph holds the
+        strengths of the edges with head i. They are divided by the largest strength.
         """
         counts = torch.from_numpy(np.diff(graph.indptr).astype(np.int64))
         strength = torch.from_numpy(graph.data.astype(np.float32))
@@ -297,11 +298,12 @@ def repulsion(points: Tensor, samples: Tensor, a: float, b: float) -> Tensor:
 
 
 def learning_rates(n_epochs: int, stop: StopRule) -> Iterator[float]:
-    """Yield the learning rate of each epoch, which falls from 1 towards 0.
+    """Yield the learning rate of each of `n_epochs` epochs, which falls from 1 towards 0.
 
-    `stop` is asked before each epoch. If it limits the number of steps, the rate falls within that
-    number. After its deadline at most ten more epochs are taken, over which the rate falls quickly:
-    at a high rate the points would stay scattered by the negative samples of the last epoch.
+    `stop` is asked before each epoch. If `stop` limits the number of steps, the rate falls within
+    that number. After its deadline at most ten more epochs are taken, over which the rate falls
+    quickly: at a high rate the points would stay scattered by the negative samples of the last
+    epoch.
     """
     if stop.max_steps is not None:
         n_epochs = min(n_epochs, stop.max_steps)
