@@ -54,9 +54,10 @@ class VersionTable(CellTable):
         state: Arrays | None,
         time: float | None = None,
     ) -> int:
-        """Commit a retrain; if it is accepted, delete the states that are no longer kept.
+        """Commit a retrain; if its version is accepted, delete states that are no longer kept.
 
-        These are the arrays of older versions, by `keeps_state`.
+        A state is the stored arrays of a version; `keeps_state` says which older versions keep
+        theirs.
 
         Parameters
         ----------
@@ -92,7 +93,8 @@ class VersionTable(CellTable):
     ) -> Row:
         """Return the row of a retrain for the table `model_version`, its arrays packed as npz.
 
-        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError if
+        `last_seq` is the number of the newest label that the retrain knew of. `state` is None, or
+        the arrays by name; `now` is the time of the row, in seconds since 1970. Raise StoreError if
         `report.accepted` is True and `state` is None, and for an array of Python objects.
         """
         arrays = check_state(report, state)
@@ -229,6 +231,7 @@ class VersionTable(CellTable):
         Returns
         -------
         list of StoredVersion
+            Each with the report, the time, and whether the arrays of its version are kept.
         """
         kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")
