@@ -112,9 +112,9 @@ class Explanation:
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:
-    """Return the id of the only decision on a part that is no reject, else of its only reject.
+    """Return the id of the only decision on a part that is no REJECT, else of its only REJECT.
 
-    A rejected part may come again, so rejects count only if there is no other decision. Only the
+    A rejected part may come again, so REJECT counts only if there is no other decision. Only the
     newest 20 decisions of this cell on the part are looked at.
 
     Parameters
@@ -172,6 +172,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     Returns
     -------
     Explanation
+        Sentences, bounds with their thresholds, the nearest references of the version that decided,
+        and the envelope of good parts; see its attributes.
 
     Raises
     ------
@@ -256,9 +258,10 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
 def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Floats | None:
     """Return the distances from a decision's embedding to the references of a version, shape (n,).
 
-    Each is measured in the embedding space of the reference, and they are in the order of the
-    version's index. The distance to references of the decision's own part is infinite. None if the
-    trace was not embedded or there is no version.
+    Each is measured in the embedding space of the reference, in which one radius means the same for
+    every reducer. They are in the order of the version's index of references. The distance to
+    references of the decision's own part is infinite. None if the trace was not embedded or there
+    is no version.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:
@@ -278,9 +281,10 @@ def _find_neighbours(
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    Nothing is yielded if `version` or `distances` is None. A neighbour may lie outside of the
-    radius. If the decision behind a reference is unknown (another cell made it), its id, part,
-    source and trace are None. Raises StoreError for a damaged trace.
+    `distances` are those of `_measure_distances`, one for each reference. Nothing is yielded if
+    `version` or `distances` is None. A neighbour may lie outside of the radius. If the decision
+    behind a reference is unknown (another cell made it), its id, part, source and trace are None.
+    Raises StoreError for a damaged trace.
     """
     if distances is None or version is None:
         return

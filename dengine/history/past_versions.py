@@ -121,8 +121,10 @@ def _was_known(label: PastLabel, item: StoredDecision) -> bool:
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
     """Return the index of a stored version's references, with the labels `added` later.
 
-    A label without a point (the embedding of its trace) is left out. In a full index each added
-    reference replaces the oldest. The fold of a label is computed from its hash.
+    A label without a point (the embedding of its trace) is left out. An index is full if older
+    references have been removed from it for lack of room; each added reference then replaces the
+    oldest. Otherwise there is room for the recipe's training window. The fold of a label is
+    computed from the content hash.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
@@ -139,9 +141,10 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
     """Compute how novel the trace of a decision was, by its version's `NoveltyGate`.
 
-    The gate calls a trace novel by its distance from the traces of the training. Returns None
-    without a decision, if the decision's reason is not `Reason.NOVEL`, and if the gate cannot be
-    restored.
+    The gate calls a trace novel by its distance from the traces of the training. The result has
+    four numbers (level, texture, distortion, gaps), of which at least one is above 1 for a novel
+    trace. Returns None without a decision, if the decision's reason is not `Reason.NOVEL`, and if
+    the gate cannot be restored.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -183,7 +186,7 @@ def _restore_thresholds(
     the second. Labels of quarantined traces and of rejected parts that somebody inspected do not
     update the rule. The rule "local" with stops="some" learns nothing, so both thresholds are the
     policy's lower bound. Of any other rule the result is None if `_restore_rule` returns None, or
-    if the rule is no `MemberRule`, which alone has such thresholds.
+    if the rule is no `MemberRule`, which alone has thresholds (a user's own rule may have none).
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -198,7 +201,7 @@ def _restore_thresholds(
 
 
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
-    """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
+    """Return the present decision rule: the stored rule, updated with all outcomes since.
 
     If a label was corrected or a check is overdue, the stored rule cannot be continued, and a fresh
     one is updated with all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
