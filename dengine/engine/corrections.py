@@ -107,7 +107,7 @@ class Corrections:
         success : bool
             The right label. If this label counts already, nothing changes.
         author : str
-            Who says so, for the record.
+            Who says so, for the event.
 
         Returns
         -------
@@ -226,10 +226,10 @@ class Corrections:
         label that it was trained with; the next retrain then starts from this version, unless it
         saw a forgotten label.
 
-        A training under way in the executor is discarded, and no other one begins. A reducer that
-        is stored by its traces (umap-learn) is fitted again on the traces of the earlier version,
-        with the labels that they had then; a baseline on the same traces, with the labels as they
-        count now.
+        A training under way in the executor is discarded, and no other one begins. A reducer like
+        umap-learn, of which not the fit but only the numbers of its traces are stored, is fitted
+        again on the traces of the earlier version, with the labels that they had then. A baseline
+        is fitted on the same traces, with the labels as they count now.
 
         Parameters
         ----------

@@ -90,13 +90,14 @@ class DecisionMaker:
         return spec
 
     def convert(self, trace: ArrayLike) -> TraceArray:
-        """Return a trace as float32 (channels, samples), converted as the `TraceSpec` demands.
+        """Return a trace as float32 (channels, samples), in the shape of the `TraceSpec`.
 
-        If no `TraceSpec` is in force, a trace without a fault sets it; but if another cell of the
-        product has set one, that one is taken, and the trace must fit it. If a `TraceSpec` is in
-        force, but the store did not take the settings, saving them is tried again; a failure is
-        logged. Until the first version is trained, the first finite trace makes the untrained model
-        compile its code for this shape; a failure of this is logged, too.
+        A trace of another length is fitted if the `TraceSpec` says how. If no `TraceSpec` is in
+        force, a trace without a fault sets it; but if another cell of the product has set one, that
+        one is taken, and the trace must fit it. If a `TraceSpec` is in force, but the store did not
+        take the settings, saving them is tried again; a failure is logged. Until the first version
+        is trained, the first finite trace makes the untrained model compile its code for this
+        shape; a failure of this is logged, too.
 
         A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`.
         Raises TraceError for a wrong shape, or too few samples of a first trace, and SettingError
@@ -120,8 +121,8 @@ class DecisionMaker:
     def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
         """Return the decision that the store already has for an id, or None for a new id.
 
-        The id comes from the caller, and `part` is the part's number. If it cannot be looked up,
-        this is logged, and the decision returned is a VERIFY for this `part` with
+        The id comes from the caller, and `part` is the part's number. If the id cannot be looked
+        up, this is logged, and the decision returned is a VERIFY for this `part` with
         `Reason.NO_STORE`. It is not recorded, because the id may have a decision already; `trace`
         is not looked at. A report for this id then raises StoreError, until a later call can look
         the id up.
@@ -186,10 +187,10 @@ class DecisionMaker:
     def sync(self, stored: StoredDecision) -> StoredDecision:
         """Wait until a decision and all earlier records are on disk; return the valid decision.
 
-        If that takes longer than the outbox, through which they are recorded, waits, or a write
-        fails, an ACCEPT or REJECT is replaced by a VERIFY with `Reason.NO_STORE`, which is
-        returned. But if it has reached the disk meanwhile, it stays valid and is returned. A VERIFY
-        is returned as it is. A timeout is not raised.
+        If that takes longer than the store's time limit, or a write fails, an ACCEPT or REJECT is
+        replaced by a VERIFY with `Reason.NO_STORE`, which is returned. But if it has reached the
+        disk meanwhile, it stays valid and is returned. A VERIFY is returned as it is. A timeout is
+        not raised.
         """
         decision = stored.decision
         try:

@@ -445,8 +445,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         A retrain that takes longer is dropped. A second call does nothing. Records that only the
         database does not take stay in the journal. Records that the disk does not take are given
-        up, and an error is logged; none of them was acknowledged. Raises StoreError while another
-        thread uses the engine.
+        up, and an error is logged; no call has said that they are on disk. Raises StoreError while
+        another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -513,7 +513,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             For a first trace that the policy's force limits do not fit, and, while settings are
             saved, for a `TraceSpec` that contradicts that of another cell of the product.
         ReportError
-            For an invalid id.
+            For an invalid id, and with `timed_out` for none.
         StoreError
             For an engine that is closed or was opened for reading, and, unless `timed_out`, for one
             that is in use by another thread.
@@ -817,8 +817,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self.set_policy(replace(self.policy, shadow=on), author)
 
     def certificate(self) -> Certificate:
-        """Flush, and return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
+        """Return bounds, at confidence 1 - alpha, on the errors of the decisions without a check.
 
+        Before that, everything is written to the disk, and to the store if it answers (`flush`).
         Decisions since the last change of policy count. Raises NotTakenError if not everything is
         on disk in time, and StoreError if the store cannot be read.
         """
@@ -868,8 +869,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._outbox.find_decision(as_id(decision_id))
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Flush, and return how the engine is doing; arguments and errors are those
-        of `history.status.status`.
+        """Return how the engine is doing, once everything is written (`flush`); arguments and
+        errors are those of `history.status.status`.
 
         If the disk does not take everything, `store_fault` says why, and the counts lack the rest.
         """

@@ -128,8 +128,9 @@ class Feedback:
 
         A VERIFY of a trace with a fault is not pending, nor is a VERIFY that could not be recorded
         (its number is 0). The rule counts each check that has become overdue as a wrong decision
-        (`_count_overdue`). When nearly all recent decisions have `Reason.NOVEL`, an event is
-        recorded, and the next such event only after their share has fallen to one half.
+        (`_count_overdue`). When more than 80 % of the decisions have `Reason.NOVEL`, in a mean that
+        fades over 50 decisions, an event is recorded, and the next such event only after this share
+        has fallen to one half.
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -206,15 +207,16 @@ class Feedback:
     def _learn_and_record(self, stored: StoredDecision, success: bool, source: Source) -> None:
         """Update rule and references with the outcome of a part, and have its label recorded.
 
-        A trace with a fault updates neither. The label of a rejected part that was inspected
-        becomes a reference and does not update the rule: which parts are inspected is somebody's
-        choice, and no sample. Every other label also tells the rule how many accepted parts went on
-        unreported since the last label, and this count begins again at 0, even if the decision is
-        from before the present rule and so does not update it. A part that was counted among them
-        is subtracted from the number that its own label tells, which may make it -1.
+        A trace with a fault updates neither. An exception of the model or the rule is logged and
+        not raised. The label of a rejected part that was inspected becomes a reference and does not
+        update the rule: which parts are inspected is somebody's choice, and no sample. Every other
+        label also tells the rule how many accepted parts went on unreported since the last label,
+        and this count begins again at 0, even if the decision is from before the present rule and
+        so does not update it. A part that was counted among them is subtracted from the number that
+        its own label tells, which may make it -1.
 
-        The label takes the next number of the outbox. That of a usable trace enters the training
-        window, in a product once the store has given it a number.
+        The label takes the next number of the outbox. The label of a trace without a fault enters
+        the training window, in a product once the store has given it a number.
         """
         decision = stored.decision
         version = self._live.version

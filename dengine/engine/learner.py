@@ -350,7 +350,7 @@ class Learner:
     def _choose_start(self) -> EngineModel:
         """Return the model that the next training starts from: one that saw no forgotten label.
 
-        Without any correction it is the model in force, or the untrained template before the first
+        Without any correction it is the model in force, or the untrained model before the first
         retrain. Otherwise `find_clean_start` chooses it from the store, and the choice is kept
         until another version is in force or another correction comes. If the store fails, that is
         logged, and the training starts from initial weights.

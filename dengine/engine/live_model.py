@@ -118,7 +118,7 @@ class LiveModel:
         Parameters
         ----------
         version : ModelVersion or None
-            None before the first retrain.
+            The newest stored version, with its arrays; None before the first retrain.
         newest_version : int
             Largest number that a version ever had.
         label_within : int
@@ -244,8 +244,8 @@ class LiveModel:
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with all stored outcomes of decisions since it began.
 
-        It is the rule of the model in force, or of the untrained template before the first retrain.
-        It begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
+        It is the rule of the model in force, or of the untrained model before the first retrain. It
+        begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
         outcomes, as wrong decisions. Labels that are not in the store yet are not, so the rule
         loses them: store them before.
 

@@ -132,7 +132,7 @@ def add_labels_since(
     capacity: int,
     shared_to: int | None = None,
 ) -> int:
-    """Make references of a version's restored model of the labels that are none yet.
+    """Add labels to a version's restored model as references, if they are none yet.
 
     They are the labels of all cells of the product up to number `shared_to`, and after it only this
     cell's own. None stands for the newest label that the version was trained on, or that it got

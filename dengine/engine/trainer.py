@@ -70,8 +70,8 @@ class TrainingWindow:
     def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
-        `label` is 1 or 0, `hash_` the hash of part or content, and `seq` the label's number, which
-        must be larger than any before; this is not checked.
+        `label` is 1 or 0, `hash_` the content hash, and `seq` the label's number, which must be
+        larger than any before; this is not checked.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
@@ -165,8 +165,9 @@ class TrainedOn:
     def to_state(self) -> dict[str, NDArray[Any]]:
         """Return the four attributes as arrays by name, for the store; `from_state` reads them.
 
-        Their names are "trained_on" (`seq`), "trained_as" (`corrected_to`), "counts_from" and
-        "pinned".
+        Their names are "trained_on" (`seq`, the numbers of the labels), "trained_as"
+        (`corrected_to`, the number of the newest correction), "counts_from" (labels with larger
+        numbers are new) and "pinned" (the version that a rollback put in force).
         """
         return {
             "trained_on": self.seq,
@@ -450,11 +451,12 @@ def train_candidate(
 ) -> Trained:
     """Train a model on labelled traces and return the outcome.
 
-    `successor` is the model, which this changes in place. Any exception, a window without traces,
-    and a defect of the trained model give an outcome without a model, whose reason begins with
-    "dropped: ". A training that reaches a limit ends early and is accepted; its reason says so if
-    the time budget ended it. `clock` returns seconds. Sets the present thread to one torch thread.
-    It is a plain function, so that any executor can run it.
+    The outcome has the model, a reason in words, the number of steps, the duration, and the numbers
+    of the labels. `successor` is the model, which this changes in place. Any exception, a window
+    without traces, and a defect of the trained model give an outcome without a model, whose reason
+    begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
+    says so if the time budget ended it. `clock` returns seconds. Sets the present thread to one
+    torch thread. It is a plain function, so that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     begin = clock()

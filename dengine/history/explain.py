@@ -282,9 +282,9 @@ def _find_neighbours(
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
     `distances` are those of `_measure_distances`, one for each reference. Nothing is yielded if
-    `version` or `distances` is None. A neighbour may lie outside of the radius. If the decision
-    behind a reference is unknown (another cell made it), its id, part, source and trace are None.
-    Raises StoreError for a damaged trace.
+    `version` or `distances` is None. A neighbour may lie outside of the radius, which only says
+    what its field `inside` is. If the decision behind a reference is unknown (another cell made
+    it), its id, part, source and trace are None. Raises StoreError for a damaged trace.
     """
     if distances is None or version is None:
         return
@@ -310,14 +310,14 @@ def _find_neighbours(
 def _find_envelope(
     store: SqlStore, item: StoredDecision, version: PastVersion | None
 ) -> Envelope | None:
-    """Return the envelope of the successes of other parts than the decision's; None if too few.
+    """Return the envelope of the good parts other than the decision's part; None if too few.
 
-    The envelope is the band that contains the middle 95 % of the successes at each sample. They are
-    taken from the newest `MAX_ENVELOPE_LABELS` labels up to `version.last_seq`, the newest label
-    that the version knew at the decision. If these give no envelope (`envelope_of` returns None),
-    or without a version, they are taken from the newest labels of today. Labels are taken as
-    corrected by now. Traces of the decision's own part (without a number, traces equal to its
-    trace) are left out. So is a damaged trace, and an event is written to the store.
+    The envelope is the band that contains the middle 95 % of these parts' traces at each sample.
+    They are taken from the newest MAX_ENVELOPE_LABELS labels (1,000) up to `version.last_seq`, the
+    newest label that the version knew at the decision. If these give no envelope (`envelope_of`
+    returns None), or without a version, they are taken from the newest labels of today. Labels are
+    taken as corrected by now. Traces of the decision's own part (without a number, traces equal to
+    its trace) are left out. So is a damaged trace, and an event is written to the store.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labels.with_traces(MAX_ENVELOPE_LABELS, last=last)

@@ -66,13 +66,14 @@ def load_past_version(
 
     Its references and its rule include this cell's labels that had come by then, as they were
     reported: later corrections are not applied. Of the labels that came after the version was
-    trained, only the first `MAX_LABELS` are read. A damaged label is left out, and an event is
-    written to the store.
+    trained, only the first MAX_LABELS (100,000) are read. A damaged label is left out, and an event
+    is written to the store.
 
     Parameters
     ----------
     store : SqlStore
     version : int
+        Number of the version.
     recipe : Recipe
         The recipe of that moment.
     item : StoredDecision or None
@@ -82,8 +83,9 @@ def load_past_version(
     Returns
     -------
     PastVersion or None
-        None if no such version was put in force, if its state is damaged or no longer kept, or if
-        it has no references (a baseline, a model that the user handed in).
+        The references with their labels, the thresholds of the rule, and how novel the trace of the
+        decision was. None if no such version was put in force, if its state is damaged or no longer
+        kept, or if it has no references (a baseline, a model that the user handed in).
     """
     try:
         stored = store.versions.load(version)

@@ -426,7 +426,8 @@ def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
     """Return the number of the version that a rollback put in force; 0: none is pinned.
 
     `accepted` holds the reports of all versions that were put in force, oldest first. If the newest
-    of them was trained, nothing is pinned, and no arrays are read.
+    of them was trained, nothing is pinned, and no arrays are read. If the arrays of the newest
+    version are damaged, an event is written to the store, and those of the version before count.
     """
     if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
         return 0
@@ -530,7 +531,7 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 
 
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
-    """Estimate the share of bad parts among those that the model found acceptable.
+    """Estimate the share of bad parts among those that the model would have accepted.
 
     These are the accepted parts, and the audited ones that would have been accepted; `n` counts
     both. If the outcomes of all accepted parts are known, the estimate rests on these outcomes.
@@ -543,6 +544,7 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     Parameters
     ----------
     outcomes : Outcomes
+        Counts of accepted and audited parts by label.
     policy : Policy
 
     Returns
@@ -680,7 +682,8 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
         Number of newest decisions of the selection; all of these are read by this call. None: all
         decisions, which are read in pages during the iteration.
     **where
-        The selection: fields of `HistoryFilter`.
+        The selection: action, reason, label, since, until, predicted or part, the fields of
+        `HistoryFilter`.
 
     Returns
     -------
@@ -720,7 +723,8 @@ def iterate_decisions(
     ----------
     store : SqlStore
     where : HistoryFilter
-        The selection: a decision must have the values of all fields that are not None.
+        The selection: a decision must have the values of all fields that are not None, and its time
+        must lie from `since` to before `until`.
     page_size : int, default 500
         Decisions read at a time.
     start_after : str or None

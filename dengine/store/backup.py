@@ -68,6 +68,8 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     Returns
     -------
     BackupReport
+        The numbers of decisions and labels in the copy and of records from journals, and the cells
+        that have no journal beside the store.
 
     Raises
     ------
@@ -171,7 +173,8 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
     """Commit records of a cell's journal to `file`, the copy; it is not opened for no records.
 
     Records that the copy already has change nothing. A record that contradicts the copy is stored
-    there as an event of kind "dead letter". Raise StoreError if the cell's ledger has another key.
+    there as an event of kind "dead letter". Raise StoreError if the cell's ledger has another key
+    or the copy cannot be written.
     """
     if not records:
         return

@@ -167,8 +167,8 @@ class CorrectionTable(CellTable):
 
         A row has content_hash, quarantined (whether its trace is kept out of training) and time of
         the decision, and of its label success and source as they were reported, its number `seq`,
-        and `corrected`, the label after corrections: 0, 1 or FORGOTTEN. These four are None without
-        a label. Ids that are not stored are left out.
+        and `corrected`, the label after corrections: 0, 1 or FORGOTTEN (2). These four are None
+        without a label. Ids that are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
         return self._database.rows_by_id(

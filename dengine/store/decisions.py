@@ -50,7 +50,8 @@ class DecisionTable(CellTable):
         Raises
         ------
         StoreError
-            If the trace is missing, or not as it was stored; it is checked only if it is read.
+            If the trace is missing, or not as it was stored; it is checked only if it is read. Also
+            for another stored value that cannot be read, and if the database fails.
         """
         query = past_query(self._database.cell_id).where(DECISION.c.id == decision_id)
         rows = self._read(
@@ -92,7 +93,8 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         where : HistoryFilter
-            The selection: a decision must have the values of all fields that are not None.
+            The selection: a decision must have the values of all fields that are not None, and its
+            time must lie from `since` to before `until`.
         limit : int
             Number of decisions at most.
         start_after : str or None

@@ -304,9 +304,11 @@ class Drainer:
         Records that are damaged on disk are taken from memory and reported by an event. If a
         decision is not in memory either, it is lost, and the kind of that event is DATA_LOST, an
         alarm. Then the journal's header notes that the database has the records, `n_drained` counts
-        them, and they are removed from the `DecisionIndex`, which keeps the newest decisions. Raise
-        StoreError if the database fails; nothing of this is done then, and the next call commits
-        the same records again, of which some may be stored already.
+        them, and they leave the queue of the recorder and, except for the newest decisions, the
+        `DecisionIndex`, by which decisions are found in memory. In a product the numbers of their
+        labels are kept for `pop_label_numbers`. Raise StoreError if the database fails; nothing of
+        this is done then, and the next call commits the same records again, of which some may be
+        stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))

@@ -192,12 +192,12 @@ def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLa
 
     The result holds the labels to be inserted, the decisions that have or will have the label that
     is reported, those whose label is to be corrected to a failure, and in words the labels that
-    contradict the store. The first label of a decision is new. A second label that repeats success
-    and source of the first changes nothing. A late stop (`_is_late_stop`) corrects the first label;
-    if this was corrected to a failure already, it changes nothing. Any other second label is a
-    problem. So is a late stop whose first label was forgotten, and a label whose decision is not
-    stored with the same trace and time. `stored` has, by id, what is stored of the decisions and
-    their labels: the rows of `CorrectionTable.stored_labels`.
+    contradict the store. The first label of a decision that has none is new. A second label that
+    repeats success and source of the first changes nothing. A late stop (`_is_late_stop`) corrects
+    the first label; if this was corrected to a failure already, it changes nothing. Any other
+    second label is a problem. So is a late stop whose first label was forgotten, and a label whose
+    decision is not stored with the same trace and time. `stored` has, by id, what is stored of the
+    decisions and their labels: the rows of `CorrectionTable.stored_labels`.
     """
     result = SortedLabels()
     for label in labels:

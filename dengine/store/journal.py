@@ -453,9 +453,10 @@ class Journal:
         self.head = Head(fields["newest"], n_drained, n_synced, newest, head.time)
 
     def _read_record(self, offset: int) -> bytes | None:
-        """Return the encoded record at an offset, without its frame (length, CRC-32, digest).
+        """Return the encoded record at an offset, without what stands before it in the file.
 
-        None if no record begins there, or if it is cut off or its CRC-32 differs.
+        That is a mark, the length, the CRC-32 and a digest, which is not checked here. Return None
+        if no record begins there, or if it is cut off or its CRC-32 differs.
         """
         frame = self._file.read(FRAME.size, offset)
         if len(frame) < FRAME.size or not frame.startswith(MARK):
@@ -629,7 +630,10 @@ def describe_process() -> str:
 
 
 def owned_error(owner: str, name: str) -> StoreError:
-    """Return the StoreError for an engine whose cell another engine owns; it names that owner."""
+    """Return the StoreError for an engine whose cell another engine owns.
+
+    `owner` describes the other engine's process, and `name` what it owns; the message has both.
+    """
     return StoreError(
         f"Expected a cell that no other engine runs on, but {owner} owns {name}; close that engine "
         "first, ask its page or its HTTP where it is served, or give this one a cell_id of its own."

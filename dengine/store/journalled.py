@@ -172,7 +172,7 @@ class JournalledStore(Outbox):
     # What the engine records
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
-        """Record a decision in memory, for a thread to write, and return a copy with its number.
+        """Record a decision in memory, return a copy with its number; a thread writes it to disk.
 
         The number is the cell's next one. If its id has a decision in memory, that one is returned,
         and nothing is recorded. If 10,000 records wait for the disk, nothing is recorded either:
@@ -332,7 +332,7 @@ class JournalledStore(Outbox):
         This ends within seconds, unless the outbox is `patient`, so that it waits for the disk and
         the database without a time limit. Records that the database does not take stay in the
         journal, and the next engine copies them. Records that the disk does not take are given up,
-        and an error is logged; no report of them was acknowledged. If the disk hangs, store and
+        and an error is logged; no call has said that they are on disk. If the disk hangs, store and
         journal stay open, and the cell is owned until the process ends. A second call does nothing,
         nor does one in a forked process.
         """
@@ -363,7 +363,7 @@ class JournalledStore(Outbox):
         return self._drainer.stop(seconds) and has_recorder_ended
 
     def _leave_store(self, can_close: bool) -> None:
-        """Log that the journal holds records that the database lacks.
+        """Log that the journal holds records that the database lacks, and why.
 
         If `can_close` (the disk answers), disconnect and close the journal without waiting, so that
         another engine can own the cell. If not, both stay open until the process ends.

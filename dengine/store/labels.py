@@ -219,16 +219,17 @@ class LabelTable(CellTable):
         since_version : int, default 0
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
-            Up to this decision number a check without a label is overdue, which counts as an error
-            until its label comes; 0: none is. All overdue checks are included, whatever `seq` is:
-            each adds an outcome "failure" if its part had evidence for success, and an outcome
-            "success" if it had evidence for failure (`overdue_outcomes`). These outcomes stand
-            where the running engine updated the rule with them: before the first label that came
-            when this check was overdue already, else at the end.
+            Up to this decision number a check without a label is overdue, and its decision counts
+            as wrong until its label comes; 0: none is. All overdue checks are included, whatever
+            `seq` is: each adds an outcome "failure" if the lower bound of its decision is above 0,
+            and an outcome "success" if the upper bound is below 1 (`overdue_outcomes`). These
+            outcomes stand where the running engine updated the rule with them: before the first
+            label that came when this check was overdue already, else at the end.
 
         Returns
         -------
         list of OutcomeRecord
+            Bounds of the decision, label, what the model alone would have done, and so on.
         """
         label = corrected_label()
         novel = DECISION.c.reason == Reason.NOVEL.value

@@ -471,8 +471,9 @@ def _chain_statement(
     rows, or in `single`, one row; `options` are not used. Return the statement with its parameters.
     Copies of rows for a table of CHAINED, whose rows the ledger covers, get the number of the entry
     and their sum. All other statements, and all those outside a write transaction of `Database`,
-    are returned unchanged; if settings are written, the entry notes it. Raise StoreError for an
-    insert into a table of CHAINED whose rows are inside the statement instead of its parameters.
+    are returned unchanged; if settings are written, the entry will have a copy of them all. Raise
+    StoreError for an insert into a table of CHAINED whose rows are inside the statement instead of
+    its parameters.
     """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):

@@ -50,9 +50,10 @@ class BloomFilter:
         return bool((self._bytes[byte] & bit).all())
 
     def _bit_positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the four bits of each id, each as an index of a byte and a byte with one bit set.
+        """Return the four bits of the filter that belong to each id.
 
-        Both arrays have four entries per id; the second has dtype uint8.
+        The first array has the index of the byte in which a bit is, the second a byte in which only
+        this bit is set. Both arrays have four entries per id; the second has dtype uint8.
         """
         digests = bytearray()
         for id_ in ids:

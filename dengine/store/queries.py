@@ -91,9 +91,10 @@ class Scope:
     def newest(
         self, connection: sa.Connection, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
     ) -> int:
-        """Return the largest number in a column over the rows of the cell, or of its product.
+        """Return the largest number in a column over the cell's rows.
 
-        With `conditions`, only over the rows that fulfil them all. 0 if there is none.
+        If the cell has a product, the rows of all cells of the product count. With `conditions`,
+        only over the rows that fulfil them all. 0 if there is none.
         """
         is_own = column.table.c.cell_id == self.cell_id
         query = sa.select(sa.func.max(column)).where(is_own, *conditions)

@@ -247,9 +247,9 @@ class Recorder:
         They are the oldest of the queue `unwritten`, and leave it.
 
         A journal of more than 8 MiB is cleared first, if the `Drainer` copies its last records to
-        the database within BATCH_SECONDS. If the journal's file was deleted, moved or replaced,
-        it is created again, and an event says so. Raise StoreError if the disk fails; the entries
-        then stay in `unwritten`.
+        the database within BATCH_SECONDS (0.05 s). If the journal's file was deleted, moved or
+        replaced, it is created again, and an event says so. Raise StoreError if the disk fails; the
+        entries then stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:

@@ -161,6 +161,8 @@ def verify_history(
     Returns
     -------
     HistoryReport
+        For each cell the numbers of ledger entries, rows and records in its journal that the store
+        lacks, and the digest of the newest entry; and the faults of all cells.
 
     Raises
     ------
@@ -344,8 +346,8 @@ class CellCheck:
         has a sum of its own, and a fault of its own.
 
         The sums of every row with an entry, also of a changed one, are kept for `_check_ledger`.
-        Each row adds 1 to `rows`. After each CHUNK rows `on_rows` is called; `run` calls it once
-        more for the rows after the last CHUNK.
+        Each row adds 1 to `rows`. After every 500th row (CHUNK) `on_rows` is called with 500; `run`
+        calls it once more with the number of the rows that are left.
         """
         for row in self._read_raw(table):
             self.rows += 1
