@@ -67,8 +67,8 @@ class DecisionMaker:
 
         If a `TraceSpec` is in force already, it stays. It only gets from `spec` a rate, units and
         columns that were unknown; a `spec` of another shape is ignored. If none is in force and
-        another cell of the product has set one, that one is taken in the same way; if it cannot be
-        read, that is logged and `spec` is set.
+        another cell of the product has set one, its `TraceSpec` is taken in the same way; if it
+        cannot be read, that is logged and `spec` is set.
 
         A change is saved in the store; if the store does not take it, it is saved with a later
         trace. Raises SettingError if the force limits do not fit the `TraceSpec`; then nothing

@@ -652,8 +652,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         Before the first cycle it waits until a retrain could begin without delay, and takes from
         the cell's `spec` what the engine does not know about the traces yet. From then until the
-        end the garbage collector ignores the objects that exist at that moment. Raises
-        NotTakenError if the disk does not take everything in time.
+        end the garbage collector ignores the objects that exist at that moment. Raises the errors
+        of `run`, for example NotTakenError if the disk does not take everything within 10 seconds.
         """
         self._wait_until_warm()
         spec = getattr(cell, "spec", None)

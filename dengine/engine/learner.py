@@ -193,7 +193,7 @@ class Learner:
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
         report is returned all the same. Raises StoreError if the labels before the training cannot
-        be stored.
+        be stored, and in a product if the store does not answer.
         """
         if not wait:
             if self.is_at_work:
@@ -244,8 +244,8 @@ class Learner:
         -------
         RetrainReport or None
             The report of a retrain that was done in this thread. None if there is no reason, if the
-            store or its journal has a fault, if a training or its preparation is under way, or if
-            the executor now trains.
+            store or its journal has a fault, if the labels cannot be stored, if a training or its
+            preparation is under way, or if the executor now trains.
         """
         peers = self._peers
         may_train = self.labels.is_due(retrain_every) and not self.live.pinned
@@ -388,7 +388,8 @@ class Learner:
 
         With `to_the_end` it takes all steps that are left: test, learn newer labels, store, learn
         newer labels, put in force. A candidate that cannot be stored is dropped. A candidate that
-        is stored waits for a later call if the newest labels cannot be stored, which is logged.
+        is stored waits for a later call if the newest labels cannot be stored, which is logged. The
+        time that this takes counts as work on the retrain, in its report.
         """
         candidate.begin_work()
         try:
@@ -468,8 +469,9 @@ class Learner:
     def _swap(self, candidate: Candidate) -> None:
         """Put a stored candidate in force with the present rule; keep its report for `take_report`.
 
-        If the training was dropped, there is no model: the previous version stays in force, the
-        report is kept, and its reason is added to `dropped`.
+        A failure to take over the rule is logged. If the training was dropped, there is no model:
+        the previous version stays in force, the report is kept, and its reason is added to
+        `dropped`, which a version that is put in force empties.
         """
         self._candidate = None
         self._report = candidate.report
@@ -533,8 +535,9 @@ class Learner:
         stored first, and the labels of all cells are read into the training window at the end. What
         is read is checked against the ledger; a difference sets the outbox's `integrity_error`,
         after which every part is verified. A pinned version or a correction discards a training
-        under way in the executor. Nothing happens in a cell without a product. Raises StoreError if
-        the store is unavailable.
+        under way in the executor. After a newer version the new labels are counted from those that
+        it knows. Nothing happens in a cell without a product. Raises StoreError if the store is
+        unavailable.
         """
         peers = self._peers
         if peers is None:

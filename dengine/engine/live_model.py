@@ -161,8 +161,9 @@ class LiveModel:
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
         """Put a model in force, as the version of this number; nothing is stored.
 
-        `trained_on` names the labels of its training. The caller hands the rule in force over to
-        the model (`EngineModel.prepare`), before or after.
+        `trained_on` names the labels of its training. The attributes `answering`, `version`,
+        `newest_version`, `trained_on` and `lacks_steps` are set. The caller hands the rule in force
+        over to the model (`EngineModel.prepare`), before or after.
         """
         self.answering = model
         self.version = version

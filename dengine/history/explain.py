@@ -183,6 +183,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     StoreError
         For a store that no engine has used, and for a damaged trace of the decision or of a
         neighbour.
+    SettingError
+        For a stored recipe that cannot be read.
     """
     settings = store.settings.read()
     if "recipe" not in settings:

@@ -166,7 +166,8 @@ def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     Returns None if the version has no state that fits this rule: it stored another rule, none (it
     is another cell's), or the rule was stale (it had missed an update). Also None if the rule is a
     user's class whose module is not imported yet, since nothing is imported here. A rule that
-    learns nothing needs no state.
+    learns nothing needs no state. Raises SettingError if an object of the user's class cannot be
+    made.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -223,6 +224,13 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
         was made under another policy, or the rule was stale (it had missed an update). A rule that
         learns nothing, like that of "local" with stops="some", has no state: another cell's version
         will do for it, and it is never stale.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
+    SettingError
+        If an object of the user's class of rule cannot be made.
     """
     stored = store.versions.newest()
     settings = store.settings.read()

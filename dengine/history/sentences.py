@@ -219,11 +219,11 @@ WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
 def _bound_sentences(
     decision: Decision, bound: Bound, circumstances: Circumstances
 ) -> Iterator[str]:
-    """Yield the sentences on a decision's evidence, its bounds, and the thresholds for them.
+    """Yield the sentences on the labels near a trace, on the bounds, and on their thresholds.
 
-    If nothing could be accepted or rejected, or the thresholds are unknown, the sentences say so.
-    For a handed-in model that decides by its own method there is one sentence, with its counts and
-    bounds.
+    `circumstances` are the settings of the engine at the decision. If nothing could be accepted or
+    rejected, or the thresholds are unknown, the sentences say so. For a handed-in model that
+    decides by its own method there is one sentence, with its counts and bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = "{:.3f} to {:.3f}".format(*outward(decision.lower, decision.upper, 3))

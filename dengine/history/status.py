@@ -371,7 +371,9 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     Raises
     ------
     StoreError
-        For a store that no engine has used.
+        For a store that no engine has used, and if the database fails.
+    SettingError
+        For a stored recipe that cannot be read.
     """
     settings = store.settings.read()
     if "recipe" not in settings:

@@ -174,9 +174,9 @@ class JournalledStore(Outbox):
     def record_decision(self, item: StoredDecision) -> StoredDecision:
         """Record a decision in memory, return a copy with its number; a thread writes it to disk.
 
-        The number is the cell's next one. If its id has a decision in memory, that one is returned,
-        and nothing is recorded. If 10,000 records wait for the disk, nothing is recorded either:
-        `item` is returned as it came, and `find_decision` raises StoreError for its id.
+        The number is the cell's next one. If its id has a decision in memory, that decision is
+        returned, and nothing is recorded. If 10,000 records wait for the disk, nothing is recorded
+        either: `item` is returned unchanged, and `find_decision` raises StoreError for its id.
         """
         id_ = item.decision.id
         with self._changed:

@@ -269,8 +269,8 @@ def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[A
 
     Its columns are seq (the label's number), success, content_hash and decision_id. Labels that
     were forgotten are left out, and so are labels of quarantined traces, which are stored but never
-    used in training. Corrections up to number `corrected_to` are applied; None: all. Labels of all
-    cells of the scope's product are included. The rows are in no order.
+    used in training. Corrections up to number `corrected_to` are applied; None: all. The labels are
+    those of the cell that `scope` names, and of all cells of its product. The rows are in no order.
     """
     label = corrected_label(corrected_to)
     return sa.select(

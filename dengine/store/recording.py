@@ -105,8 +105,8 @@ class Recorder:
     def fault(self) -> str:
         """Why the journal cannot be written: the last error, or that a sync takes too long.
 
-        It takes too long if it lasts more than the seconds with which this object was made. "" if
-        the journal can be written.
+        A sync takes too long if it lasts longer than `limit` seconds, an argument of `Recorder`. ""
+        if the journal can be written.
         """
         seconds = time.monotonic() - self._began
         if self._error or seconds <= self._limit:
@@ -168,7 +168,7 @@ class Recorder:
     def sync(self, seconds: float | None = None) -> None:
         """Wait until everything recorded so far is on the disk, at most `seconds`.
 
-        None: the `limit` with which this object was made. Raise NotTakenError if that takes longer,
+        None: `limit` seconds, an argument of `Recorder`. Raise NotTakenError if that takes longer,
         or a write fails meanwhile. The records are not lost then: the thread tries to write them
         again.
         """
