@@ -177,7 +177,8 @@ class DecisionMaker:
             The record with its number, which is 0 if it could not be recorded. If another thread
             has recorded a decision for the id meanwhile, that decision is returned. Before the
             first training the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault
-            or is outside a force limit.
+            or is outside a force limit. If the model raises, that is logged, and the decision is
+            VERIFY, `Reason.MODEL_ERROR`.
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE

@@ -673,8 +673,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         `index` is the number of the cycle, from 0. A REJECT is not reported, nor is an ACCEPT if
         the cell does not know its outcome. A label that cannot be written to the disk is logged,
         and written later. A retrain that is due is begun or done (`poll`). An exception of the cell
-        is raised unchanged, and ReportError if the cell returns no label or outcome. Returns the
-        record of the cycle; its `decide_seconds` is the duration of the decision alone.
+        is raised unchanged, and so are the other errors of `decide`, `report` and `poll`;
+        ReportError is raised if the cell returns no label or outcome. Returns the record of the
+        cycle; its `decide_seconds` is the duration of the decision alone.
         """
         trace = cell.insert()
         with uncollected():

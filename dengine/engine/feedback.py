@@ -207,13 +207,13 @@ class Feedback:
     def _learn_and_record(self, stored: StoredDecision, success: bool, source: Source) -> None:
         """Update rule and references with the outcome of a part, and have its label recorded.
 
-        A trace with a fault updates neither. An exception of the model or the rule is logged and
-        not raised. The label of a rejected part that was inspected becomes a reference and does not
-        update the rule: which parts are inspected is somebody's choice, and no sample. Every other
-        label also tells the rule how many accepted parts went on unreported since the last label,
-        and this count begins again at 0, even if the decision is from before the present rule and
-        so does not update it. A part that was counted among them is subtracted from the number that
-        its own label tells, which may make it -1.
+        `source` says where the label comes from. A trace with a fault updates neither. An exception
+        of the model or the rule is logged and not raised. The label of a rejected part that was
+        inspected becomes a reference and does not update the rule: which parts are inspected is
+        somebody's choice, and no sample. Every other label also tells the rule how many accepted
+        parts went on unreported since the last label, and this count begins again at 0, even if the
+        decision is from before the present rule and so does not update it. A part that was counted
+        among them is subtracted from the number that its own label tells, which may make it -1.
 
         The label takes the next number of the outbox. The label of a trace without a fault enters
         the training window, in a product once the store has given it a number.

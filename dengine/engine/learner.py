@@ -312,9 +312,9 @@ class Learner:
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
         given up, and so is a training that hangs. In a product (cells that share labels and
-        versions) all steps are taken in any case. When the training is done, the call first takes
-        in what the other cells stored: a correction or a rollback discards the training, and if the
-        store is unavailable, the training waits for a later call.
+        versions) all steps are taken in any case. When the training is done, or with `wait` above
+        0, the call first takes in what the other cells stored: a correction or a rollback discards
+        the training, and if the store is unavailable, the training waits for a later call.
         """
         if self._candidate is None and self._retrainer.future is None:
             return
@@ -657,8 +657,8 @@ class Learner:
         A model like umap-learn, of which not the fit but only the numbers of its traces are stored,
         is fitted on these traces again, with the labels that they had then. A baseline is fitted on
         its traces with the labels as they count now, since it cannot take a label back. The model
-        is not put in force. Raises StoreError if one of these traces has changed, or if this
-        dengine cannot restore the version.
+        is not put in force. An exception as it takes over the rule is logged. Raises StoreError if
+        one of these traces has changed, or if this dengine cannot restore the version.
         """
         state = without_rule(version.state)
         trained_on = TrainedOn.from_state(version.state)

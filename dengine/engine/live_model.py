@@ -112,8 +112,10 @@ class LiveModel:
         points. Without a version, or if one of those traces is damaged or missing, no model is in
         force, and the rule of the untrained model is updated with the stored outcomes since it
         began. The outcomes that update the rule are checked against the store's ledger; a
-        difference sets the outbox's `integrity_error`, after which every part is verified.
-        `overdue`, `overdue_to` and `corrected_to` are restored, too.
+        difference sets the outbox's `integrity_error`, after which every part is verified. Labels
+        that came after the version was stored become references. If the version is from before the
+        present rule, its stored rule is not taken. An exception as the model is made ready is
+        logged. `overdue`, `overdue_to` and `corrected_to` are restored, too.
 
         Parameters
         ----------
@@ -306,8 +308,9 @@ class LiveModel:
 
         Their rule is that of the policy and has learned nothing; it starts in the safe mode that
         `evidence` names. The second copy is None before the first retrain; it shares the references
-        of the model in force. If it cannot be made ready to predict, that is logged. Neither is put
-        in force. Raises SettingError if the rule cannot be made.
+        of the model in force. A baseline, which has no such rule, is not copied. If it cannot be
+        made ready to predict, that is logged. Neither is put in force. Raises SettingError if the
+        rule cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)

@@ -277,8 +277,8 @@ def _with_objects(
     `texts` are the store's settings, and `name` is the name of the store for messages. An object
     equal to the reducer that the recipe names is accepted and not used; so is a name, which is not
     compared here, and any reducer beside a model. Raises SettingError if an object is missing or
-    differs from the one that the store was made with, or if a `model` is passed to an engine that
-    has its own.
+    differs from the one that the store was made with, if a `model` is passed to an engine that has
+    its own, or if it lacks a method of `Model`.
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -405,7 +405,8 @@ def fill_from_peers(
     seed is taken if `request` has none (0 without a peer), and its recipe if `request` names
     neither reducer, recipe nor model. The recipe is not taken if the peer was given an object that
     has no name. Raises ImportRefusedError if the recipe names a class that may not be imported: any
-    class may be with `allow_import` True, none with False, else those that it names.
+    class may be with `allow_import` True, none with False, else those that it names. Raises
+    SettingError if the recipe cannot be read.
     """
     peer = next(iter(store.settings.of_peers().values()), {})
     filled = dict(request)

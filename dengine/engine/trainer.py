@@ -307,7 +307,8 @@ class Retrainer:
         A successor starts from the weights of the current model, or from scratch; it is trained on
         the training window as it is now. `begin` is when work on the retrain began, in seconds by
         the clock. The current model is not changed. If the training fails, the outcome has no
-        model, and nothing is raised.
+        model, and nothing is raised. How long the training worked after its last step is
+        remembered, and reserved in the time budget of the next.
         """
         data = self.window.snapshot()
         trained = train_candidate(current.successor(), data, self._limits(), self.clock)
@@ -391,7 +392,9 @@ class Retrainer:
         `wait` seconds, and a training that is not done then is given up. So is, whatever `wait` is,
         a training that hangs, or whose executor died. The outcome of a training that was given up
         or failed has no model and says why. An executor that died or hangs is started again if it
-        can be, or not used. `begin` of the outcome is now minus the duration of the training.
+        can be, or not used. `begin` of the outcome is now minus the duration of the training. How
+        long the training worked after its last step is remembered, and reserved in the budget of
+        the next.
         """
         future = self.future
         left = self._count_seconds_left()

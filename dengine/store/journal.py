@@ -306,7 +306,7 @@ class Journal:
     def _write_head(self) -> None:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
-        The file is created if need be. A failure is ignored.
+        The file is created if need be, and stays open. A failure is ignored.
         """
         # An older head is harmless. The file stays open, since each report writes it.
         with suppress(OSError, ValueError):  # ValueError: closed by another thread meanwhile

@@ -199,8 +199,9 @@ class VersionTable(CellTable):
     def _load_retrain(self, retrain: int) -> ModelVersion:
         """Return the version that the retrain with this number made, with its arrays.
 
-        A version of another cell is returned without the state of its rule, and its `rule_last_seq`
-        is 0: the rule includes no label. Raise VersionError if the state is missing or damaged.
+        There must be such a retrain. A version of another cell is returned without the state of its
+        rule, and its `rule_last_seq` is 0: the rule includes no label. Raise VersionError if the
+        state is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
