@@ -517,8 +517,8 @@ class Learner:
         """Take in what peers stored (`_hear_of_peers`); return whether the store gave an answer.
 
         These are versions and corrections of the product's other cells, and with `with_labels` the
-        labels of all cells. If it gave none, that is logged, once until it answers again, and
-        nothing is raised.
+        labels of all cells. If the store gave no answer, that is logged, once until it answers
+        again, and nothing is raised.
         """
         failure = None
         try:

@@ -189,7 +189,8 @@ def _restore_thresholds(
     the second. Labels of quarantined traces and of rejected parts that somebody inspected do not
     update the rule. The rule "local" with stops="some" learns nothing, so both thresholds are the
     policy's lower bound. Of any other rule the result is None if `_restore_rule` returns None, or
-    if the rule is no `MemberRule`, which alone has thresholds (a user's own rule may have none).
+    if the rule is no `MemberRule`: only rules of this class have thresholds. Raises SettingError
+    like `_restore_rule`.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:

@@ -331,10 +331,10 @@ class JournalledStore(Outbox):
 
         This ends within seconds, unless the outbox is `patient`, so that it waits for the disk and
         the database without a time limit. Records that the database does not take stay in the
-        journal, and the next engine copies them. Records that the disk does not take are given up,
-        and an error is logged; no call has said that they are on disk. If the disk hangs, store and
-        journal stay open, and the cell is owned until the process ends. A second call does nothing,
-        nor does one in a forked process.
+        journal, which is logged, and the next engine copies them. Records that the disk does not
+        take are given up, and an error is logged; no call has said that they are on disk. If the
+        disk hangs, store and journal stay open, and the cell is owned until the process ends. A
+        second call does nothing, nor does one in a forked process.
         """
         if not self.is_usable:
             return
