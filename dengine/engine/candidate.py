@@ -72,10 +72,11 @@ class Candidate:
     def check(self) -> Iterator[None]:
         """Make the model ready to decide, and test it on some traces of its training.
 
-        The model takes over the rule of the previous model. Then the generator yields before each
-        test, which decides on one trace. If the compiled model gives another result than the
-        trained one, or raises, the training is dropped: `model` becomes None, and the report says
-        why. An exception is logged and not raised. If `model` is None already, nothing is done.
+        The model takes over the rule of the previous model, which decides until now. Then the
+        generator yields before each test, which decides on one trace. If the compiled model gives
+        another result than the trained one, or raises, the training is dropped: `model` becomes
+        None, and the report says why. An exception is logged and not raised. If `model` is None
+        already, nothing is done.
         """
         if self.model is None:
             return
@@ -97,9 +98,10 @@ class Candidate:
     def learn_next(self, window: TrainingWindow) -> bool:
         """Make one of the labels that came after the training began a reference of the model.
 
-        Each call takes the oldest label of `window` that the model did not get yet. It returns True
-        if there was such a label; a label that the model cannot take is logged and skipped. It
-        returns False, and does nothing, if no label is left or `model` is None.
+        `window` holds the newest labelled traces. Each call takes its oldest label that the model
+        did not get yet. It returns True if there was such a label; a label that the model cannot
+        take is logged and skipped. It returns False, and does nothing, if no label is left or
+        `model` is None.
         """
         if self.model is None:
             return False
@@ -116,8 +118,9 @@ class Candidate:
         """Put the seconds of work so far into the report, and return it for the caller to store.
 
         If there is a model, the report is also marked as accepted and gets the number `version`,
-        and `trained_on` is set. `corrected_to` is the number of the newest correction that the
-        labels of the training had. Without a model the report stays that of a dropped retrain.
+        and `trained_on`, which names the labels of the training, is set. `corrected_to` is the
+        number of the newest correction that the labels of the training had. Without a model the
+        report stays that of a dropped retrain.
         """
         seconds = self._seconds + self._clock() - self._work_began  # storing it comes on top
         self.report = replace(self.report, seconds=seconds)

@@ -99,7 +99,7 @@ class Corrections:
         fold of its trace stays. A baseline, which cannot take a label back, is retrained before
         this returns. The label as it was reported stays in the store. A training under way in the
         executor is discarded, and begins again. If a safe mode begins or ends by this,
-        `on_safe_mode` is called.
+        `on_safe_mode`, the user's function, is called.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class Corrections:
         success : bool
             The right label. If this label counts already, nothing changes.
         author : str
-            Who says so, for the record.
+            Who says so, for the event.
 
         Returns
         -------
@@ -143,16 +143,16 @@ class Corrections:
         pinned this version, and it was trained with one of these labels, it is released, so that
         retrains may replace it. A baseline is retrained before this returns. A training under way
         in the executor is discarded, and begins again. If a safe mode begins or ends by this,
-        `on_safe_mode` is called. A guarantee assumes that the choice of what is forgotten does not
-        depend on the label. The certificate counts a forgotten outcome of a certain decision as
-        wrong, so that forgetting earns nothing.
+        `on_safe_mode`, the user's function, is called. A guarantee assumes that the choice of what
+        is forgotten does not depend on the label. The certificate counts a forgotten outcome of a
+        certain decision as wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
         *decision_ids : str
             Labels that are forgotten already stay as they are.
         author, reason : str
-            For the record.
+            Who forgets them, and why, for the event.
 
         Returns
         -------
@@ -193,8 +193,8 @@ class Corrections:
         """Let retrains replace again the version that `rollback` pinned.
 
         The same model goes on, stored as a new version. Labels that came meanwhile count for the
-        next retrain. A training under way in the executor is discarded, and begins again, even if
-        no version was pinned.
+        next retrain, which may be due at once. A training under way in the executor is discarded,
+        and begins again, even if no version was pinned.
 
         Parameters
         ----------
@@ -226,10 +226,10 @@ class Corrections:
         label that it was trained with; the next retrain then starts from this version, unless it
         saw a forgotten label.
 
-        A training under way in the executor is discarded, and no other one begins. A reducer that
-        is stored by its traces (umap-learn) is fitted again on the traces of the earlier version,
-        with the labels that they had then; a baseline on the same traces, with the labels as they
-        count now.
+        A training under way in the executor is discarded, and no other one begins. A reducer like
+        umap-learn, of which not the fit but only the numbers of its traces are stored, is fitted
+        again on the traces of the earlier version, with the labels that they had then. A baseline
+        is fitted on the same traces, with the labels as they count now.
 
         Parameters
         ----------
@@ -288,11 +288,11 @@ class Corrections:
         certificate is up to m alpha.
 
         A safe mode goes on until new outcomes end it. If the new rule has no safe mode, the safe
-        mode ends now, and `on_safe_mode` is called. An accepted part whose outcome was not reported
-        before the change stays unreported. With `Policy(shadow=True)` each part that the model is
-        certain of is an audit: `Decision.predicted` says what the model would have done, and all
-        outcomes are learned from as always. The shadow mode stays on when the engine is opened
-        again.
+        mode ends now, and `on_safe_mode`, the user's function, is called. An accepted part whose
+        outcome was not reported before the change stays unreported. With `Policy(shadow=True)` each
+        part that the model is certain of is an audit: `Decision.predicted` says what the model
+        would have done, and all outcomes are learned from as always. The shadow mode stays on when
+        the engine is opened again.
 
         Parameters
         ----------
@@ -390,9 +390,9 @@ class Corrections:
         """Store a change of labels, and apply it to references, training window and rule.
 
         A model that cannot change its references is retrained, in this thread. If a safe mode
-        begins or ends by this, an event is recorded, and `on_safe_mode` is called. Returns what was
-        done. Raises StoreError if the store does not answer; a change that is stored by then is
-        applied with the next one, or when the store is opened again.
+        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
+        called. Returns what was done. Raises StoreError if the store does not answer; a change that
+        is stored by then is applied with the next one, or when the store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:
@@ -409,8 +409,8 @@ class Corrections:
         """Return what a stored change did; also announce a safe mode that it began or ended.
 
         `number` is that of the change's event; None means that it is the store's newest event. The
-        announcement is an event and a call of `on_safe_mode`; if it fails, that is logged.
-        `reason_ended` is the reason recorded for an end.
+        announcement is an event and a call of `on_safe_mode`, the user's function; if it fails,
+        that is logged. `reason_ended` is the reason that is recorded if a safe mode ended.
         """
         if number is None:
             number = self._store.events.newest(1)[0].number
@@ -425,7 +425,8 @@ class Corrections:
 def _check_baseline_settings(changes: Settings) -> None:
     """Raise SettingError for changes of a policy that have no effect on a handed-in model.
 
-    `changes` holds the changed settings by name; those of `BASELINE_SETTINGS` have an effect.
+    `changes` holds the changed settings by name. Only audit_rate, stops, label_within, force_limits
+    and shadow (`BASELINE_SETTINGS`) have an effect.
     """
     idle = sorted(set(changes) - set(BASELINE_SETTINGS))
     if idle:

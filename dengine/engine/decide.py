@@ -67,8 +67,8 @@ class DecisionMaker:
 
         If a `TraceSpec` is in force already, it stays. It only gets from `spec` a rate, units and
         columns that were unknown; a `spec` of another shape is ignored. If none is in force and
-        another cell of the product has set one, that one is taken in the same way; if it cannot be
-        read, that is logged and `spec` is set.
+        another cell of the product has set one, its `TraceSpec` is taken in the same way; if it
+        cannot be read, that is logged and `spec` is set.
 
         A change is saved in the store; if the store does not take it, it is saved with a later
         trace. Raises SettingError if the force limits do not fit the `TraceSpec`; then nothing
@@ -90,13 +90,14 @@ class DecisionMaker:
         return spec
 
     def convert(self, trace: ArrayLike) -> TraceArray:
-        """Return a trace as float32 (channels, samples), converted as the `TraceSpec` demands.
+        """Return a trace as float32 (channels, samples), in the shape of the `TraceSpec`.
 
-        If no `TraceSpec` is in force, a trace without a fault sets it; but if another cell of the
-        product has set one, that one is taken, and the trace must fit it. If a `TraceSpec` is in
-        force, but the store did not take the settings, saving them is tried again; a failure is
-        logged. Until the first version is trained, the first finite trace makes the model compile
-        its code for this shape; a failure of this is logged, too.
+        A trace of another length is fitted if the `TraceSpec` says how. If no `TraceSpec` is in
+        force, a trace without a fault sets it; but if another cell of the product has set one, that
+        one is taken, and the trace must fit it. If a `TraceSpec` is in force, but the store did not
+        take the settings, saving them is tried again; a failure is logged. Until the first version
+        is trained, the first finite trace makes the untrained model compile its code for this
+        shape; a failure of this is logged, too.
 
         A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`.
         Raises TraceError for a wrong shape, or too few samples of a first trace, and SettingError
@@ -120,10 +121,11 @@ class DecisionMaker:
     def find_earlier(self, decision_id: str, part: str | None, trace: Any) -> Decision | None:
         """Return the decision that the store already has for an id, or None for a new id.
 
-        The id comes from the caller. If it cannot be looked up, this is logged, and the decision
-        returned is a VERIFY for this `part` with `Reason.NO_STORE`. It is not recorded, because the
-        id may have a decision already; `trace` is not looked at. A report for this id then raises
-        StoreError, until a later call can look the id up.
+        The id comes from the caller, and `part` is the part's number. If the id cannot be looked
+        up, this is logged, and the decision returned is a VERIFY for this `part` with
+        `Reason.NO_STORE`. It is not recorded, because the id may have a decision already; `trace`
+        is not looked at. A report for this id then raises StoreError, until a later call can look
+        the id up.
 
         Raises
         ------
@@ -165,16 +167,18 @@ class DecisionMaker:
         decision_id : str, optional
             An id that the caller chose; None: a new one.
         verify_reason : Reason, optional
-            Verify for this reason, without asking the model; see `_decide`. If the store is damaged
-            or its journal cannot be written, the reason is `Reason.NO_STORE` whatever is passed.
+            Verify for this reason, without asking the model and without checking the force limits;
+            but a fault of the trace is the reason instead. If the store is damaged or its journal
+            cannot be written, the reason is `Reason.NO_STORE` whatever is passed.
 
         Returns
         -------
         StoredDecision
             The record with its number, which is 0 if it could not be recorded. If another thread
-            has recorded a decision for the id meanwhile, that one is returned. Before the first
-            training the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault or is
-            outside a force limit.
+            has recorded a decision for the id meanwhile, that decision is returned. Before the
+            first training the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault
+            or is outside a force limit. If the model raises, that is logged, and the decision is
+            VERIFY, `Reason.MODEL_ERROR`.
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE
@@ -182,12 +186,12 @@ class DecisionMaker:
         return self._outbox.record_decision(item)
 
     def sync(self, stored: StoredDecision) -> StoredDecision:
-        """Wait until a decision and all earlier records are on disk; return the record that counts.
+        """Wait until a decision and all earlier records are on disk; return the valid decision.
 
-        If that takes longer than the outbox waits, or a write fails, an ACCEPT or REJECT is
+        If that takes longer than the store's time limit, or a write fails, an ACCEPT or REJECT is
         replaced by a VERIFY with `Reason.NO_STORE`, which is returned. But if it has reached the
-        disk meanwhile, it counts and is returned. A VERIFY is returned as it is. A timeout is not
-        raised.
+        disk meanwhile, it stays valid and is returned. A VERIFY is returned as it is. A timeout is
+        not raised.
         """
         decision = stored.decision
         try:
@@ -237,11 +241,12 @@ class DecisionMaker:
         """Decide on one trace by a model; return the decision as a record that is not stored yet.
 
         A trace with a fault is verified for that reason, and its record is quarantined: it is never
-        trained on. Otherwise, with a `verify_reason` the decision is VERIFY for it, and the force
-        limits are not checked. Without it a trace outside a force limit is verified or rejected,
-        also without a model. Else, without a model the decision is VERIFY, `Reason.NO_MODEL`. If
-        the model raises or returns impossible bounds, that is logged, and it is VERIFY,
-        `Reason.MODEL_ERROR`.
+        trained on. Otherwise, with a `verify_reason` the decision is VERIFY for this reason, and
+        the force limits are not checked. Without it a trace outside a force limit is verified or
+        rejected, also without a model. Else, without a model the decision is VERIFY,
+        `Reason.NO_MODEL`. If the model raises, or returns bounds that are not 0 <= lower <= upper
+        <= 1, that is logged, and the decision is VERIFY, `Reason.MODEL_ERROR`. Without a
+        `decision_id` it gets a new id.
         """
         part_hash_ = 0 if part is None else part_hash(part)
         # Without a TraceSpec the trace has a fault, and is decided all the same.
@@ -318,8 +323,9 @@ def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None)
 def verify_decision(decision_id: str, part: str | None, version: int, reason: Reason) -> Decision:
     """Return a VERIFY decision for which neither model nor trace was looked at.
 
-    It has no labels, the bound (0, 1), no embedding, and 1 as its `propensity`, the probability of
-    a check. Nothing is recorded.
+    `part` is the part's number, and `version` that of the model. It counts no labels, and has the
+    bounds 0 and 1, no embedding, and 1 as its `propensity`, the probability of a check. Nothing is
+    recorded.
     """
     return Decision(
         id=decision_id,
@@ -344,7 +350,7 @@ def as_part(part: Any) -> str | None:
     Raises
     ------
     TraceError
-        For anything but a whole number of at most `LONGEST` digits, or a text of 1 to `LONGEST`
+        For anything but a whole number of at most LONGEST digits (200), or a text of 1 to LONGEST
         printable characters.
     """
     if part is None:

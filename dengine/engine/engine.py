@@ -215,13 +215,15 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         on_safe_mode: Callable[[str], object] | None = None,
         reading: bool = False,
     ) -> None:
-        """Make the engine's objects on an opened store, and give each the objects that it uses.
+        """Make the objects of which the engine consists, on an opened store, and connect them.
 
-        From now on the store is closed when the engine is garbage-collected. The modules that a
-        retrain imports are loaded: with an executor in a thread that goes on after this returns,
-        without one before this returns, but not for an engine that only reads (`reading`). Limits
-        this thread to one torch thread. Raises SettingError for force limits in seconds at an
-        unknown rate, and StoreError if another engine owns the cell.
+        `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
+        those of `DataEngine`. From now on the store is closed when the engine is garbage-collected.
+        The modules that a retrain imports are loaded: with an executor in a thread that goes on
+        after this returns, without one before this returns, but not for an engine that only reads
+        (`reading`). Limits this thread to one torch thread. Raises SettingError for force limits in
+        seconds at an unknown rate, and StoreError if another engine owns the cell or the store
+        cannot be used.
         """
         recipe = settings.recipe
         check_rate(recipe.policy.force_limits, settings.trace)
@@ -278,7 +280,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         When it returns, the modules that a retrain imports are loaded, and the features of the
         stored traces, which a retrain would compute first, are computed. If there are labels and no
         version yet, this call begins to compute them, and also has the code for decisions compiled
-        if it can be; in other cases `Learner.resume` began.
+        if the model can be compiled; in other cases `Learner.resume` began to.
         """
         self._join_warm_up()
         if self.state.new_labels and not self.version:
@@ -322,6 +324,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Parameters
         ----------
         url : str, path or SqlStore
+            A file, a URL or an open store.
         reducer, model : object, optional
             If the engine had an object of yours that the store cannot name: the same object again.
         trace : TraceSpec, optional
@@ -398,13 +401,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             Whether any `module:Class` that the store names is imported. A class that the settings
             name is imported in any case.
         **settings
-            As `DataEngine` takes them. For a used store, the given settings must be the settings
-            in force, so that a running cell does not change unnoticed; see
-            `EngineSettings.check_request` for what is not compared, like the shadow mode. `model`
-            is as for `open`; `executor`, `clock`, `replaying` and `on_safe_mode` are not stored, so
-            any may be given. A new cell of a product (cells that share labels and versions) takes
-            the seed, and the recipe if it is given neither recipe, reducer nor model, from the
-            first of its peers, the other cells.
+            As `DataEngine` takes them. For a used store, the given settings must be the settings in
+            force, so that a running cell does not change unnoticed. The shadow mode, a reducer that
+            is an object, and what is left out are not compared (for details see
+            `EngineSettings.check_request`). `model` is as for `open`; `executor`, `clock`,
+            `replaying` and `on_safe_mode` are not stored, so any may be given. A new cell of a
+            product (cells that share labels and versions) takes the seed, and the recipe if it is
+            given neither recipe, reducer nor model, from the first of its peers, the other cells.
 
         Returns
         -------
@@ -442,8 +445,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         A retrain that takes longer is dropped. A second call does nothing. Records that only the
         database does not take stay in the journal. Records that the disk does not take are given
-        up, and an error is logged; none of them was acknowledged. Raises StoreError while another
-        thread uses the engine.
+        up, and an error is logged; no call has said that they are on disk. Raises StoreError while
+        another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:
@@ -453,9 +456,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        If a wrong confirmation has updated the rule, the rule is put right, too, if the store has
-        answered. Raises NotTakenError if the disk takes longer than `wait` seconds; None: the
-        store's own limit. The store is waited for up to its own limit.
+        If a part was confirmed as good and then stopped the line, the rule was updated with a wrong
+        outcome; if the store has answered, the rule is put right, too. Raises NotTakenError if the
+        disk takes longer than `wait` seconds; None: the store's own limit. The store is waited for
+        up to its own limit.
         """
         self._outbox.flush(wait)
         self._learner.catch_up()
@@ -472,10 +476,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     ) -> Decision:
         """Decide on one trace, and record the decision.
 
-        Before that, a version that the executor has trained is taken one step further, and accepted
-        parts without a report are confirmed (`Policy(stops="all")`) or counted as unreported. If a
-        safe mode began or ended, an event is recorded, and `on_safe_mode` is called. For an id that
-        has a decision nothing of this is done, and that decision is returned.
+        Before that, a version that the executor has trained is taken one step further (the steps
+        are test, store, put in force), and accepted parts without a report are confirmed
+        (`Policy(stops="all")`) or counted as unreported. If a safe mode began or ended, an event is
+        recorded, and `on_safe_mode` is called. For an id that has a decision nothing of this is
+        done, and that decision is returned.
 
         Parameters
         ----------
@@ -508,7 +513,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             For a first trace that the policy's force limits do not fit, and, while settings are
             saved, for a `TraceSpec` that contradicts that of another cell of the product.
         ReportError
-            For an invalid id.
+            For an invalid id, and with `timed_out` for none.
         StoreError
             For an engine that is closed or was opened for reading, and, unless `timed_out`, for one
             that is in use by another thread.
@@ -531,12 +536,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _decide(self, trace: ArrayLike, part: str | None, decision_id: str | None) -> Decision:
         """Decide on one trace by the model, record the decision and return it.
 
-        The order of the steps has reasons. A wrong trace raises before it could confirm an earlier
-        part. A rule that lacks a correction is put right before it decides. This trace may confirm
-        accepted parts that nobody reported, which may change the rule. With an id the decision must
-        be on disk before the caller acts on it; if the disk does not take it, the decision becomes
-        VERIFY. Raises TraceError for a wrong trace, and SettingError for a first trace that the
-        force limits do not fit.
+        These are the steps. The trace is converted, so that a wrong trace raises before it could
+        confirm an earlier part. A rule that lacks a correction is put right. Accepted parts that
+        nobody reported are confirmed (with `stops="all"`) or counted, which may change the rule.
+        The decision is made and recorded. With an id it must be on disk before the caller acts on
+        it; if the disk does not take it, the decision becomes VERIFY. Without an id one is made.
+        Raises TraceError for a wrong trace, and SettingError for a first trace that the force
+        limits do not fit.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -550,12 +556,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def report(self, decision_id: str, success: bool) -> RetrainReport | None:
         """Report the outcome of a decision; the label survives a killed process once this returns.
 
-        Before that, a version that the executor has trained is taken one step further. After the
-        label, safe mode may begin or end (`on_safe_mode` is called), and a retrain that is due runs
-        in this thread or begins in the executor. The label of a trace with a fault is stored, but
-        no retrain follows. If the next decision had confirmed the part as good already, the call
-        also waits for the store, so that the rule is corrected now; if the store does not answer,
-        this happens later.
+        Before that, a version that the executor has trained is taken one step further (the steps
+        are test, store, put in force). After the label is learned, a safe mode may begin or end (an
+        event is recorded, and `on_safe_mode` is called), and a retrain that is due runs in this
+        thread or begins in the executor. The label of a trace with a fault is stored, but no
+        retrain follows. If the next decision had confirmed the part as good already, the call also
+        waits for the store, so that the rule is corrected now; if the store does not answer, this
+        happens later.
 
         Parameters
         ----------
@@ -645,8 +652,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
         Before the first cycle it waits until a retrain could begin without delay, and takes from
         the cell's `spec` what the engine does not know about the traces yet. From then until the
-        end the garbage collector ignores the objects that exist at that moment. Raises
-        NotTakenError if the disk does not take everything in time.
+        end the garbage collector ignores the objects that exist at that moment. Raises the errors
+        of `run`, for example NotTakenError if the disk does not take everything within 10 seconds.
         """
         self._wait_until_warm()
         spec = getattr(cell, "spec", None)
@@ -663,11 +670,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def _cycle(self, cell: Cell, index: int) -> Cycle:
         """Have the cell insert one part, decide, do what the decision says, and report the outcome.
 
-        A REJECT is not reported, nor is an ACCEPT if the cell does not know its outcome. A label
-        that cannot be written is logged and waits. A retrain that is due is begun or done. An
-        exception of the cell is raised unchanged, and ReportError if the cell returns no label or
-        outcome. Returns the record of the cycle; its `decide_seconds` is the duration of the
-        decision alone.
+        `index` is the number of the cycle, from 0. A REJECT is not reported, nor is an ACCEPT if
+        the cell does not know its outcome. A label that cannot be written to the disk is logged,
+        and written later. A retrain that is due is begun or done (`poll`). An exception of the cell
+        is raised unchanged, and so are the other errors of `decide`, `report` and `poll`;
+        ReportError is raised if the cell returns no label or outcome. Returns the record of the
+        cycle; its `decide_seconds` is the duration of the decision alone.
         """
         trace = cell.insert()
         with uncollected():
@@ -739,8 +747,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             return self._learner.retrain(wait)
 
     def poll(self, brief: bool = False) -> RetrainReport | None:
-        """Do between two parts what is due: put a trained version in force, retrain, tell of safe
-        mode.
+        """Do between two parts what is due: put a trained version in force, retrain, announce a
+        safe mode.
 
         `run` calls it after each part. In a loop of your own `decide` and `report` together do the
         same, but each takes a version that the executor has trained only one step further (the
@@ -810,8 +818,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self.set_policy(replace(self.policy, shadow=on), author)
 
     def certificate(self) -> Certificate:
-        """Flush, and return bounds, at confidence 1 - alpha, on the errors of unchecked decisions.
+        """Return bounds, at confidence 1 - alpha, on the errors of the decisions without a check.
 
+        Before that, everything is written to the disk, and to the store if it answers (`flush`).
         Decisions since the last change of policy count. Raises NotTakenError if not everything is
         on disk in time, and StoreError if the store cannot be read.
         """
@@ -861,8 +870,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return self._outbox.find_decision(as_id(decision_id))
 
     def status(self, last: int = NEWEST, watching: bool = False) -> Status:
-        """Flush, and return how the engine is doing; arguments and errors are those
-        of `history.status.status`.
+        """Return how the engine is doing, once everything is written (`flush`); arguments and
+        errors are those of `history.status.status`.
 
         If the disk does not take everything, `store_fault` says why, and the counts lack the rest.
         """

@@ -101,11 +101,12 @@ class Feedback:
     def resume(self) -> None:
         """Restore from the store the pending checks, and the accepted parts without an outcome.
 
-        The live model must be restored before. Overdue checks and checks from before the present
-        rule are left out, as are accepted parts from before the present policy. With `stops="all"`
-        the accepted parts are kept, so that the next trace confirms them. With "some" they are only
-        counted, as unreported since the last label. For a safe mode that the live model is in,
-        `on_safe_mode` is not called again. Raises StoreError if the store cannot be read.
+        The model in force and its rule must be restored before. Overdue checks and checks from
+        before the present rule are left out, as are accepted parts from before the present policy.
+        With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
+        "some" they are only counted, as unreported since the last label. For a safe mode that the
+        rule is in already, the user's function `on_safe_mode` is not called. Raises StoreError if
+        the store cannot be read.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -125,10 +126,11 @@ class Feedback:
     def record_decision(self, stored: StoredDecision) -> None:
         """Note a new decision: VERIFY as a pending check, ACCEPT as a part without an outcome.
 
-        A VERIFY of a trace with a fault is not pending, nor is a VERIFY that was not recorded. The
-        rule counts each check that has become overdue as a wrong decision (`_count_overdue`). When
-        nearly all recent decisions have `Reason.NOVEL`, an event is recorded, and the next such
-        event only after their share has fallen to one half.
+        A VERIFY of a trace with a fault is not pending, nor is a VERIFY that could not be recorded
+        (its number is 0). The rule counts each check that has become overdue as a wrong decision
+        (`_count_overdue`). When more than 80 % of the decisions have `Reason.NOVEL`, in a mean that
+        fades over 50 decisions, an event is recorded, and the next such event only after this share
+        has fallen to one half.
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -145,7 +147,7 @@ class Feedback:
         self._novelty_reported = self._novel_share > limit
 
     def confirm_unreported(self) -> None:
-        """Settle accepted parts without an outcome, because the next trace has come.
+        """Confirm or count the accepted parts without an outcome, because the next trace has come.
 
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each part
         counts as good: rule and references learn it at once, and its label, CONFIRMED, is recorded.
@@ -161,11 +163,12 @@ class Feedback:
     def take_in(self, stored: StoredDecision, success: bool) -> None:
         """Learn a reported label and hand it to the outbox, without waiting for the disk.
 
-        If the same report comes again before `note_synced`, nothing is done. If the outbox has a
-        label of the decision already, ReportError is raised, with one exception: a line stop may
+        `stored` is the decision with the label that it has so far, if any. If the same report comes
+        again before its label is known to be on disk (`note_synced`), nothing is done. If the
+        decision has a label already, ReportError is raised, with one exception: a line stop may
         follow the confirmation of a part by the next decision (`Policy(stops="all")`). Such a line
-        stop is learned later, as a correction. `remedy` is set if the rule must be rebuilt, which
-        is not done here.
+        stop is recorded, and learned later, as a correction. The attribute `remedy` is set if the
+        rule must be rebuilt, which is not done here.
         """
         id_ = stored.decision.id
         if self._unsynced.get(id_) is not success:
@@ -179,10 +182,10 @@ class Feedback:
     def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
         """Learn a label that is no repetition, and hand it to the outbox.
 
-        If the next decision had confirmed the part as good, a line stop is recorded but not learned
-        yet, and `remedy` is set to CORRECT. It is set to REBUILD_RULE if the rule had counted the
-        part's check as overdue. Raises ReportError if the outbox has any other label of the
-        decision.
+        `stored` is the decision with the label that it has so far. If the next decision had
+        confirmed the part as good, a line stop is recorded but not learned yet, and `remedy`, which
+        says what must be done later, is set to CORRECT. It is set to REBUILD_RULE if the rule had
+        counted the part's check as overdue. Raises ReportError if the decision has any other label.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -204,15 +207,16 @@ class Feedback:
     def _learn_and_record(self, stored: StoredDecision, success: bool, source: Source) -> None:
         """Update rule and references with the outcome of a part, and have its label recorded.
 
-        A trace with a fault updates neither. The label of a rejected part that was inspected
-        becomes a reference and does not update the rule: which parts are inspected is somebody's
-        choice, and no sample. Every other label also tells the rule how many accepted parts went on
-        unreported since the last label, and this count begins again at 0, even if the decision is
-        from before the present rule and so does not update it. A part that was counted among them
-        is subtracted from the number that its own label tells, which may make it -1.
+        `source` says where the label comes from. A trace with a fault updates neither. An exception
+        of the model or the rule is logged and not raised. The label of a rejected part that was
+        inspected becomes a reference and does not update the rule: which parts are inspected is
+        somebody's choice, and no sample. Every other label also tells the rule how many accepted
+        parts went on unreported since the last label, and this count begins again at 0, even if the
+        decision is from before the present rule and so does not update it. A part that was counted
+        among them is subtracted from the number that its own label tells, which may make it -1.
 
-        The label takes the next number of the outbox. That of a usable trace enters the training
-        window, in a product once the store has given it a number.
+        The label takes the next number of the outbox. The label of a trace without a fault enters
+        the training window, in a product once the store has given it a number.
         """
         decision = stored.decision
         version = self._live.version
@@ -242,8 +246,8 @@ class Feedback:
     def _was_unreported(self, stored: StoredDecision) -> bool:
         """Return whether this part is one of those counted as unreported.
 
-        It is, if it was accepted under the present policy with stops="some", and the next trace
-        came before its outcome.
+        It is, if it was accepted by a version under the present policy, which has stops="some", and
+        the next trace came before its outcome.
         """
         decision = stored.decision
         if decision.action is not Action.ACCEPT or self._stops_all:
@@ -264,7 +268,7 @@ class Feedback:
                 self._labels.assign_number(id_, number)
 
     def _count_overdue(self) -> None:
-        """Make the rule count as wrong each decision whose check is overdue.
+        """Update the rule with each decision whose check has become overdue, as with a wrong one.
 
         A check is overdue if it has no report within `Policy.label_within` later decisions. Each
         decision is counted once; a decision with the bound (0, 1), which says nothing, or from
@@ -297,12 +301,13 @@ class Feedback:
         self._n_unreported = 0
 
     def announce_safe_mode(self, reason_ended: str = "fresh evidence keeps the tolerance") -> None:
-        """Record an event, then call `on_safe_mode`, if a safe mode began or ended since the last
-        call.
+        """Record and announce that a safe mode began or ended since the last call; else do nothing.
 
-        A safe mode begins after an alarm of the rule. `reason_ended` is recorded if one ended. If
-        recording the event or the user's function fails, that is logged and not tried again;
-        callers do this only after labels are stored, so that such a failure costs no label.
+        An event is recorded, then the user's function `on_safe_mode` is called. It gets the reason
+        of a safe mode that began, or "" if it ended; then the event says `reason_ended`. A safe
+        mode begins after an alarm of the rule. If recording the event or the user's function fails,
+        that is logged and not tried again; callers do this only after labels are stored, so that
+        such a failure costs no label.
         """
         safe_mode = self._live.newest.safe_mode
         if safe_mode == self._safe_mode:

@@ -58,7 +58,8 @@ class Peers:
 
         The first is 0 if there is no version that is newer than the one in force; a version that
         could not be put in force does not count. Raises StoreError if the store gives no answer in
-        time. In both cases no look is due for the next `LOOK_SECONDS`.
+        time. In both cases the store need not be asked again (`is_look_due`) for the next
+        LOOK_SECONDS (1 s).
         """
         self._looked = self._clock()
         store = self._outbox.store
@@ -69,9 +70,11 @@ class Peers:
         return version if is_newer else 0, correction
 
     def note_answer(self, error: StoreError | None) -> None:
-        """Log that the store gave no answer, with the error, or that it answers again, with None.
+        """Log that the store gave no answer, or that it answers again.
 
-        Only the first of several failures is logged.
+        `error` is that of the last attempt to ask the store for versions and corrections of the
+        product's other cells; None: it answered. Only the first of several failures is logged, and
+        only the first answer after a failure.
         """
         product = self._outbox.store.product
         if error is None and self._is_lost:
@@ -85,8 +88,9 @@ class Peers:
     def read_labels(self) -> None:
         """Add the labels of all cells that came since the window's newest to the training window.
 
-        They are read with the corrections that the live model has. Raises StoreError if the store
-        cannot be read.
+        They are read with the corrections that the references of the model in force have. Labels of
+        traces with a fault and forgotten labels are left out. Raises StoreError if the store cannot
+        be read.
         """
         labelled = self._outbox.store.labels.with_traces(
             self._window.capacity,
@@ -99,10 +103,10 @@ class Peers:
     def put_in_force(self, number: int) -> bool:
         """Put a version that another cell of the product stored in force, with this cell's labels.
 
-        It gets this cell's rule as it is: nothing is rebuilt, and the peer's rule is ignored. If
-        the version is damaged or cannot be restored, that is logged, the present version stays in
-        force, and `look` does not return this number again. Returns whether it is in force. Raises
-        StoreError if the store cannot be read.
+        It gets the present decision rule of this cell: nothing is rebuilt, and the other cell's
+        rule is ignored. If the version is damaged or cannot be restored, that is logged, the
+        present version stays in force, and `look` does not return this number again. Returns
+        whether the version is in force now. Raises StoreError if the store cannot be read.
         """
         store = self._outbox.store
         try:

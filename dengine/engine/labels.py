@@ -41,9 +41,11 @@ class CellLabels:
         self.new_labels = len(self._window.newer(number))
 
     def add(self, stored: StoredDecision, label: NewLabel) -> None:
-        """Add a learned label, which is recorded, to the window, and count it.
+        """Add a label, which was learned and recorded, to the training window, and count it as new.
 
-        In a product its number is provisional, and is only noted until the store gives it another.
+        `stored` is its decision with the trace. In a product the number of the label is provisional
+        (0 or less): then the label is not added, and the number is noted until the store gives the
+        label another.
         """
         self.new_labels += 1
         if label.seq > 0:

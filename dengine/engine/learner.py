@@ -93,13 +93,13 @@ class Learner:
         self._start: tuple[tuple[int, int], EngineModel, str] | None = None
 
     def resume(self, label_within: int, policy_since: int) -> None:
-        """Restore window, version, rule and counts from the store, bit for bit.
+        """Restore training window, version, rule and counts from the store, bit for bit.
 
         It is called when an engine opens the store. `label_within` is the number of later decisions
         after which a check without a report is overdue, and `policy_since` the first version under
-        the policy in force. If there is a version, or at least `IMPORTED` labels, this also starts
-        a thread that computes in advance for the next retrain (`precompute`). Raises StoreError if
-        the store cannot be read.
+        the policy in force. If there is a version, or at least IMPORTED labels (500), this also
+        starts a thread that computes in advance for the next retrain (`precompute`). Raises
+        StoreError if the store cannot be read.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()
@@ -122,9 +122,9 @@ class Learner:
     def precompute(self) -> None:
         """Start a thread that computes in advance what the next training needs; do not wait.
 
-        These are above all the features of the window's traces. They are kept in the model that the
-        training starts from; a failure is logged. Nothing is started until `wait_until_precomputed`
-        has waited for an earlier thread, or if the training window is empty.
+        These are above all the features of the traces in the training window. They are kept in the
+        model that the training starts from; a failure is logged. Nothing is started if the training
+        window is empty, or if `wait_until_precomputed` has not waited for an earlier thread yet.
         """
         if self._precomputed is not None or not len(self._window):
             return
@@ -139,14 +139,14 @@ class Learner:
     # Labels
 
     def catch_up(self) -> None:
-        """Give labels the numbers that the store assigned, and do what `Feedback.remedy` asks.
+        """Give labels the numbers that the store assigned, and put the rule right if it must be.
 
         The store assigns numbers only in a product. Checks that have become overdue are counted,
-        too. The remedy follows a wrong label that was learned: the rule is rebuilt, or a correction
-        is applied and the rule is rebuilt. It waits for a later call while the store lacks records
-        or cannot be written. Before a correction a retrain under way is ended (`end_training`); a
-        model that cannot change its references is retrained. If the store fails meanwhile, that is
-        logged and not raised, and a later call tries again.
+        too. The rule must be put right (`Feedback.remedy`) after it learned a wrong outcome: it is
+        rebuilt, or a correction is applied and it is rebuilt. This waits for a later call while the
+        store lacks records or cannot be written. Before a correction a retrain under way is ended
+        (`end_training`); a model that cannot change its references is retrained. If the store fails
+        meanwhile, that is logged and not raised, and a later call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -165,7 +165,7 @@ class Learner:
             log.exception("the rule is rebuilt when the store is back")
 
     def store_labels(self) -> None:
-        """Wait until every label is in the store and has its number, then catch up.
+        """Wait until every label is in the store and has its number; then do what `catch_up` does.
 
         Raises StoreError if the store is unavailable or takes too long.
         """
@@ -179,12 +179,13 @@ class Learner:
         """Train a version and put it in force, in this thread, or begin to in the executor.
 
         First every label is stored, since a version is trained only on labels that the store has
-        numbered. Then the call waits for what is computed in advance, and hears of peers (a newer
-        version, corrections and labels of the product's other cells), since either may change what
-        the training starts from. Then new labels count from zero, and the training begins.
+        numbered. Then the call waits for what is computed in advance, and takes in what the
+        product's other cells stored (a newer version, corrections and labels), since either may
+        change what the training starts from. Then new labels count from zero, and the training
+        begins.
 
         With `wait` True, or if no executor takes work, all is done in this thread, and the report
-        is returned. Otherwise None is returned, and `advance` brings the version to its end. With
+        is returned. Otherwise None is returned, and `advance` puts the version in force later. With
         `wait` False, None is also returned if a training is under way already, and then nothing is
         begun. If the executor still works on a discarded training, or the computing in advance is
         not done, the training is requested, and `retrain_if_due` begins it later.
@@ -192,7 +193,7 @@ class Learner:
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
         report is returned all the same. Raises StoreError if the labels before the training cannot
-        be stored.
+        be stored, and in a product if the store does not answer.
         """
         if not wait:
             if self.is_at_work:
@@ -221,11 +222,11 @@ class Learner:
         """Retrain, or begin to, if there is a reason for it.
 
         There are three reasons. First, `retrain_every` labels are new, and there are as many labels
-        as the model's `min_traces`. Second, the time budget ended the training of the version in
-        force before its last step; this is a reason only in a cell without a product, and only if
-        the last retrain was not dropped. Third, a retrain was requested earlier and could not begin
-        then, or a training was discarded and is to begin again. A pinned version is not replaced,
-        and such a request is withdrawn.
+        as the model needs for a training (`min_traces`). Second, the time budget ended the training
+        of the version in force before its last step; this is a reason only in a cell without a
+        product, and only if the last retrain was not dropped. Third, a retrain was requested
+        earlier and could not begin then, or a training was discarded and is to begin again. A
+        pinned version is not replaced, and such a request is withdrawn.
 
         In a product a newer version and corrections of other cells are put in force first, so a
         peer's version may be in force afterwards, even if nothing is trained here. They are looked
@@ -243,8 +244,8 @@ class Learner:
         -------
         RetrainReport or None
             The report of a retrain that was done in this thread. None if there is no reason, if the
-            store or its journal has a fault, if a training or its preparation is under way, or if
-            the executor now trains.
+            store or its journal has a fault, if the labels cannot be stored, if a training or its
+            preparation is under way, or if the executor now trains.
         """
         peers = self._peers
         may_train = self.labels.is_due(retrain_every) and not self.live.pinned
@@ -304,15 +305,16 @@ class Learner:
     def advance(self, to_the_end: bool = False, wait: float = 0.0) -> None:
         """Take a training's outcome from the executor, or bring its version one step further.
 
-        Taking the outcome is a step. With `to_the_end` all steps of a training that is done are
-        taken, and the call waits for the store. Nothing happens if no training is under way, or
-        while it is not done. A version that cannot be stored is dropped, and nothing is raised.
+        Taking the outcome is a step; the others test the version, store it and put it in force.
+        With `to_the_end` all steps of a training that is done are taken, and the call waits for the
+        store. Nothing happens if no training is under way, or while it is not done. A version that
+        cannot be stored is dropped, and nothing is raised.
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
         given up, and so is a training that hangs. In a product (cells that share labels and
-        versions) all steps are taken in any case. When the training is done, the call first hears
-        of the other cells: a correction or a rollback discards the training, and if the store is
-        unavailable, the training waits for a later call.
+        versions) all steps are taken in any case. When the training is done, or with `wait` above
+        0, the call first takes in what the other cells stored: a correction or a rollback discards
+        the training, and if the store is unavailable, the training waits for a later call.
         """
         if self._candidate is None and self._retrainer.future is None:
             return
@@ -335,7 +337,8 @@ class Learner:
         """Make the outcome of a training the candidate, the version on its way to be put in force.
 
         It will take over the rule of the model in force. If the training started from another
-        model, the reason in its report says from which.
+        model, because labels were forgotten, the reason in its report says from which. Returns the
+        candidate, whose steps (test, store, put in force) `_advance` takes.
         """
         note = self._start[2] if self._start is not None else ""
         if note:
@@ -347,7 +350,7 @@ class Learner:
     def _choose_start(self) -> EngineModel:
         """Return the model that the next training starts from: one that saw no forgotten label.
 
-        Without any correction it is the model in force, or the untrained template before the first
+        Without any correction it is the model in force, or the untrained model before the first
         retrain. Otherwise `find_clean_start` chooses it from the store, and the choice is kept
         until another version is in force or another correction comes. If the store fails, that is
         logged, and the training starts from initial weights.
@@ -383,9 +386,10 @@ class Learner:
     def _advance(self, candidate: Candidate, to_the_end: bool) -> None:
         """Bring the candidate, a trained version that is not in force yet, one step further.
 
-        With `to_the_end` it takes all steps of `_see_through`. A candidate that cannot be stored is
-        dropped. A candidate that is stored waits for a later call if the newest labels cannot be
-        stored, which is logged.
+        With `to_the_end` it takes all steps that are left: test, learn newer labels, store, learn
+        newer labels, put in force. A candidate that cannot be stored is dropped. A candidate that
+        is stored waits for a later call if the newest labels cannot be stored, which is logged. The
+        time that this takes counts as work on the retrain, in its report.
         """
         candidate.begin_work()
         try:
@@ -429,10 +433,11 @@ class Learner:
     def _catch_up_candidate(self, candidate: Candidate) -> Iterator[Callable[[], object] | None]:
         """Make all labels that came references of the candidate, one a step, and have them stored.
 
-        Each round first counts overdue checks. It yields like `_see_through`, and ends when no
-        label is missing or waits to be stored. In a cell that never pauses some label always waits,
-        so in every `PATIENCE`-th round this call waits for the store itself; a StoreError there is
-        ignored.
+        The candidate is a trained version that is not in force yet. Each round first counts overdue
+        checks. It yields None after each label, and a function that waits for the store if labels
+        are not stored yet; it ends when no label is missing or waits to be stored. In a cell that
+        never pauses some label always waits, so in every 20th round this call waits for the store
+        itself; a StoreError there is ignored.
         """
         for n_waits in count(1):
             self._feedback.number_labels()
@@ -449,9 +454,10 @@ class Learner:
     def _begin_storing(self, candidate: Candidate) -> Future[int]:
         """Complete the candidate's report; hand report and model to the thread that stores them.
 
-        Returns a future of the version's number: the report's, or a higher one if another cell of
-        the product stored a version first. Without a model only the report is stored, and the
-        number is the report's. Raises StoreError if the store is unavailable.
+        The candidate is a trained version that is not in force yet. Returns a future of the
+        version's number: the report's, or a higher one if another cell of the product stored a
+        version first. Without a model only the report is stored, and the number is the report's.
+        Raises StoreError if the store is unavailable.
         """
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
@@ -463,8 +469,9 @@ class Learner:
     def _swap(self, candidate: Candidate) -> None:
         """Put a stored candidate in force with the present rule; keep its report for `take_report`.
 
-        If the training was dropped, there is no model: the previous version stays in force, the
-        report is kept, and its reason is added to `dropped`.
+        A failure to take over the rule is logged. If the training was dropped, there is no model:
+        the previous version stays in force, the report is kept, and its reason is added to
+        `dropped`, which a version that is put in force empties.
         """
         self._candidate = None
         self._report = candidate.report
@@ -507,9 +514,11 @@ class Learner:
     # The other cells of a product
 
     def _try_to_hear(self, peers: Peers, with_labels: bool = True) -> bool:
-        """Hear of peers (`_hear_of_peers`), and return whether the store gave an answer.
+        """Take in what peers stored (`_hear_of_peers`); return whether the store gave an answer.
 
-        If it gave none, that is logged, once until it answers again, and nothing is raised.
+        These are versions and corrections of the product's other cells, and with `with_labels` the
+        labels of all cells. If the store gave no answer, that is logged, once until it answers
+        again, and nothing is raised.
         """
         failure = None
         try:
@@ -522,11 +531,13 @@ class Learner:
     def _hear_of_peers(self, with_labels: bool = True) -> None:
         """Put a newer version and corrections of the product's other cells in force.
 
-        If there is one of them, or with `with_labels`, this cell's labels are stored first, and the
-        labels of all cells are read into the training window at the end. What is read is checked
-        against the ledger, which may set the outbox's `integrity_error`. A pinned version or a
-        correction discards a training under way in the executor. Nothing happens in a cell without
-        a product. Raises StoreError if the store is unavailable.
+        If there is a newer version or correction, or with `with_labels`, this cell's labels are
+        stored first, and the labels of all cells are read into the training window at the end. What
+        is read is checked against the ledger; a difference sets the outbox's `integrity_error`,
+        after which every part is verified. A pinned version or a correction discards a training
+        under way in the executor. After a newer version the new labels are counted from those that
+        it knows. Nothing happens in a cell without a product. Raises StoreError if the store is
+        unavailable.
         """
         peers = self._peers
         if peers is None:
@@ -566,8 +577,8 @@ class Learner:
         thread, or, if it is pinned, fitted again as a new version; only the cell that corrected
         does so. If the next training does not start from the model in force, because labels were
         forgotten, its features are computed in advance (`_precompute_other_start`). The store is
-        checked against its ledger, which may set the outbox's `integrity_error`. Raises StoreError
-        if the store is unavailable.
+        checked against its ledger; a difference sets the outbox's `integrity_error`, after which
+        every part is verified. Raises StoreError if the store is unavailable.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
@@ -619,10 +630,10 @@ class Learner:
         """Put the earlier version `number` in force again, as a new version that is pinned.
 
         It is stored together with `event`. Until then nothing changes, so all that can fail comes
-        before: reading it, restoring it, and adding the later labels, up to the training window's
-        capacity, as its references. Once it is in force, new labels count from zero, since the
-        version knows all labels until now. A retrain that was requested before is not begun any
-        more.
+        before: checking the store against its ledger, reading the version, restoring it, and adding
+        the later labels, up to the training window's capacity, as its references. Once it is in
+        force, new labels count from zero, since the version knows all labels until now. A retrain
+        that was requested before is not begun any more.
 
         Raises StoreError if the version is not kept, if a trace is damaged that the model must be
         fitted on again, and if the version cannot be stored.
@@ -643,10 +654,11 @@ class Learner:
     def _restore_with_rule_in_force(self, version: ModelVersion) -> tuple[EngineModel, TrainedOn]:
         """Return the model of a stored version with the rule in force, and what it was trained on.
 
-        A model that is stored by its traces is fitted on them again, with the labels that they had
-        then. A baseline is fitted on its traces with the labels as they count now, since it cannot
-        take a label back. The model is not put in force. Raises StoreError if one of these traces
-        has changed, or if this dengine cannot restore the version.
+        A model like umap-learn, of which not the fit but only the numbers of its traces are stored,
+        is fitted on these traces again, with the labels that they had then. A baseline is fitted on
+        its traces with the labels as they count now, since it cannot take a label back. The model
+        is not put in force. An exception as it takes over the rule is logged. Raises StoreError if
+        one of these traces has changed, or if this dengine cannot restore the version.
         """
         state = without_rule(version.state)
         trained_on = TrainedOn.from_state(version.state)

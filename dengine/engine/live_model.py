@@ -107,17 +107,20 @@ class LiveModel:
     ) -> None:
         """Restore a stored version and learn the outcomes that came after it.
 
-        A model that is stored by its traces is trained on them again; any other is restored bit for
-        bit, with its reference points. Without a version, or if one of those traces is damaged or
-        missing, the untrained template stays, and its rule is updated with the stored outcomes
-        since it began. The outcomes that update the rule are checked against the store's ledger,
-        which may set the outbox's `integrity_error`. `overdue`, `overdue_to` and `corrected_to` are
-        restored, too.
+        A model like umap-learn, of which not the fit but only the numbers of its traces are stored,
+        is trained on these traces again; any other is restored bit for bit, with its reference
+        points. Without a version, or if one of those traces is damaged or missing, no model is in
+        force, and the rule of the untrained model is updated with the stored outcomes since it
+        began. The outcomes that update the rule are checked against the store's ledger; a
+        difference sets the outbox's `integrity_error`, after which every part is verified. Labels
+        that came after the version was stored become references. If the version is from before the
+        present rule, its stored rule is not taken. An exception as the model is made ready is
+        logged. `overdue`, `overdue_to` and `corrected_to` are restored, too.
 
         Parameters
         ----------
         version : ModelVersion or None
-            None before the first retrain.
+            The newest stored version, with its arrays; None before the first retrain.
         newest_version : int
             Largest number that a version ever had.
         label_within : int
@@ -160,7 +163,9 @@ class LiveModel:
     def swap_in(self, model: EngineModel, version: int, trained_on: TrainedOn) -> None:
         """Put a model in force, as the version of this number; nothing is stored.
 
-        The caller hands the rule in force over to it (`EngineModel.prepare`), before or after.
+        `trained_on` names the labels of its training. The attributes `answering`, `version`,
+        `newest_version`, `trained_on` and `lacks_steps` are set. The caller hands the rule in force
+        over to the model (`EngineModel.prepare`), before or after.
         """
         self.answering = model
         self.version = version
@@ -231,7 +236,8 @@ class LiveModel:
     def clear_overdue(self, decision_id: str) -> bool:
         """Stop counting a decision as overdue, because its check was reported.
 
-        Returns whether it was counted as overdue. If True, the caller must have the rule rebuilt.
+        The decision leaves the set `overdue`. Returns whether it was in it. If True, the caller
+        must have the rule rebuilt, because the rule has counted the decision as wrong.
         """
         if decision_id not in self.overdue:
             return False
@@ -241,8 +247,8 @@ class LiveModel:
     def rebuild_rule(self) -> None:
         """Reset the rule, and update it with all stored outcomes of decisions since it began.
 
-        It is the rule of the model in force, or of the untrained template before the first retrain.
-        It begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
+        It is the rule of the model in force, or of the untrained model before the first retrain. It
+        begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
         outcomes, as wrong decisions. Labels that are not in the store yet are not, so the rule
         loses them: store them before.
 
@@ -262,8 +268,8 @@ class LiveModel:
     ) -> None:
         """Reset a model's rule and update it with the outcomes that `read_outcomes` returns.
 
-        It starts in the safe mode of `evidence`. A failed update is logged, and the rule is stale
-        then. A rule that never learns is only reset.
+        It starts in the safe mode that `evidence` names (`began_in`). A failed update is logged,
+        and the rule is stale then. A rule that never learns is only reset.
         """
         model.reset_rule(self.evidence.began_in)
         _update_rule(model, read_outcomes)
@@ -300,10 +306,11 @@ class LiveModel:
     ) -> tuple[EngineModel, EngineModel | None]:
         """Return copies of the untrained model and the model in force, under another policy.
 
-        Their rule is that of the policy and has learned nothing. The second copy is None before the
-        first retrain; it shares the references of the model in force. If it cannot be made ready to
-        predict, that is logged. Neither is put in force. Raises SettingError if the rule cannot be
-        made.
+        Their rule is that of the policy and has learned nothing; it starts in the safe mode that
+        `evidence` names. The second copy is None before the first retrain; it shares the references
+        of the model in force. A baseline, which has no such rule, is not copied. If it cannot be
+        made ready to predict, that is logged. Neither is put in force. Raises SettingError if the
+        rule cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
@@ -324,8 +331,9 @@ class LiveModel:
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         """Return the arrays by name with which the store can restore a model as a version.
 
-        They hold the model with its rule, the labels that it was trained on, and how far
-        corrections and overdue checks count. If an overdue check counts, they say so
+        They hold the model with its rule, the numbers of the labels that it was trained on
+        (`trained_on`), and the numbers of the newest correction that counts and of the newest
+        decision that was examined for an overdue check. If an overdue check counts, they say so
         (`includes_overdue`): an engine that opens the store then does not take the stored rule, but
         rebuilds it.
         """
@@ -342,8 +350,8 @@ class LiveModel:
 def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]) -> None:
     """Update a model's rule with outcomes in the order of their labels.
 
-    An update that fails is logged, and the rule is stale then: every part is verified. For a rule
-    that never learns, `read_outcomes` is not called.
+    `read_outcomes` returns the outcomes. An update that fails is logged, and the rule is stale
+    then: every part is verified. For a rule that never learns, `read_outcomes` is not called.
     """
     if not model.rule_learns:
         return

@@ -27,12 +27,13 @@ if TYPE_CHECKING:
 def restore_model(
     outbox: Outbox, template: EngineModel, state: Mapping[str, NDArray[Any]]
 ) -> EngineModel | None:
-    """Return a new model, made from the untrained template, in the state of a stored version.
+    """Return a new model, made from the untrained model `template`, as a stored version was.
 
-    A model that is stored by its traces is trained on them again (`refit`). Returns None if one of
-    these traces is damaged or missing. The new model and the template share one rule, so the
-    template gets the stored rule, too. Raises StoreError for a state that this dengine cannot
-    restore, for a label that is neither 0 nor 1, and if the store cannot be read.
+    `state` holds the arrays of the version by name. A model like umap-learn, of which not the fit
+    but only the numbers of its traces are stored, is trained on these traces again (`refit`).
+    Returns None if one of these traces is damaged or missing. The new model and the template share
+    one rule, so the template gets the stored rule, too. Raises StoreError for a state that this
+    dengine cannot restore, for a label that is neither 0 nor 1, and if the store cannot be read.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -43,9 +44,11 @@ def restore_model(
 def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     """Train a model on the traces of a stored version, with the labels that these had then.
 
+    `trained_on` has the numbers of these labels, and that of the newest correction that they had.
     The labels are first compared with the ledger, the store's hash chain. A difference sets the
-    outbox's `integrity_error`, and the model is trained nevertheless. A trace whose label was
-    forgotten by then is left out, and does not count as missing.
+    outbox's `integrity_error`, after which every part is verified, and the model is trained
+    nevertheless. A trace whose label was forgotten by then is left out, and does not count as
+    missing.
 
     Returns False, with the model untrained, if a trace is missing or damaged; an event is written
     to the store for each damaged trace. Raises StoreError if a label is neither 0 nor 1, if the
@@ -77,10 +80,11 @@ def find_clean_start(
 ) -> tuple[EngineModel, str]:
     """Return a model for the next training to start from, which saw no label that is forgotten now.
 
-    If `newest`, whose weights learned from `trained_on`, saw no such label, it is returned. It is
-    also returned if it begins anew with each training. Otherwise the newest stored version that saw
-    no such label is returned, without its rule; versions that are damaged or not kept are passed
-    over. If there is none, it is `template`, the untrained model with its initial weights.
+    If `newest`, whose weights learned from the labels that `trained_on` names, saw no such label,
+    it is returned. It is also returned if it begins anew with each training, like a baseline.
+    Otherwise the newest stored version that saw no such label is returned, without its rule;
+    versions that are damaged or not kept are passed over. If there is none, it is `template`, the
+    untrained model with its initial weights.
 
     Returns
     -------
@@ -128,7 +132,7 @@ def add_labels_since(
     capacity: int,
     shared_to: int | None = None,
 ) -> int:
-    """Add to a version's model, as references, the labels that are none yet.
+    """Add labels to a version's restored model as references, if they are none yet.
 
     They are the labels of all cells of the product up to number `shared_to`, and after it only this
     cell's own. None stands for the newest label that the version was trained on, or that it got

@@ -195,11 +195,12 @@ class EngineSettings:
     def with_template(self, model: Model | None) -> tuple[Self, EngineModel]:
         """Return the settings in force and an untrained model: the recipe's, or `model` if given.
 
-        If an object was handed in, the settings are a copy that describes it. A `ModelPrediction`
-        as `model` also replaces the settings of the recipe that it has itself, like the radius; for
-        a baseline the recipe stays, though not all of it has an effect. Without a `model` the
-        recipe's reducer is made, for which a class of the user's is imported. Raises SettingError
-        if that fails, and for a `model` that lacks a method of `Model`.
+        If a user passed an object in place of a name, the settings are a copy that describes it. A
+        `ModelPrediction`, dengine's own kind of model, as `model` also replaces the settings of the
+        recipe that it has itself, like the radius; for a baseline the recipe stays, though not all
+        of it has an effect. Without a `model` the recipe's reducer is made, for which a class of
+        the user's is imported. Raises SettingError if that fails, and for a `model` that lacks a
+        method of `Model`.
         """
         if model is None:
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
@@ -221,8 +222,9 @@ class EngineSettings:
 
         `request` holds settings by name, as `DataEngine` takes them; None is a setting that was not
         given. All settings of a recipe in it are compared. An unknown name is an error, too. For a
-        model that was handed in only `LOOP_SETTINGS`, which have an effect on any model, are
-        compared.
+        model that was handed in only settings that have an effect on any model are compared
+        (`LOOP_SETTINGS`: seed, trace, retrain_every, budget, max_steps, window, audit_rate, stops,
+        label_within and force_limits).
 
         Not compared are the shadow mode, and force limits that the program leaves out, because an
         operator sets both while the cell runs. Nor is a reducer that is an object, with its
@@ -275,8 +277,8 @@ def _with_objects(
     `texts` are the store's settings, and `name` is the name of the store for messages. An object
     equal to the reducer that the recipe names is accepted and not used; so is a name, which is not
     compared here, and any reducer beside a model. Raises SettingError if an object is missing or
-    differs from the one that the store was made with, or if a `model` is passed to an engine that
-    has its own.
+    differs from the one that the store was made with, if a `model` is passed to an engine that has
+    its own, or if it lacks a method of `Model`.
     """
     if "model" in texts and model is None:
         raise SettingError(
@@ -399,10 +401,12 @@ def fill_from_peers(
 ) -> dict[str, Any]:
     """Return a copy of a new engine's settings, in which a peer's replace some that were not given.
 
-    A peer is another cell of the store's product; the first one is taken. Its seed is taken if
-    `request` has none (0 without a peer), and its recipe if `request` names neither reducer, recipe
-    nor model. A peer that was given an object without a name has no recipe to take. Raises
-    ImportRefusedError if the recipe names a class that may not be imported.
+    A peer is another cell of the store's product; the first peer that has settings is taken. Its
+    seed is taken if `request` has none (0 without a peer), and its recipe if `request` names
+    neither reducer, recipe nor model. The recipe is not taken if the peer was given an object that
+    has no name. Raises ImportRefusedError if the recipe names a class that may not be imported: any
+    class may be with `allow_import` True, none with False, else those that it names. Raises
+    SettingError if the recipe cannot be read.
     """
     peer = next(iter(store.settings.of_peers().values()), {})
     filled = dict(request)
@@ -472,7 +476,11 @@ class SettingsInForce:
         self._outbox = outbox
 
     def change(self, settings: EngineSettings) -> None:
-        """Use other settings from now on, without saving them; they give new `conditions`."""
+        """Use other settings from now on, without saving them.
+
+        `conditions`, what a decision depends on beside the model, are made of them. They are None
+        if the settings have no `TraceSpec`.
+        """
         policy = settings.recipe.policy
         self.now = settings
         self.conditions: DecisionConditions | None = None
@@ -482,7 +490,7 @@ class SettingsInForce:
             )
 
     def save(self) -> None:
-        """Write the settings to the store, within its time limit.
+        """Write the settings to the store; wait for it at most as long as its time limit.
 
         If the store does not take them, the error is logged and `is_unsaved` is set, which a later
         success clears. Raises SettingError if another cell of the product has settings that

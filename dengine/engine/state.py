@@ -61,8 +61,9 @@ class EngineState:
     def complete(self, status: Status) -> Status:
         """Return a copy of a status from the store, completed by what only the engine knows.
 
-        That is version, safe mode, number of labels since the newest retrain began, the store's
-        fault, age of the oldest record that the store lacks, and whether it retrains.
+        That is the version in force, the reason of a safe mode, the number of labels since the
+        newest retrain began, why the store cannot be written, the age of the oldest record that the
+        store lacks, and whether a retrain is under way.
         """
         return replace(
             status,

@@ -70,8 +70,8 @@ class TrainingWindow:
     def add(self, trace: TraceArray, label: int, hash_: int, seq: int) -> None:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
-        `label` is 1 or 0, `hash_` the hash of part or content, and `seq` the label's number, which
-        must be larger than any before; this is not checked.
+        `label` is 1 or 0, `hash_` the content hash, and `seq` the label's number, which must be
+        larger than any before; this is not checked.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
@@ -82,10 +82,11 @@ class TrainingWindow:
         self._first = max(self._first, self._end - self.capacity)
 
     def _enlarge(self, trace_shape: tuple[int, ...]) -> None:
-        """Copy the window to the front of a new block, which has room for half as many rows more.
+        """Copy the window to the front of new arrays, which have room for half as many rows more.
 
-        At least 64 rows more fit. `trace_shape` is the shape of one trace, which an empty window
-        does not know. The old block is not changed.
+        At least 64 rows more fit. A row is a labelled trace; `trace_shape` is the shape of one
+        trace, which an empty window does not know. The old arrays, of which snapshots may be views,
+        are not changed.
         """
         n = len(self)
         columns = [column[self._first :] for column in self._block]
@@ -101,16 +102,17 @@ class TrainingWindow:
         self._end = n
 
     def refill(self, labelled: LabelledTraces) -> None:
-        """Replace the whole window by the newest of these labelled traces, ordered by number.
+        """Replace the whole window by the newest of these labelled traces.
 
-        Their arrays become the window's block and are not copied.
+        They must be ordered by the numbers of their labels. Their arrays become those of the window
+        and are not copied.
         """
         self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
         self._end = len(labelled.seq)
         self._first = max(0, self._end - self.capacity)
 
     def snapshot(self) -> LabelledTraces:
-        """Return the labelled traces, oldest first.
+        """Return the labelled traces of the window, oldest first.
 
         The arrays are views that never change, and are not to be written to.
         """
@@ -163,8 +165,9 @@ class TrainedOn:
     def to_state(self) -> dict[str, NDArray[Any]]:
         """Return the four attributes as arrays by name, for the store; `from_state` reads them.
 
-        Their names are "trained_on" (`seq`), "trained_as" (`corrected_to`), "counts_from" and
-        "pinned".
+        Their names are "trained_on" (`seq`, the numbers of the labels), "trained_as"
+        (`corrected_to`, the number of the newest correction), "counts_from" (labels with larger
+        numbers are new) and "pinned" (the version that a rollback put in force).
         """
         return {
             "trained_on": self.seq,
@@ -201,8 +204,9 @@ class Limits:
     def deadline(self, begin: float) -> float | None:
         """Return the time after which a training begins no step, if it began at `begin`.
 
-        That is after 70 % of the budget, or when `reserve` seconds of it are left if that is
-        earlier, but not before 30 %. None without a budget.
+        Both are in seconds by the same clock. It is after 70 % of the time budget, or when
+        `reserve` seconds of it are left if that is earlier, but not before 30 %. None without a
+        budget.
         """
         if self.budget is None:
             return None
@@ -300,8 +304,11 @@ class Retrainer:
     def train(self, current: EngineModel, begin: float) -> Trained:
         """Train a successor of the current model in this thread, and return the outcome.
 
-        `begin` is when work on the retrain began, by the clock. The current model is not changed.
-        If the training fails, the outcome has no model, and nothing is raised.
+        A successor starts from the weights of the current model, or from scratch; it is trained on
+        the training window as it is now. `begin` is when work on the retrain began, in seconds by
+        the clock. The current model is not changed. If the training fails, the outcome has no
+        model, and nothing is raised. How long the training worked after its last step is
+        remembered, and reserved in the time budget of the next.
         """
         data = self.window.snapshot()
         trained = train_candidate(current.successor(), data, self._limits(), self.clock)
@@ -309,11 +316,12 @@ class Retrainer:
         return replace(trained, begin=begin)
 
     def start(self, current: EngineModel) -> bool:
-        """Begin to train a successor of the current model in the executor, on the labels as of now.
+        """Begin to train a successor of the current model in the executor, on the present window.
 
-        `collect` returns the outcome; no other training may be under way. Returns False, and begins
-        nothing, if there is no executor, if it refuses work, or while it still works on a discarded
-        training. An executor that refuses work is started again or given up, and that is logged.
+        A successor starts from the weights of the current model, or from scratch. `collect` returns
+        the outcome; no other training may be under way. Returns False, and begins nothing, if there
+        is no executor, if it refuses work, or while it still works on a discarded training. An
+        executor that refuses work is started again or given up, and that is logged.
         """
         executor = self.executor
         if executor is None or self._left is not None:
@@ -352,8 +360,9 @@ class Retrainer:
     def is_occupied(self) -> bool:
         """Whether the executor still works on a training that was discarded.
 
-        A training that hangs, by `HUNG`, does not count: reading this then starts the executor
-        again, or if that cannot be done, leaves it unused until the training is done.
+        A training that hangs, which is to say that it takes longer than HUNG (60 s), does not
+        count: reading this then starts the executor again, or if that cannot be done, leaves it
+        unused until the training is done.
         """
         left = self._left
         if left is None or left.done():
@@ -367,8 +376,8 @@ class Retrainer:
     def _count_seconds_left(self) -> float:
         """Return how many seconds the executor's training has left, before it counts as hung.
 
-        It has `HUNG` seconds from when the executor could begin with it: while the executor's
-        process still imports, the count starts anew.
+        It has HUNG seconds (60) from when the executor could begin with it: while the executor's
+        process still imports modules, the count starts anew. The number is negative after that.
         """
         now = time.monotonic()
         executor = self.executor
@@ -383,7 +392,9 @@ class Retrainer:
         `wait` seconds, and a training that is not done then is given up. So is, whatever `wait` is,
         a training that hangs, or whose executor died. The outcome of a training that was given up
         or failed has no model and says why. An executor that died or hangs is started again if it
-        can be, or not used. `begin` of the outcome is now minus the duration of the training.
+        can be, or not used. `begin` of the outcome is now minus the duration of the training. How
+        long the training worked after its last step is remembered, and reserved in the budget of
+        the next.
         """
         future = self.future
         left = self._count_seconds_left()
@@ -400,9 +411,10 @@ class Retrainer:
     def _give_up(self, future: Future[Trained], error: Exception) -> str:
         """Log why a training failed, and return it as the reason of a dropped retrain.
 
-        If the training is not done and its executor lives, it is discarded: the executor is
-        occupied until it is done. An executor that died, or in which a training hangs, is started
-        again if it can be, or not used.
+        `error` is what the training, or waiting for it, raised; the reason begins with "dropped: ".
+        If the training is not done and its executor lives, it is discarded: the executor takes no
+        other training until it is done. An executor that died, or in which a training hangs, is
+        started again if it can be, or not used.
         """
         is_broken = isinstance(error, BrokenExecutor)
         training_raised = future.done() and not is_broken
@@ -440,12 +452,14 @@ class Retrainer:
 def train_candidate(
     successor: EngineModel, data: LabelledTraces, limits: Limits, clock: Clock
 ) -> Trained:
-    """Train a successor, which this changes, on labelled traces and return the outcome.
+    """Train a model on labelled traces and return the outcome.
 
-    Any exception, a window without traces, and a defect of the trained model give an outcome
-    without a model, whose reason begins with "dropped: ". A training that reaches a limit ends
-    early and is accepted. Sets the present thread to one torch thread. It is a plain function, so
-    that any executor can run it.
+    The outcome has the model, a reason in words, the number of steps, the duration, and the numbers
+    of the labels. `successor` is the model, which this changes in place. Any exception, a window
+    without traces, and a defect of the trained model give an outcome without a model, whose reason
+    begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
+    says so if the time budget ended it. `clock` returns seconds. Sets the present thread to one
+    torch thread. It is a plain function, so that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only
     begin = clock()

@@ -34,20 +34,22 @@ class Envelope:
 
 
 def envelope_of(successes: TraceArray, trace: TraceArray) -> Envelope | None:
-    """Compute the envelope of successes, and the share of a trace's samples outside.
+    """Compute the envelope of good parts' traces, and the share of a trace's samples outside.
 
-    At each sample the envelope contains the middle 95 % of the successes.
+    At each sample the envelope contains the middle 95 % of the good parts.
 
     Parameters
     ----------
     successes : array of float32, shape (n, C, T)
+        Traces of good parts: n parts, C channels, T samples.
     trace : array of float32, shape (C, T)
-        A NaN counts as inside.
+        The trace that is compared with them. A NaN counts as inside.
 
     Returns
     -------
     Envelope or None
-        None for fewer than 20 successes, or if their shape is not the trace's.
+        Lower edge, median and upper edge at each sample, and the share. None for fewer than 20
+        successes, or if their shape is not the trace's.
     """
     if len(successes) < MIN_SUCCESSES or successes.shape[1:] != trace.shape:
         return None

@@ -112,9 +112,9 @@ class Explanation:
 
 
 def find_decision_id(store: SqlStore, part: str) -> str:
-    """Return the id of the only decision on a part that is no reject, else of its only reject.
+    """Return the id of the only decision on a part that is no REJECT, else of its only REJECT.
 
-    A rejected part may come again, so rejects count only if there is no other decision. Only the
+    A rejected part may come again, so REJECT counts only if there is no other decision. Only the
     newest 20 decisions of this cell on the part are looked at.
 
     Parameters
@@ -172,6 +172,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     Returns
     -------
     Explanation
+        Sentences, bounds with their thresholds, the nearest references of the version that decided,
+        and the envelope of good parts; see its attributes.
 
     Raises
     ------
@@ -181,6 +183,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     StoreError
         For a store that no engine has used, and for a damaged trace of the decision or of a
         neighbour.
+    SettingError
+        For a stored recipe that cannot be read.
     """
     settings = store.settings.read()
     if "recipe" not in settings:
@@ -256,9 +260,10 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
 def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Floats | None:
     """Return the distances from a decision's embedding to the references of a version, shape (n,).
 
-    Each is measured in the embedding space of the reference, and they are in the order of the
-    version's index. The distance to references of the decision's own part is infinite. None if the
-    trace was not embedded or there is no version.
+    Each is measured in the embedding space of the reference, in which one radius means the same for
+    every reducer. They are in the order of the version's index of references. The distance to
+    references of the decision's own part is infinite. None if the trace was not embedded or there
+    is no version.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:
@@ -278,9 +283,10 @@ def _find_neighbours(
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    Nothing is yielded if `version` or `distances` is None. A neighbour may lie outside of the
-    radius. If the decision behind a reference is unknown (another cell made it), its id, part,
-    source and trace are None. Raises StoreError for a damaged trace.
+    `distances` are those of `_measure_distances`, one for each reference. Nothing is yielded if
+    `version` or `distances` is None. A neighbour may lie outside of the radius, which only says
+    what its field `inside` is. If the decision behind a reference is unknown (another cell made
+    it), its id, part, source and trace are None. Raises StoreError for a damaged trace.
     """
     if distances is None or version is None:
         return
@@ -306,14 +312,14 @@ def _find_neighbours(
 def _find_envelope(
     store: SqlStore, item: StoredDecision, version: PastVersion | None
 ) -> Envelope | None:
-    """Return the envelope of the successes of other parts than the decision's; None if too few.
+    """Return the envelope of the good parts other than the decision's part; None if too few.
 
-    The envelope is the band that contains the middle 95 % of the successes at each sample. They are
-    taken from the newest `MAX_ENVELOPE_LABELS` labels up to `version.last_seq`, the newest label
-    that the version knew at the decision. If these give no envelope (`envelope_of` returns None),
-    or without a version, they are taken from the newest labels of today. Labels are taken as
-    corrected by now. Traces of the decision's own part (without a number, traces equal to its
-    trace) are left out. So is a damaged trace, and an event is written to the store.
+    The envelope is the band that contains the middle 95 % of these parts' traces at each sample.
+    They are taken from the newest MAX_ENVELOPE_LABELS labels (1,000) up to `version.last_seq`, the
+    newest label that the version knew at the decision. If these give no envelope (`envelope_of`
+    returns None), or without a version, they are taken from the newest labels of today. Labels are
+    taken as corrected by now. Traces of the decision's own part (without a number, traces equal to
+    its trace) are left out. So is a damaged trace, and an event is written to the store.
     """
     for last in (None if version is None else version.last_seq, None):
         labelled = store.labels.with_traces(MAX_ENVELOPE_LABELS, last=last)

@@ -109,9 +109,10 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
 
 
 def _newest_marks(items: list[StoredDecision], version: int) -> Iterator[Mark]:
-    """Yield the marks of decisions, in their order, each at the mean of its K embeddings.
+    """Yield a `Mark`, a point of the map, for each decision, at the mean of its K embeddings.
 
-    Decisions of another version, and those without an embedding, are left out.
+    They are in the order of `items`; K is the number of embedding spaces. Decisions of another
+    version, and those without an embedding, are left out.
     """
     for item in items:
         decision = item.decision
@@ -123,11 +124,11 @@ def _newest_marks(items: list[StoredDecision], version: int) -> Iterator[Mark]:
 def _known_marks(
     store: "SqlStore", recipe: Recipe, version: int, parts: dict[str, str | None]
 ) -> list[Mark]:
-    """Return the marks of the newest N_KNOWN references of a version, oldest first.
+    """Return a `Mark`, a point of the map, for each of a version's newest references, oldest first.
 
-    References whose label this cell did not record are left out. [] if the version's references are
-    not kept. `parts` maps decision ids to the parts' numbers; the mark of an id that is missing
-    there has no number.
+    There are at most N_KNOWN (250). References whose label this cell did not record are left out.
+    [] if the version's references are not kept. `parts` maps decision ids to the parts' numbers;
+    the mark of an id that is missing there has no number.
     """
     past = load_past_version(store, version, recipe, None)
     if past is None:

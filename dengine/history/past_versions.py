@@ -66,13 +66,14 @@ def load_past_version(
 
     Its references and its rule include this cell's labels that had come by then, as they were
     reported: later corrections are not applied. Of the labels that came after the version was
-    trained, only the first `MAX_LABELS` are read. A damaged label is left out, and an event is
-    written to the store.
+    trained, only the first MAX_LABELS (100,000) are read. A damaged label is left out, and an event
+    is written to the store.
 
     Parameters
     ----------
     store : SqlStore
     version : int
+        Number of the version.
     recipe : Recipe
         The recipe of that moment.
     item : StoredDecision or None
@@ -82,8 +83,9 @@ def load_past_version(
     Returns
     -------
     PastVersion or None
-        None if no such version was put in force, if its state is damaged or no longer kept, or if
-        it has no references (a baseline, a model that the user handed in).
+        The references with their labels, the thresholds of the rule, and how novel the trace of the
+        decision was. None if no such version was put in force, if its state is damaged or no longer
+        kept, or if it has no references (a baseline, a model that the user handed in).
     """
     try:
         stored = store.versions.load(version)
@@ -121,8 +123,10 @@ def _was_known(label: PastLabel, item: StoredDecision) -> bool:
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
     """Return the index of a stored version's references, with the labels `added` later.
 
-    A label without a point (the embedding of its trace) is left out. In a full index each added
-    reference replaces the oldest. The fold of a label is computed from its hash.
+    A label without a point (the embedding of its trace) is left out. An index is full if older
+    references have been removed from it for lack of room; each added reference then replaces the
+    oldest. Otherwise there is room for the recipe's training window. The fold of a label is
+    computed from the content hash.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
@@ -139,9 +143,10 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty | None:
     """Compute how novel the trace of a decision was, by its version's `NoveltyGate`.
 
-    The gate calls a trace novel by its distance from the traces of the training. Returns None
-    without a decision, if the decision's reason is not `Reason.NOVEL`, and if the gate cannot be
-    restored.
+    The gate calls a trace novel by its distance from the traces of the training. The result has
+    four numbers (level, texture, distortion, gaps), of which at least one is above 1 for a novel
+    trace. Returns None without a decision, if the decision's reason is not `Reason.NOVEL`, and if
+    the gate cannot be restored.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -161,7 +166,8 @@ def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     Returns None if the version has no state that fits this rule: it stored another rule, none (it
     is another cell's), or the rule was stale (it had missed an update). Also None if the rule is a
     user's class whose module is not imported yet, since nothing is imported here. A rule that
-    learns nothing needs no state.
+    learns nothing needs no state. Raises SettingError if an object of the user's class cannot be
+    made.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -183,7 +189,8 @@ def _restore_thresholds(
     the second. Labels of quarantined traces and of rejected parts that somebody inspected do not
     update the rule. The rule "local" with stops="some" learns nothing, so both thresholds are the
     policy's lower bound. Of any other rule the result is None if `_restore_rule` returns None, or
-    if the rule is no `MemberRule`, which alone has such thresholds.
+    if the rule is no `MemberRule`: only rules of this class have thresholds. Raises SettingError
+    like `_restore_rule`.
     """
     has_state = bool(arrays_with_prefix(stored.state, "rule."))
     if (policy.guarantee, policy.stops) == ("local", "some") and not has_state:
@@ -198,7 +205,7 @@ def _restore_thresholds(
 
 
 def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
-    """Return the decision rule as it is now: the stored rule, updated with all outcomes since.
+    """Return the present decision rule: the stored rule, updated with all outcomes since.
 
     If a label was corrected or a check is overdue, the stored rule cannot be continued, and a fresh
     one is updated with all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
@@ -218,6 +225,13 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
         was made under another policy, or the rule was stale (it had missed an update). A rule that
         learns nothing, like that of "local" with stops="some", has no state: another cell's version
         will do for it, and it is never stale.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
+    SettingError
+        If an object of the user's class of rule cannot be made.
     """
     stored = store.versions.newest()
     settings = store.settings.read()

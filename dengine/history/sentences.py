@@ -87,6 +87,7 @@ class Circumstances:
 def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """Return a decision's bounds with the thresholds that they had to reach.
 
+    `circumstances` are the settings of the engine, and the thresholds of its rule, at the decision.
     Returns None if no bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and
     SAFE_MODE.
     """
@@ -107,7 +108,8 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
 def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:
     """Return accept threshold (of lower), reject threshold (of upper), and their origin in words.
 
-    A part was accepted if lower >= the first, rejected if upper <= the second. Under the guarantee
+    `circumstances` are the settings of the engine, and the thresholds of its rule, at a decision. A
+    part was accepted if lower >= the first, rejected if upper <= the second. Under the guarantee
     "local", outside safe mode, they are LB and 1 - LB; else those of the version's rule at that
     time. Both are None if they are unknown: they are not kept, a user's rule decided, or a
     handed-in model decided by its own method. One of them is None if nothing could be accepted, or
@@ -142,8 +144,9 @@ def explain_in_words(
 ) -> Iterator[str]:
     """Yield the sentences that explain a decision: its reason, its bounds, its outcome.
 
-    If `bound` is None, the sentences on bounds are left out. The outcome is the label as corrected
-    by now, or that nothing was reported.
+    `circumstances` are the settings and the state of the engine at the decision. If `bound` is
+    None, the sentences on bounds are left out. The outcome is the label as corrected by now, or
+    that nothing was reported.
     """
     decision = item.decision
     reason = WHY[decision.reason](decision, item.trace, circumstances)
@@ -158,9 +161,11 @@ def explain_in_words(
 
 
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:
-    """Return the rest of the sentence on a trace outside the force limits: which limits it leaves.
+    """Return the end of the sentence on a trace outside the force limits: which limits it leaves.
 
-    The limits of the policy of that time are checked again, one by one.
+    The sentence begins with what was done, like "Rejected". The force limits of the policy of that
+    time are checked again, one by one. If none is left now, the sentence says that they are
+    unknown.
     """
     x = torch.from_numpy(trace)
     left = [
@@ -214,11 +219,11 @@ WHY: dict[Reason, Callable[[Decision, TraceArray, Circumstances], str]] = {
 def _bound_sentences(
     decision: Decision, bound: Bound, circumstances: Circumstances
 ) -> Iterator[str]:
-    """Yield the sentences on a decision's evidence, its bounds, and the thresholds for them.
+    """Yield the sentences on the labels near a trace, on the bounds, and on their thresholds.
 
-    If nothing could be accepted or rejected, or the thresholds are unknown, the sentences say so.
-    For a handed-in model that decides by its own method there is one sentence, with its counts and
-    bounds.
+    `circumstances` are the settings of the engine at the decision. If nothing could be accepted or
+    rejected, or the thresholds are unknown, the sentences say so. For a handed-in model that
+    decides by its own method there is one sentence, with its counts and bounds.
     """
     n = decision.n_success + decision.n_failure
     interval = "{:.3f} to {:.3f}".format(*outward(decision.lower, decision.upper, 3))

@@ -271,10 +271,11 @@ class Status:
 
         The first of these that applies: a fault of the store, lost data, safe mode, too many bad
         parts among the accepted, too many good parts among the rejected, 3 or more dropped retrains
-        in a row, traces that nearly repeat another, too many errors in shadow mode, mostly novel
-        traces, mostly parts outside the force limits, errors of the model. "Too many" means an
-        `ErrorEstimate` whose verdict is "broken", "mostly" means more than half. Parts are counted
-        over the newest decisions alone.
+        in a row, traces that nearly repeat another, in shadow mode too many bad parts among those
+        that the model would have accepted, mostly novel traces, mostly parts outside the force
+        limits, errors of the model. "Too many" means that the confidence interval of their share
+        lies above the tolerance, "mostly" means more than half. Parts are counted over the newest
+        decisions alone.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -363,13 +364,16 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     Returns
     -------
     Status
-        Its `store_fault` is "", `retraining` False and `store_lag` 0.0: only a running engine knows
+        Counts, settings, certificate, retrains, events and more; see its attributes. Its
+        `store_fault` is "", `retraining` False and `store_lag` 0.0: only a running engine knows
         them.
 
     Raises
     ------
     StoreError
-        For a store that no engine has used.
+        For a store that no engine has used, and if the database fails.
+    SettingError
+        For a stored recipe that cannot be read.
     """
     settings = store.settings.read()
     if "recipe" not in settings:
@@ -424,7 +428,8 @@ def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
     """Return the number of the version that a rollback put in force; 0: none is pinned.
 
     `accepted` holds the reports of all versions that were put in force, oldest first. If the newest
-    of them was trained, nothing is pinned, and no arrays are read.
+    of them was trained, nothing is pinned, and no arrays are read. If the arrays of the newest
+    version are damaged, an event is written to the store, and those of the version before count.
     """
     if not accepted or accepted[-1].reason.startswith(TRAINED):  # spares reading its arrays
         return 0
@@ -440,8 +445,9 @@ def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> 
     """Return the counts over a tally's decisions, and over the retrains since the first decision.
 
     Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
-    properties, like action and reason. The intervals of `would_accept` and `would_reject` (how
-    often the model would have been wrong) are at 95 %, whatever the policy's alpha.
+    properties, like action and reason; `retrains` are all retrains of the cell. The intervals of
+    `would_accept` and `would_reject` (how often the model would have been wrong) are at 95 %,
+    whatever the policy's alpha.
     """
     outcomes = tally.outcomes
     first = tally.first
@@ -495,8 +501,11 @@ def _estimate_error(
 ) -> ErrorEstimate:
     """Return the estimate of the share of wrong decisions, of which `n_wrong` are among `n_known`.
 
-    Its bounds are the two-sided Wilson interval at error level `alpha`. If `n_known` is 0, they are
-    0 and 1, and its basis is "". `n` is the number of all parts, by default `n_known`.
+    `n_known` is the number of parts whose outcomes are known, and `n` that of all parts, by default
+    `n_known`. The bounds are the two-sided Wilson interval at error level `alpha`, and the verdict
+    says whether it is below `tolerance` ("kept"), above ("broken"), or neither ("open"). `basis`
+    says in a word where the outcomes come from. If `n_known` is 0, the bounds are 0 and 1, and the
+    basis is "".
     """
     low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
     lower = 1.0 - high
@@ -524,7 +533,7 @@ def _verdict(lower: float, upper: float, tolerance: float) -> str:
 
 
 def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
-    """Estimate the share of bad parts among those that the model found acceptable.
+    """Estimate the share of bad parts among those that the model would have accepted.
 
     These are the accepted parts, and the audited ones that would have been accepted; `n` counts
     both. If the outcomes of all accepted parts are known, the estimate rests on these outcomes.
@@ -537,6 +546,7 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     Parameters
     ----------
     outcomes : Outcomes
+        Counts of accepted and audited parts by label.
     policy : Policy
 
     Returns
@@ -569,8 +579,10 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
 
     They are read from the rule that `load_rule` returns. None if that is None, and if the rule has
     no drift detectors: "local" with stops="some", and a user's rule. In a safe mode that novel
-    traces began, the three values are 0. `mode` is the newest event at which a safe mode began or
-    ended; without it `recovery` is "".
+    traces began, the three values are 0. The text `recovery` says how many parts since the alarm
+    count as evidence, and after about how many more parts the safe mode ends; it is "" outside safe
+    mode. `mode` is the newest event at which a safe mode began or ended; without it `recovery` is
+    "".
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule
@@ -672,7 +684,8 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
         Number of newest decisions of the selection; all of these are read by this call. None: all
         decisions, which are read in pages during the iteration.
     **where
-        The selection: fields of `HistoryFilter`.
+        The selection: action, reason, label, since, until, predicted or part, the fields of
+        `HistoryFilter`.
 
     Returns
     -------
@@ -712,6 +725,8 @@ def iterate_decisions(
     ----------
     store : SqlStore
     where : HistoryFilter
+        The selection: a decision must have the values of all fields that are not None, and its time
+        must lie from `since` to before `until`.
     page_size : int, default 500
         Decisions read at a time.
     start_after : str or None

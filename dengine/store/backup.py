@@ -53,10 +53,10 @@ class BackupReport:
 def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
-    Engines may run meanwhile: everything that they had acknowledged when this was called is in the
-    copy. Damaged records of a journal are left out, and a record that contradicts the copy becomes
-    an event of kind "dead letter" there. The copy is written in full or not at all. The store and
-    the journals are only read.
+    Engines may run meanwhile: every decision and label that was on disk when this was called is in
+    the copy. Damaged records of a journal are left out, and a record that contradicts the copy
+    becomes an event of kind "dead letter" there. The copy is written in full or not at all. The
+    store and the journals are only read.
 
     Parameters
     ----------
@@ -68,13 +68,15 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     Returns
     -------
     BackupReport
+        The numbers of decisions and labels in the copy and of records from journals, and the cells
+        that have no journal beside the store.
 
     Raises
     ------
     StoreError
-        If `url` is no store, if it is a PostgreSQL store (pg_dump copies that), and if a journal
-        cannot be read. If a journal holds records, and the ledger of its cell was begun with
-        another key than the one in the file that DENGINE_LEDGER_KEY names.
+        If `url` is no store or cannot be read, if it is a PostgreSQL store (pg_dump copies that),
+        and if a journal cannot be read. If a journal holds records, and the ledger of its cell was
+        begun with another key than the one in the file that DENGINE_LEDGER_KEY names.
     OutputError
         If `out` exists, or cannot be written, for example on a full disk.
     """
@@ -111,12 +113,13 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
 
 
 def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
-    """Copy a backup to the place of a store, on this or another machine, and make its journals.
+    """Copy a backup into a new file `store`, and make a journal beside it for each cell.
 
-    Each cell gets a journal that names its newest ledger entry, so that the engine that opens the
-    cell next can tell that nothing is missing. A journal that is already beside `store` is not
-    changed: the next engine of its cell takes the records from it that the copy lacks. If the
-    journal names a ledger entry that the copy lacks, this engine also records an alarm.
+    The journal names the newest ledger entry of its cell, so that the engine that opens the cell
+    next can tell that nothing is missing. A journal that is already beside `store` is not changed:
+    the next engine of its cell takes the records from it that the copy lacks. If the journal names
+    a ledger entry that the copy lacks, this engine also records an alarm. Records of journals that
+    are beside `copy` are added, as by `backup_store`.
 
     Parameters
     ----------
@@ -128,6 +131,8 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     Returns
     -------
     tuple of CellHistory
+        For each cell of `copy`: its numbers of rows and of ledger entries, and the digest of its
+        newest entry.
 
     Raises
     ------
@@ -165,10 +170,11 @@ def _copy(connection: sa.Connection, target: Path) -> None:
 
 
 def _add_records(file: Path, cell: str, records: list[Record]) -> None:
-    """Commit a cell's journal records to the copy; without records it is not opened.
+    """Commit records of a cell's journal to `file`, the copy; it is not opened for no records.
 
     Records that the copy already has change nothing. A record that contradicts the copy is stored
-    there as an event of kind "dead letter". Raise StoreError if the cell's ledger has another key.
+    there as an event of kind "dead letter". Raise StoreError if the cell's ledger has another key
+    or the copy cannot be written.
     """
     if not records:
         return
@@ -178,7 +184,7 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
 
 
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:
-    """Turn off write-ahead logging in a store's file, so that everything is in this one file.
+    """Turn off SQLite's write-ahead log in a store's file, so that everything is in this one file.
 
     Return the numbers of its decisions and labels, over all cells.
     """

@@ -47,8 +47,8 @@ BUSY_SECONDS = 10.0  # wait for another process that writes to the same SQLite f
 def make_engine(url: str | None) -> sa.Engine:
     """Return a new SQLAlchemy engine for a store's database; it does not connect yet.
 
-    In SQLite a commit is synced to the disk, and a store's file is in WAL mode. PostgreSQL
-    connections use psycopg, unless the URL names another driver.
+    Its connections to SQLite sync each commit to the disk, and set a store's file to WAL mode.
+    Connections to PostgreSQL use psycopg, unless the URL names another driver.
 
     Parameters
     ----------
@@ -104,9 +104,9 @@ def make_engine(url: str | None) -> sa.Engine:
 
 
 def _with_sqlite_events(engine: sa.Engine) -> sa.Engine:
-    """Have an engine open its SQLite connections in this module's way, and return the engine.
+    """Have an SQLAlchemy engine set up its SQLite connections for a store; return the engine.
 
-    From then on it calls `_connect_sqlite`, `_set_pragmas` for each new connection, and
+    From then on it calls `_connect_sqlite` to connect, `_set_pragmas` for each new connection, and
     `_begin_transaction` for each transaction.
     """
     sa.event.listen(engine, "do_connect", _connect_sqlite)
@@ -135,11 +135,13 @@ def _connect_sqlite(
 ) -> Any:
     """Return a new SQLite connection; it only reads if the file or its folder cannot be written.
 
-    SQLAlchemy calls it with the dialect and the driver's arguments. A file that cannot be written
-    and has no `-wal` beside it is opened as immutable. If it has a `-wal`, but no `-shm` and SQLite
-    cannot create that, both files are copied to a temporary folder, which is deleted with the
-    connection, and the copy is opened for reading. A new file and a `file:` URI are opened in the
-    driver's own way. A damaged file raises nothing here, but when the connection is used.
+    SQLAlchemy calls this with its dialect, its own record of the connection, which is not used, and
+    the arguments and options for `sqlite3.connect`; the first argument is the file. A file that
+    cannot be written and has no `-wal` beside it is opened as immutable. If it has a `-wal`, but no
+    `-shm` and SQLite cannot create that, both files are copied to a temporary folder, which is
+    deleted with the connection, and the copy is opened for reading. A new file and a `file:` URI
+    are opened in the driver's own way. A damaged file raises nothing here, but when the connection
+    is used. Raise sqlite3.Error if the file cannot be opened, and OSError if it cannot be copied.
     """
     name = str(arguments[0])
     file = Path(name)
@@ -181,8 +183,9 @@ def _set_pragmas(connection: Any, record: Any) -> None:
 
     The file of a store, or an empty one, is set to WAL mode, and an empty one to pages of 16 KiB.
     Another program's file is not changed, and a file that cannot be written keeps its mode. The
-    driver begins no transactions by itself any more. Raise sqlite3.DatabaseError for a file that is
-    damaged or no database.
+    driver begins no transactions by itself any more. `record` is SQLAlchemy's own record of the
+    connection, which is not used. Raise sqlite3.DatabaseError for a file that is damaged or no
+    database.
     """
     connection.isolation_level = None  # `_begin_transaction` starts transactions, not the driver
     try:
@@ -230,8 +233,8 @@ def _store_errors(verb: str, name: str) -> Iterator[None]:
     """Context manager that turns an error of its block into StoreError.
 
     It does so for errors of the database, and for OSError, ValueError, TypeError and OverflowError.
-    The message is "Could not `verb` `name`", the error, and what to do. dengine's own errors and
-    all others pass unchanged.
+    The message is "Could not `verb` `name`", the error, and what to do; `name` is the database.
+    dengine's own errors (`DengineError`) and all others pass unchanged.
     """
     try:
         yield
@@ -263,9 +266,9 @@ def reading(url: str) -> Iterator[sa.Connection]:
     Raises
     ------
     StoreError
-        If there is no file, if it is no store of the present schema, for a URL that `make_engine`
-        refuses, and if the database fails. Also in place of a ValueError, TypeError, OverflowError
-        or OSError that the block raises, unless it is dengine's own.
+        If there is no file, if it is no store of the present schema (version of the tables), for a
+        URL that `make_engine` refuses, and if the database fails. Also in place of a ValueError,
+        TypeError, OverflowError or OSError that the block raises, unless it is dengine's own.
     """
     engine = make_engine(url)
     name = engine.url.render_as_string(hide_password=True)
@@ -375,12 +378,14 @@ class Database:
                 self._file = file, file.stat()
 
     def _open(self, product: str | None) -> Scope:
-        """Create the tables or check them, enter the cell if it is new, and set `newest_entry`.
+        """Create the tables or check them, add the cell to them if it is new, set `newest_entry`.
 
-        A new cell gets its product, and its ledger begins with the key that DENGINE_LEDGER_KEY
-        names. Return the cell with its product. Raise StoreError, and disconnect, if the database
-        cannot be opened or is no store of this schema, if the ledger of the cell was begun with
-        another key, and if `join_product` refuses the product.
+        `newest_entry` becomes number and digest of the cell's newest ledger entry. A new cell gets
+        `product`, and its ledger begins with the key in the file that DENGINE_LEDGER_KEY names.
+        Return the cell with its product; it has none if neither the store nor `product` names one.
+        Raise StoreError, and disconnect, if the database cannot be opened or is no store of this
+        schema, if the ledger of the cell was begun with another key, and if `join_product` refuses
+        the product, for example for a cell that has another one.
         """
         try:
             with _store_errors("open", self.name), self._engine.connect() as plain:
@@ -399,9 +404,10 @@ class Database:
     def reading(self) -> Iterator[sa.Connection]:
         """Context manager that opens a read transaction and gives its connection.
 
-        `before_use` is called first, so that waiting records are seen. Raise StoreError if the
-        database fails or is closed, and in place of a ValueError, TypeError, OverflowError or
-        OSError that the block raises, unless it is dengine's own.
+        First it calls `before_use`, a function that the outbox has set, which writes the records
+        that wait in it, so that they are seen. Raise StoreError if the database fails or is closed,
+        and in place of a ValueError, TypeError, OverflowError or OSError that the block raises,
+        unless it is dengine's own.
         """
         self.check_open()
         self.before_use()
@@ -413,10 +419,11 @@ class Database:
         """Context manager that opens a write transaction, locks the cell and gives the connection.
 
         After the block a ledger entry for the rows that it added is inserted, and both are
-        committed; then `newest_entry` is set and `on_entry` called. If the block added no rows and
-        changed no settings, there is no entry. On an error everything is rolled back. Errors of the
-        database, and OSError, ValueError, TypeError and OverflowError, become StoreError; dengine's
-        own errors and all others pass unchanged.
+        committed. Then `newest_entry` becomes number and digest of this entry, and `on_entry`, a
+        function that the outbox has set, is called. If the block added no rows and changed no
+        settings, there is no entry. On an error everything is rolled back. Errors of the database,
+        and OSError, ValueError, TypeError and OverflowError, become StoreError; dengine's own
+        errors and all others pass unchanged.
 
         StoreError is raised, too, if the function given to `commit_if` returns False, and if the
         SQLite file was replaced. If this is noticed only after the commit, the rows are in the
@@ -455,7 +462,7 @@ class Database:
 
     @contextmanager
     def commit_if(self, is_wanted: Callable[[], bool]) -> Iterator[None]:
-        """Context manager in which this thread commits a transaction only if `is_wanted()`.
+        """Context manager in which this thread commits a transaction only if `is_wanted()` is true.
 
         `is_wanted` is called just before each commit. If it returns False, the transaction is
         rolled back, and `write` raises StoreError.
@@ -480,13 +487,14 @@ class Database:
 
         These are the settings, corrections, labels and model versions of this cell, and of the
         other cells of its product. Of the labels only the newest are checked. The rest is checked
-        in full, except for the arrays of the versions.
+        in full, except for the arrays of the versions. A ledger with another key than the one with
+        which the store was opened counts as a difference, too.
 
         Parameters
         ----------
         window : int
             Number of newest labels that are checked, at least, without those of quarantined traces.
-            In a product the number is an estimate (`Scope.first_label`).
+            In a product fewer are checked if most of the newest labels are of such traces.
         since : int or None
             If given, the labels after this number are checked instead of the newest `window`.
 
@@ -525,7 +533,7 @@ class Database:
     def check_writable(self) -> None:
         """Raise a StoreError if the database cannot be written; an update of no row shows this.
 
-        Waiting records are written first (`before_use`).
+        The records that wait in the outbox are written first.
         """
         self.write(
             lambda connection: connection.exec_driver_sql(
@@ -536,9 +544,9 @@ class Database:
     def acquire_lease(self) -> None:
         """Lock the cell on a PostgreSQL server, and write from now on through that one connection.
 
-        The lock lasts as long as the connection; a new connection locks again. Raise StoreError if
-        another engine has the lock, or the database fails; this `Database` can then still be used,
-        without it.
+        Only one engine has the lock of a cell (the lease). It lasts as long as the connection; if
+        that is lost, the next connection locks again. Raise StoreError if another engine has the
+        lock, or the database fails; this `Database` can then still be used, without it.
         """
         # The name is shown to an engine that finds the cell locked.
         options = TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]}
@@ -557,8 +565,9 @@ class Database:
     def _take_lease(self, connection: Any, record: Any) -> None:
         """Lock the cell (the lease) for a new PostgreSQL connection, until that is closed.
 
-        SQLAlchemy calls it for each connection. If another engine has the lock, the connection is
-        closed, and the StoreError that is raised names that engine.
+        SQLAlchemy calls this for each new connection, with its own record of the connection, which
+        is not used. If another engine has the lock, the connection is closed, and the StoreError
+        that is raised names that engine.
         """
         digest = hashlib.sha256(b"dengine " + self.cell_id.encode()).digest()
         key = int.from_bytes(digest[:8], "big", signed=True)
@@ -592,9 +601,9 @@ class Database:
     def write(self, add_rows: Callable[[sa.Connection], T]) -> T:
         """Call `add_rows` in a write transaction, commit it, and return what `add_rows` returned.
 
-        `before_use` is called first, so that waiting records are written before these rows. This
-        waits until another transaction has ended. If rows were added or settings changed, the
-        commit includes a ledger entry for them.
+        First `before_use` is called, a function that the outbox has set, so that the records that
+        wait in the outbox are written before these rows. This waits until another transaction has
+        ended. If rows were added or settings changed, the commit includes a ledger entry for them.
 
         Parameters
         ----------
@@ -623,7 +632,8 @@ class Database:
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
         """Run a query in a read transaction of its own, and return all its rows.
 
-        `before_use` is called first. Raise StoreError if the database fails or is closed.
+        The records that wait in the outbox are written first. Raise StoreError if the database
+        fails or is closed.
         """
         with self.reading() as connection:
             return connection.execute(query).all()
@@ -651,9 +661,9 @@ class Database:
     ) -> list[int]:
         """Insert rows of this cell into a table, each with a number; return these numbers.
 
-        The first row gets the next free number, and each further row the one after it. A row that
-        brings a larger number for that column keeps it, and the rows behind it go on from there. A
-        smaller number is replaced.
+        The first row gets the next free number, and each further row the next one. If a row already
+        has a number in `column`, it keeps this number if it is larger than the one that it would
+        get, and the rows behind it go on from there; a smaller number is replaced.
 
         Parameters
         ----------
@@ -688,9 +698,10 @@ class Database:
     def rows_by_id(
         self, connection: sa.Connection, query: sa.Select[Any], ids: Sequence[str]
     ) -> dict[str, Any]:
-        """Run a query over this cell's decisions for the given ids, at most CHUNK ids at a time.
+        """Run a query over decisions for the given ids of this cell, at most CHUNK (500) at a time.
 
-        Return the rows by id; ids without a row are left out.
+        `query` selects from the table `decision`, its column `id` included. Return the rows by id;
+        ids without a row are left out.
         """
         query = query.where(DECISION.c.cell_id == self.cell_id)
         return {

@@ -46,8 +46,8 @@ class CorrectionTable(CellTable):
         """Commit a person's change and its event in one transaction; return the event's number.
 
         The change may correct labels, or have them forgotten (they count nowhere any more), store a
-        version, for which `VersionTable.insert` deletes states of older ones, and replace the
-        settings. If one part fails, nothing is written.
+        model version, and replace the engine's settings. A new version deletes the stored arrays of
+        older versions that are not kept any more. If one of these fails, nothing is written.
 
         Raises
         ------
@@ -56,9 +56,9 @@ class CorrectionTable(CellTable):
         SettingError
             If the settings of another cell of the product contradict the new ones.
         StoreError
-            For data that JSON does not have, for a setting that only the store itself may write
-            (`schema.RESERVED`), for an accepted version without arrays, if another cell of the
-            product stored a version meanwhile, and if the database fails.
+            For data of the event that JSON does not have, for a setting that only the store itself
+            may write (`schema.RESERVED`), for an accepted version without arrays, if another cell
+            of the product stored a version meanwhile, and if the database fails.
         """
         now = float(self._database.clock())
         event = new_event(change.kind, change.text, now, change.data, change.author)
@@ -84,9 +84,10 @@ class CorrectionTable(CellTable):
     def _labels_to_correct(
         self, connection: sa.Connection, ids: Sequence[str]
     ) -> dict[str, bool | None]:
-        """Return the present label of each of these decisions; None if it was forgotten.
+        """Return the label of each of these decisions, by id, as corrected by now.
 
-        Raise ReportError for a decision that is unknown or has no label.
+        It is True for success, False for failure, and None if it was forgotten. Raise ReportError
+        for a decision that is unknown or has no label.
         """
         stored = self.stored_labels(connection, ids)
         for id_ in ids:
@@ -108,7 +109,7 @@ class CorrectionTable(CellTable):
         Parameters
         ----------
         after : int, default 0
-            Only those after this number.
+            Only corrections whose number is above this one.
 
         Returns
         -------
@@ -132,7 +133,7 @@ class CorrectionTable(CellTable):
         success: bool | None,
         labels: Mapping[str, bool | None],
     ) -> int:
-        """Insert an event, and a correction for each of `labels`; nothing is committed.
+        """Insert an event, and a correction for each decision in `labels`; nothing is committed.
 
         The labels themselves stay as they were reported. Without labels only the event is inserted.
 
@@ -165,9 +166,9 @@ class CorrectionTable(CellTable):
         """Return, by id, a row for each of the given decisions that the cell has stored.
 
         A row has content_hash, quarantined (whether its trace is kept out of training) and time of
-        the decision, and success, source, seq and `corrected` of its label. `corrected` is the
-        label after corrections: 0, 1 or FORGOTTEN. These four are None without a label. Ids that
-        are not stored are left out.
+        the decision, and of its label success and source as they were reported, its number `seq`,
+        and `corrected`, the label after corrections: 0, 1 or FORGOTTEN (2). These four are None
+        without a label. Ids that are not stored are left out.
         """
         label = (LABEL.c.success, LABEL.c.source, LABEL.c.seq, corrected_label().label("corrected"))
         return self._database.rows_by_id(

@@ -50,7 +50,8 @@ class DecisionTable(CellTable):
         Raises
         ------
         StoreError
-            If the trace is missing, or not as it was stored; it is checked only if it is read.
+            If the trace is missing, or not as it was stored; it is checked only if it is read. Also
+            for another stored value that cannot be read, and if the database fails.
         """
         query = past_query(self._database.cell_id).where(DECISION.c.id == decision_id)
         rows = self._read(
@@ -67,7 +68,7 @@ class DecisionTable(CellTable):
         return read_decision(rows[0])
 
     def ids(self) -> Iterator[Sequence[str]]:
-        """Yield the ids of all decisions of the cell, in any order, in lists of at most CHUNK.
+        """Yield the ids of all decisions of the cell, in any order, in lists of at most 500.
 
         A read transaction stays open meanwhile.
         """
@@ -92,7 +93,10 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         where : HistoryFilter
+            The selection: a decision must have the values of all fields that are not None, and its
+            time must lie from `since` to before `until`.
         limit : int
+            Number of decisions at most.
         start_after : str or None
             Id of a decision, for the next page: only decisions before it are returned; with
             `newest=False` only those after it.
@@ -194,18 +198,19 @@ class DecisionTable(CellTable):
     def overdue_to(self, within: int, since_version: int = 0) -> int:
         """Return the number up to which decisions are old enough for their checks to be overdue.
 
-        A check is overdue if its decision has this or a lower number, asked for the check, and has
-        no label. The number returned is the larger of two: the number of the newest decision minus
-        `within`, and the largest `NewLabel.overdue_to` among the stored labels. It is 0 if nothing
-        can be overdue yet.
+        Decisions are numbered 1, 2, ... in each cell. A check is overdue if its decision has this
+        or a lower number, asked for the check, and has no label. The number returned is the larger
+        of two: the number of the newest decision minus `within`, and the largest `overdue_to` of a
+        stored label, the number of the newest decision whose check was overdue when the rule was
+        updated with this label. It is 0 if nothing can be overdue yet.
 
         Parameters
         ----------
         within : int
             Number of later decisions after which a check is overdue.
         since_version : int, default 0
-            The version with which `within` came into force. If the newest decision is by an earlier
-            version, only the numbers of the labels count.
+            The model version with which `within` came into force. If the newest decision is by an
+            earlier version, or there is none, only the numbers of the labels count.
 
         Returns
         -------
@@ -225,7 +230,11 @@ class DecisionTable(CellTable):
     def tally(
         self, last: int | None = None, since_version: int = 0, within: int | None = None
     ) -> Tally:
-        """Count the cell's decisions in groups of equal action, reason, corrected label and so on.
+        """Count the cell's decisions in groups.
+
+        The decisions of a group are equal in action, in the action that the model alone would have
+        taken, reason, audit, quarantine, corrected label, the label's source, and whether a check
+        of that age would be overdue.
 
         Parameters
         ----------
@@ -239,7 +248,8 @@ class DecisionTable(CellTable):
         Returns
         -------
         Tally
-            With the groups in no order.
+            The groups, in no order, with the number of decisions in each; the times of the oldest
+            and newest of these decisions and of their newest label.
         """
         newest = n_decisions(self._database.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
@@ -281,10 +291,11 @@ class DecisionTable(CellTable):
 
         Parameters
         ----------
-        n : int
-            Without effect on stretches of time.
+        n : int, default 1
+            Number of stretches of decisions at most; without effect on periods of time.
         **by
-            `seconds` and `start` for periods of time; the arguments of `stretches_query`.
+            For periods of time: `seconds`, the length of a period, and `start`, a time in seconds
+            since 1970 at which a period begins (0.0 by default).
 
         Returns
         -------
@@ -300,15 +311,16 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         tally : Tally or None
-            All decisions of the cell counted in groups, if that was read already; None: it is read.
+            What `tally()` returned, if it was called already; None: it is called here.
 
         Returns
         -------
         dict
             decisions, labels: numbers; quarantined: number of decisions whose trace is kept out of
             training; corrected, forgotten: numbers of decisions whose label was corrected or
-            forgotten; actions, reasons, sources: dicts of numbers by value, 0 included. Forgotten
-            labels are not among labels, sources and corrected.
+            forgotten; actions, reasons: numbers of decisions by value, and sources: numbers of
+            labels by value, each a dict that includes values with 0. Forgotten labels are not among
+            labels, sources and corrected.
         """
         tally = tally or self.tally()
         actions = tally.by("action")

@@ -89,9 +89,9 @@ class Drainer:
     def fault(self) -> str:
         """Why the store cannot be written or read at present; "" if it can.
 
-        The first of these is given: a fault of the journal; the last error of the database, until a
-        later attempt succeeds; that the oldest record has waited for the database longer than
-        `limit` and than LAG_SECONDS (1 s).
+        The first of these is given: why the journal cannot be written; the last error of the
+        database, until a later attempt succeeds; that the oldest record has waited for the database
+        longer than `limit` (the seconds that a call waits at most) and than LAG_SECONDS (1 s).
         """
         fault = self._recorder.fault or self._error
         lag = self.lag
@@ -111,9 +111,10 @@ class Drainer:
     def drain(self) -> None:
         """Have everything recorded so far copied to the database, and wait for it.
 
-        Raise StoreError if this takes longer than `limit`, or as soon as the store has a `fault`.
-        The records then stay in the journal and are copied later. After a timeout the store has a
-        `fault` until the database takes records again.
+        If the database has everything, nothing is done. Raise StoreError if this takes longer than
+        `limit` seconds, or as soon as there is a `fault`, which is a reason why the store cannot be
+        used now. The records then stay in the journal and are copied later. After a timeout there
+        is a `fault` until the database takes records again.
         """
         with self._changed:
             if self.is_drained:
@@ -137,8 +138,9 @@ class Drainer:
     def pop_label_numbers(self) -> LabelNumbers:
         """Return (decision id, label number) of each label that was drained since the last call.
 
-        They are in the order in which they were drained. A report that repeats a stored label has
-        the number of that label. Without a product the list is empty.
+        To drain a label is to copy it from the journal to the database. The pairs are in the order
+        in which this was done. A report that repeats a stored label has the number of that label.
+        Without a product the list is empty.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -146,7 +148,7 @@ class Drainer:
         return numbers
 
     def submit(self, call: Callable[[], T]) -> Future[T]:
-        """Have the thread make a call, and return without waiting for it.
+        """Have this object's thread, which uses the database, make a call; do not wait for it.
 
         Before the call, the thread copies the records that are on the journal's disk to the
         database. If this fails, the call is made nevertheless.
@@ -159,7 +161,7 @@ class Drainer:
         Raises
         ------
         StoreError
-            If the store has a `fault` now; the call is then not made.
+            If the store cannot be used now (there is a `fault`); the call is then not made.
         """
         future: Future[T] = Future()
         with self._changed:
@@ -175,9 +177,10 @@ class Drainer:
         Raises
         ------
         StoreError
-            If the call takes longer than `limit`. It is then cancelled, so that it commits nothing.
-            A call that is already committing cannot be cancelled, and gets COMMIT_SECONDS more; if
-            StoreError is raised after these, the call may still have committed, or do so later.
+            If the call takes longer than `limit` seconds. It is then cancelled, so that it commits
+            nothing. A call that is already committing cannot be cancelled, and gets COMMIT_SECONDS
+            (2 s) more; if StoreError is raised after these, the call may still have committed, or
+            do so later.
         """
         if not wait([future], self._limit).done and not future.cancel():
             wait([future], COMMIT_SECONDS)
@@ -214,22 +217,23 @@ class Drainer:
         return not self._thread.is_alive()
 
     def _drain_before_use(self) -> None:
-        """Copy records to the database before it is used directly, so that all are seen.
+        """Copy the journal's records to the database before somebody reads or writes there.
 
-        It waits at most `limit` seconds. If the store is unavailable, nothing is raised here. In
-        the thread that drains, and once that was stopped, it does nothing.
+        `Database` calls this, so that all records are seen. It waits at most `limit` seconds. If
+        the store is unavailable, nothing is raised here. In the thread that does the copying, and
+        once `stop` was called, it does nothing.
         """
         if not self._stopped and threading.current_thread() is not self._thread:
             with suppress(StoreError):
                 self.drain()
 
     def _run(self) -> None:
-        """Copy the records on the journal's disk to the database, and make calls, until stopped.
+        """Copy the records on the journal's disk to the database, and make submitted calls.
 
-        Before a call all of these records are copied; if this fails, the call is made nevertheless.
-        An error of the database is logged once and kept for `fault`; a second later the database is
-        tried again. Once stopped, it ends when all submitted calls are made, and the records are
-        copied or the database has failed.
+        The thread runs this until `stop` is called. Before a call all of these records are copied;
+        if this fails, the call is made nevertheless. An error of the database is logged once and
+        kept for `fault`; a second later the database is tried again. Once stopped, it ends when all
+        submitted calls are made, and the records are copied or the database has failed.
         """
         while True:
             call = self._wait_for_work()
@@ -249,9 +253,10 @@ class Drainer:
     def _wait_for_work(self) -> tuple[Future[Any], Callable[[], Any]] | None:
         """Wait until there is a call, or until there are records and it is time to drain them.
 
-        Return the oldest call, None if there is none. Records are drained DRAIN_SECONDS after the
-        first of them came, or at once if somebody waits for the database, the journal is long, or
-        `stop` was called.
+        To drain records is to copy them to the database. Return the oldest submitted call, which
+        leaves the queue, or None if there is none. Records are drained DRAIN_SECONDS (0.25 s) after
+        the first of them came, or at once if somebody waits for the database, the journal is so
+        long that it is to be cleared, or `stop` was called.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._calls or self._recorder.synced or self._stopped)
@@ -280,10 +285,10 @@ class Drainer:
     def _drain_synced(self) -> None:
         """Copy all records that are on the journal's disk by now to the database.
 
-        They go in chunks of at most DRAIN_CHUNK. Later records go with them only if they still fit
-        into the last chunk. The journal's head is synced first. At the end the last error, which
-        `fault` shows, is cleared. Raise StoreError if the database fails: chunks that were
-        committed stay, and the last error is kept.
+        They go in chunks of at most DRAIN_CHUNK (500) records. Later records go with them only if
+        they still fit into the last chunk. The journal's head, the small file beside it, is synced
+        first. At the end the last error, which `fault` shows, is cleared. Raise StoreError if the
+        database fails: chunks that were committed stay, and the last error is kept.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:
@@ -293,14 +298,17 @@ class Drainer:
         self._error = ""
 
     def drain_chunk(self) -> None:
-        """Commit the oldest records that are on the journal's disk, at most DRAIN_CHUNK.
+        """Commit the oldest records that are on the journal's disk, at most DRAIN_CHUNK (500).
 
         There must be one. A decision is left out if a later record with the same id replaces it.
         Records that are damaged on disk are taken from memory and reported by an event. If a
         decision is not in memory either, it is lost, and the kind of that event is DATA_LOST, an
-        alarm. Journal, counters and index are then updated. Raise StoreError if the database fails;
-        nothing is updated then, and the next call commits the same records again, of which some may
-        be stored already.
+        alarm. Then the journal's header notes that the database has the records, `n_drained` counts
+        them, and they leave the queue of the recorder and, except for the newest decisions, the
+        `DecisionIndex`, by which decisions are found in memory. In a product the numbers of their
+        labels are kept for `pop_label_numbers`. Raise StoreError if the database fails; nothing of
+        this is done then, and the next call commits the same records again, of which some may be
+        stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))
@@ -358,8 +366,8 @@ class Drainer:
     def _make_call(self, future: Future[Any], call: Callable[[], Any]) -> None:
         """Make a submitted call; set the future's result or exception. Nothing is raised here.
 
-        A call that was cancelled before is not made. One that is cancelled while it runs is rolled
-        back; once it has begun to commit it cannot be cancelled.
+        A call whose future was cancelled before is not made. If the future is cancelled while the
+        call runs, its transaction is rolled back; once the call commits, it cannot be cancelled.
         """
 
         def is_wanted() -> bool:

@@ -34,8 +34,14 @@ class EventTable(CellTable):
 
         Parameters
         ----------
-        kind, text, data, author
-            As in `Event`.
+        kind : str
+            A word for the kind of the event.
+        text : str
+            What happened, for people.
+        data : mapping or None
+            The same for machines, with values that JSON has.
+        author : str, default ""
+            Who did it; "" for the engine itself.
 
         Raises
         ------
@@ -49,7 +55,7 @@ class EventTable(CellTable):
         return number
 
     def record_damage(self, text: str) -> None:
-        """Commit an event of kind "damaged", unless the cell has one with this text.
+        """Commit an event of kind "damaged" with this text, unless the cell has the same already.
 
         If the store cannot be written, the text is logged instead, and nothing is raised. Raise
         StoreError if it cannot be read.
@@ -81,13 +87,15 @@ class EventTable(CellTable):
         return [from_row(Event, row._mapping) for row in self._read(query)[::-1]]
 
     def acknowledge_losses(self, author: str = "") -> None:
-        """End the alarm about lost data by an event ACKNOWLEDGED; without an alarm write nothing.
+        """End the alarm about lost data by an event of kind ACKNOWLEDGED.
 
-        An event DATA_LOST is an alarm until a later ACKNOWLEDGED.
+        An event of kind DATA_LOST (records are lost) is an alarm until a later event of kind
+        ACKNOWLEDGED. Without an alarm nothing is written.
 
         Parameters
         ----------
         author : str
+            Who acknowledges the loss.
 
         Raises
         ------

@@ -71,8 +71,8 @@ class RecordInsertion:
         A record that is stored already changes nothing. A record that contradicts the store becomes
         a dead letter, an event that says what was in it. If the database refuses a value, the
         records are halved, each half in a transaction of its own, until the refused record is
-        alone; it becomes a dead letter, too. A dead letter has no label number. Raise StoreError if
-        the database fails in another way; halves that were committed before stay.
+        alone; it becomes a dead letter, too. A label that became a dead letter has no pair. Raise
+        StoreError if the database fails in another way; halves that were committed before stay.
         """
         try:
             return self._database.write(lambda connection: self._insert(connection, records))
@@ -93,7 +93,7 @@ class RecordInsertion:
         that had counted as good (`_is_late_stop`) corrects the label of that part. Return one pair
         (decision id, number) for each decision of which a label is among the records: the number of
         its first label, whether that is new, was stored before, or is corrected by a late stop. A
-        dead letter has no pair.
+        label that becomes a dead letter has no pair.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]
@@ -142,8 +142,9 @@ class RecordInsertion:
     ) -> dict[str, int]:
         """Insert new labels; return their numbers and those of the labels in `stored`, by decision.
 
-        `stored` has the rows of `CorrectionTable.stored_labels`. A label is quarantined (kept out
-        of training) if its decision is.
+        `stored` has a row for each decision of the new labels (`CorrectionTable.stored_labels`),
+        with the number `seq` of the label that it has, or None, and `quarantined`. A label is
+        quarantined (kept out of training) if its decision is. Nothing is committed.
         """
         rows = [
             to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
@@ -158,7 +159,8 @@ class RecordInsertion:
     ) -> None:
         """Insert events, and one "dead letter" for each problem, which is also logged as an error.
 
-        An event is left out if the cell has one with the same time, kind and text.
+        An event is left out if the cell has one with the same time, kind and text. Nothing is
+        committed.
         """
         new = []
         if events:
@@ -188,11 +190,14 @@ class RecordInsertion:
 def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLabels:
     """Sort labels by what the store does with them; nothing is written.
 
-    The first label of a decision is new. A second label that repeats success and source of the
-    first changes nothing. A late stop (`_is_late_stop`) corrects the first label; if this was
-    corrected to a failure already, it changes nothing. Any other second label is a problem. So is a
-    late stop whose first label was forgotten, and a label whose decision is not stored with the
-    same trace and time. `stored` has, by decision, the rows of `CorrectionTable.stored_labels`.
+    The result holds the labels to be inserted, the decisions that have or will have the label that
+    is reported, those whose label is to be corrected to a failure, and in words the labels that
+    contradict the store. The first label of a decision that has none is new. A second label that
+    repeats success and source of the first changes nothing. A late stop (`_is_late_stop`) corrects
+    the first label; if this was corrected to a failure already, it changes nothing. Any other
+    second label is a problem. So is a late stop whose first label was forgotten, and a label whose
+    decision is not stored with the same trace and time. `stored` has, by id, what is stored of the
+    decisions and their labels: the rows of `CorrectionTable.stored_labels`.
     """
     result = SortedLabels()
     for label in labels:
@@ -215,11 +220,11 @@ def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLa
 def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     """Return in words why the store cannot take a label; "" if it can.
 
-    `row` is the stored row of its decision, or None; `first` is the label that the decision has, or
-    None. The row must be there, with the same trace and time as the label's decision. A second
-    label is a problem, with two exceptions: it repeats the first, or it is a late stop, a line stop
-    of a part that was confirmed as good before. A late stop is a problem if a person had the first
-    label forgotten.
+    `row` is the stored row of its decision, or None. `first` is the label that the decision has, or
+    None; it is this row or a `NewLabel`. The row must be there, with the same trace and time as the
+    label's decision. A second label is a problem, with two exceptions: it repeats the first, or it
+    is a late stop, a line stop of a part that was confirmed as good before. A late stop is a
+    problem if a person had the first label forgotten.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"
@@ -247,7 +252,10 @@ def _differences(item: StoredDecision, row: Any) -> list[str]:
 
 
 def _describe(record: Record) -> str:
-    """Return a record (event, decision or label) in a few words, for the text of a dead letter."""
+    """Return in a few words what a record is, for the text of a dead letter.
+
+    They name a decision or a label by the decision's id, and an event by its text.
+    """
     if isinstance(record, Event):
         return f"an event, {record.text!r}"
     if isinstance(record, StoredDecision):

@@ -70,8 +70,8 @@ def encode_record(record: Record) -> bytes:
     """Return a record (decision, label or event) as bytes.
 
     They are the length of a JSON text, this text with the record's kind and fields, and the float32
-    values of a decision's trace or of a label's `point`. The frame that stands before each record
-    in a journal is not included.
+    values of a decision's trace or of a label's `point`, the embedding of the trace. The mark,
+    length, checksum and digest that stand before each record in a journal are not included.
     """
     if isinstance(record, StoredDecision):
         row = to_row(record.decision) | to_row(record, *OF_DECISION) | {"shape": record.trace.shape}
@@ -200,14 +200,14 @@ class Journal:
     def append(self, records: Sequence[bytes], time: float) -> list[int]:
         """Append encoded records behind the last one, and return when they are synced to the disk.
 
-        The head then names the newest of them; it is not synced, and if it cannot be written, that
-        is ignored. After an error the journal's end is where it was before, and the same records
-        can be appended again.
+        The head, a small file beside the journal, then names the newest of them; it is not synced,
+        and if it cannot be written, that is ignored. After an error the journal's end is where it
+        was before, and the same records can be appended again.
 
         Parameters
         ----------
         records : sequence of bytes
-            As `encode_record` returns them.
+            Each in the form that `encode_record` returns.
         time : float
             The present time, in seconds since 1970.
 
@@ -258,7 +258,8 @@ class Journal:
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
 
-        Raise StoreError if no intact record begins there, or if the disk cannot be read.
+        `decode_record` decodes it. Raise StoreError if no intact record begins there, or if the
+        disk cannot be read.
         """
         with _os_errors(self.path):
             record = self._read_record(offset)
@@ -272,7 +273,8 @@ class Journal:
     def undrained_records(self) -> Iterator[tuple[int, int, bytes]]:
         """Yield (offset, end, encoded record) of the records that the store lacks, oldest first.
 
-        Damaged records are skipped: the search goes on at the next one.
+        A record takes the bytes of the file from `offset` to before `end`. Damaged records are
+        skipped: the search goes on at the next record.
         """
         begin = self.drained_to
         while begin < self.end:
@@ -291,9 +293,10 @@ class Journal:
     def save_newest_entry(self, newest: EntryName | None) -> None:
         """Write to header and head the newest ledger entry, and which records the store holds.
 
-        Nothing is synced: an older header is harmless, since the store ignores a record that it is
-        given twice. Raise StoreError if the header cannot be written; a failure of the head is
-        ignored.
+        The header is the beginning of the journal, the head a small file beside it. `newest` is
+        number and digest of the ledger entry; None: there is none yet. Nothing is synced: an older
+        header is harmless, since the store ignores a record that it is given twice. Raise
+        StoreError if the header cannot be written; a failure of the head is ignored.
         """
         with self._describing, _os_errors(self.path):
             self.head.newest = newest
@@ -301,7 +304,10 @@ class Journal:
             self._write_head()
 
     def _write_head(self) -> None:
-        """Write the head as this journal now is, without a sync; a failure is ignored."""
+        """Write the attribute `head` to the small file beside the journal, without a sync.
+
+        The file is created if need be, and stays open. A failure is ignored.
+        """
         # An older head is harmless. The file stays open, since each report writes it.
         with suppress(OSError, ValueError):  # ValueError: closed by another thread meanwhile
             if self._head_file is None:
@@ -311,7 +317,7 @@ class Journal:
             self._head_file.write(_pack_fields(vars(self.head)).ljust(HEADER))
 
     def clear(self) -> None:
-        """Remove all records, drained or not; the caller has made sure that the store holds them.
+        """Remove all records; the caller has made sure that the store holds them.
 
         The file is cut off behind its header, and space is reserved and synced again. Raise
         StoreError if the file cannot be written.
@@ -326,7 +332,7 @@ class Journal:
         self.reserve()
 
     def reserve(self) -> None:
-        """Reserve disk space for at least RESERVE bytes of records, and sync that.
+        """Reserve disk space for at least RESERVE bytes (8 MiB) of records, and sync that.
 
         On a full disk nothing is reserved, and no error raised; StoreError if the sync fails.
         """
@@ -336,9 +342,9 @@ class Journal:
     def recreate(self) -> None:
         """Create a new file at the path of a journal that was deleted, moved or replaced.
 
-        The records that are not drained are copied from the lost file to the same offsets. Raise
-        StoreError if the new file cannot be written, or another engine has locked it; the journal
-        then still uses the lost one.
+        The records that the store lacks are copied to the same offsets from the lost file, which is
+        still open and is then closed. Raise StoreError if the new file cannot be written, or
+        another engine has locked it; the journal then still uses the lost one.
         """
         lost = self._file
         self._file = _open_file(self.path)
@@ -355,12 +361,12 @@ class Journal:
             lost.close()
 
     def close(self, waiting: bool = True) -> None:
-        """Cut off the reserved space, and the records if all are drained; close, unlock the file.
+        """Cut off the reserved space, and the records if the store has all; close, unlock the file.
 
-        With `waiting=False` the file is not synced, and the records stay even if all are drained.
+        With `waiting=False` the file is not synced, and the records stay even if the store has all.
 
         The header stays in the file, so that the next engine can compare it with the ledger. A
-        journal that was opened for reading is only closed, and so is one whose disk fails.
+        journal that was opened for reading is only closed, and so is a journal whose disk fails.
         """
         if self._owning and not self._file.closed:
             with suppress(OSError):
@@ -374,9 +380,10 @@ class Journal:
         self._file.close()
 
     def _write_header(self) -> None:
-        """Write the header, HEADER bytes: MAGIC, then JSON, padded with zeros.
+        """Write the header, the first 256 bytes: MAGIC, then JSON, padded with zeros.
 
-        The JSON has this process as the owner, the drained records and the newest ledger entry.
+        The JSON has this process as the owner, the number of the records that the store has, the
+        offset behind them, and the newest ledger entry. Raise OSError if it cannot be written.
         """
         fields = {
             "owner": describe_process()[:60],
@@ -392,11 +399,11 @@ class Journal:
         self.reserve()
 
     def _scan(self) -> None:
-        """Read header, head and all undrained records, and set the attributes that describe them.
+        """Read header, head and all records that the store lacks; set the journal's attributes.
 
-        With a damaged header all records count as undrained. Damage and missing records are put
-        into `loss` and `dropped`, not raised. Nothing is written. Raise StoreError if the file is
-        no journal.
+        With a damaged header the store counts as lacking every record. Records that are damaged or
+        missing are described in `loss`, and the bytes of an unfinished record counted in `dropped`;
+        they are not raised. Nothing is written. Raise StoreError if the file is no journal.
         """
         head = self.head
         fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
@@ -446,9 +453,10 @@ class Journal:
         self.head = Head(fields["newest"], n_drained, n_synced, newest, head.time)
 
     def _read_record(self, offset: int) -> bytes | None:
-        """Return the encoded record at an offset, without its frame (length, CRC-32, digest).
+        """Return the encoded record at an offset, without what stands before it in the file.
 
-        None if no record begins there, or if it is cut off or its CRC-32 differs.
+        That is a mark, the length, the CRC-32 and a digest, which is not checked here. Return None
+        if no record begins there, or if it is cut off or its CRC-32 differs.
         """
         frame = self._file.read(FRAME.size, offset)
         if len(frame) < FRAME.size or not frame.startswith(MARK):
@@ -470,17 +478,20 @@ def _chain_digest(previous: bytes, record: bytes) -> bytes:
 
 
 def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
-    """Context manager that raises StoreError, with the path and advice, for an OSError in it."""
+    """Context manager that raises StoreError, with the path and advice, for an OSError in it.
+
+    The advice is about writing the journal, or if `owning` is False about reading it.
+    """
     do = "free some space there, or make its folder writable"
     do = do if owning else "read it as the user that its cell runs as"
     return instead(StoreError, f"Could not use the journal {path}", OSError, do=do)
 
 
 def _open_file(path: Path, owning: bool = True) -> OwnedFile:
-    """Open a journal's file, and lock it if `owning`; it is then created if need be.
+    """Open a journal's file: locked, for writing, and created if need be; or only for reading.
 
-    Raise StoreError if the system refuses, or if another engine has locked it; the message then
-    names that engine's process.
+    If `owning` is False, it is only read, and not locked. Raise StoreError if the system refuses,
+    or if another engine has locked it; the message then names that engine's process.
     """
     with _os_errors(path, owning):
         try:
@@ -545,9 +556,9 @@ def read_undrained(path: Path) -> tuple[list[Record], Journal]:
     """Return the records of a journal that its store has not taken, and the journal, closed.
 
     The records are oldest first. If several decisions have one id, only the last is returned.
-    Damaged records are left out; `loss` of the journal says so. Nothing is locked or changed, so an
-    engine may be using the journal. Raise StoreError if the file cannot be read or is no journal,
-    and for a record that another release of dengine wrote.
+    Damaged records are left out; the journal's attribute `loss` says so. Nothing is locked or
+    changed, so an engine may be using the journal. Raise StoreError if the file cannot be read or
+    is no journal, and for a record that another release of dengine wrote.
     """
     journal = Journal(path, owning=False)
     try:
@@ -582,9 +593,11 @@ def _pack_fields(fields: dict[str, Any]) -> bytes:
 
 
 def _unpack_fields(content: bytes) -> dict[str, Any]:
-    """Return the fields of a header or head; raise one of the types in DAMAGES if it is damaged.
+    """Return the fields of a header or head, by name; raise one of DAMAGES if it is damaged.
 
-    The CRC-32 is compared only if there is one: headers of earlier releases have none.
+    DAMAGES are ValueError, LookupError and TypeError. The field "newest", which names the newest
+    ledger entry, becomes a pair (number, digest) or None. The CRC-32 is compared only if there is
+    one: headers of earlier releases have none.
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):
@@ -617,7 +630,10 @@ def describe_process() -> str:
 
 
 def owned_error(owner: str, name: str) -> StoreError:
-    """Return the StoreError for an engine whose cell another engine owns; it names that owner."""
+    """Return the StoreError for an engine whose cell another engine owns.
+
+    `owner` describes the other engine's process, and `name` what it owns; the message has both.
+    """
     return StoreError(
         f"Expected a cell that no other engine runs on, but {owner} owns {name}; close that engine "
         "first, ask its page or its HTTP where it is served, or give this one a cell_id of its own."

@@ -84,11 +84,11 @@ class JournalledStore(Outbox):
     def _compare_with_ledger(self) -> None:
         """Check that the store's ledger has the entries that the journal and its head name.
 
-        If one is missing, the store was cut off or restored from an older copy: an event DATA_LOST
-        (an alarm) is stored, and all records of the journal count as undrained, so that they are
-        copied to the database again. An event that is no alarm is stored if the journal or its head
-        is new or damaged though the store is not new. Raise StoreError only if the database cannot
-        be read or written.
+        The head is a small file beside the journal. If an entry is missing, the store was cut off
+        or restored from an older copy: an event DATA_LOST (an alarm) is stored, and all records of
+        the journal will be copied to the database again. An event that is no alarm is stored if the
+        journal or its head is new or damaged though the store is not new. Raise StoreError only if
+        the database cannot be read or written.
         """
         journal = self._journal
         database = self.store.database
@@ -111,7 +111,7 @@ class JournalledStore(Outbox):
     def _drain_leftovers(self) -> None:
         """Copy to the database what an earlier process left in the journal, and clear the journal.
 
-        If records are damaged or missing in the journal, an event DATA_LOST says so, which is an
+        If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
         alarm until a person acknowledges it. Otherwise, if a killed process left an unfinished
         record, which was cut off, an event that is no alarm says so. Raise StoreError if the
         database fails, or another release wrote a record; the records that were not copied then
@@ -138,10 +138,11 @@ class JournalledStore(Outbox):
         self._journal.clear()
 
     def _begin_check(self) -> None:
-        """Check the store's integrity; a difference is put into `integrity_error`, and logged.
+        """Compare the store with its ledger; put a difference into `integrity_error`, and log it.
 
-        SQLite's own check of the file runs in a thread. It is waited for only CHECK_SECONDS; later
-        it may still set `integrity_error`. Raise StoreError if the database cannot be read.
+        While there is an `integrity_error`, every part is verified. SQLite's own check of the file
+        runs in a thread. It is waited for only CHECK_SECONDS (0.1 s); later it may still set
+        `integrity_error`. Raise StoreError if the database cannot be read.
         """
         check = threading.Thread(
             target=lambda: self._note_integrity(self.store.database.check_pages()), daemon=True
@@ -171,11 +172,11 @@ class JournalledStore(Outbox):
     # What the engine records
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
-        """Record a decision in memory, for a thread to write, and return it with its number.
+        """Record a decision in memory, return a copy with its number; a thread writes it to disk.
 
-        If its id has a decision in memory, that one is returned, and nothing is recorded. If 10,000
-        records wait for the disk, nothing is recorded either: `item` is returned as it came, and
-        `find_decision` raises StoreError for its id.
+        The number is the cell's next one. If its id has a decision in memory, that decision is
+        returned, and nothing is recorded. If 10,000 records wait for the disk, nothing is recorded
+        either: `item` is returned unchanged, and `find_decision` raises StoreError for its id.
         """
         id_ = item.decision.id
         with self._changed:
@@ -194,10 +195,11 @@ class JournalledStore(Outbox):
     def replace_decision(self, item: StoredDecision) -> StoredDecision:
         """Record a decision in the place of an earlier one that is not on disk yet, and return it.
 
-        The new decision keeps time, trace and number of the earlier one. If the earlier one is on
-        disk by now, nothing is recorded, and the earlier one is returned. Raise KeyError for an id
-        that is neither in memory nor in the journal, and StoreError if the journal is damaged where
-        the earlier decision stands.
+        Both have the same id. What is recorded and returned is a copy of `item` with time, trace
+        and number of the earlier decision. If the earlier one is on disk by now, nothing is
+        recorded, and the earlier one is returned. Raise KeyError for an id that is neither in
+        memory nor in the journal, and StoreError if the journal is damaged where the earlier
+        decision stands.
         """
         id_ = item.decision.id
         with self._changed:
@@ -211,7 +213,11 @@ class JournalledStore(Outbox):
         return item
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
-        """Record labels in memory, each with the present time and its decision's hash and time."""
+        """Record copies of labels in memory, for a thread to write to the journal.
+
+        `labels` holds pairs of a decision and its label. Each copy gets the present time, and the
+        content hash and time of its decision.
+        """
         with self._changed:
             for item, label in labels:
                 label = self._completed(item, label)
@@ -244,8 +250,8 @@ class JournalledStore(Outbox):
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
         """Return a decision with its label from memory, journal or database, or None if unknown.
 
-        A label that is not on disk yet is returned only with `unsynced`. Raise StoreError if the
-        database is needed and does not answer within `limit` seconds, or if the stored trace is
+        A label that is not on disk yet is left out, unless `unsynced` is True. Raise StoreError if
+        the database is needed and does not answer within `limit` seconds, or if the stored trace is
         damaged. Raise it also for an id whose last decision was VERIFY and was not recorded,
         because the id could not be looked up or the disk hung.
         """
@@ -281,9 +287,9 @@ class JournalledStore(Outbox):
     def load_ids(self) -> None:
         """Read the ids of all decisions from the database into a Bloom filter in memory.
 
-        It takes about a second for a million ids; other calls to this outbox may go on meanwhile.
-        Once all are loaded, another call does nothing. Raise StoreError if the database cannot be
-        read.
+        By the filter most new ids are recognized without the database. It takes about a second for
+        a million ids; other calls to this outbox may go on meanwhile. Once all are loaded, another
+        call does nothing. Raise StoreError if the database cannot be read.
         """
         if self._index.has_all_ids:
             return
@@ -293,9 +299,10 @@ class JournalledStore(Outbox):
         self._index.has_all_ids = True
 
     def _load_ids(self) -> None:
-        """Load the ids, again after each failure, until that succeeds or the outbox is closed.
+        """Load the ids of all decisions (`load_ids`), and try again a second after each failure.
 
-        Until then every new id is looked up in the database.
+        It ends when that succeeds or the outbox is closed. Until then each id that is not in memory
+        is looked up in the database.
         """
         while not self._closed and not self._index.has_all_ids:
             try:
@@ -320,12 +327,14 @@ class JournalledStore(Outbox):
         return self._drainer.wait_for_result(future)
 
     def close(self) -> None:
-        """Drain, end the threads, close store and journal, within seconds unless `patient`.
+        """Copy the records to the database, end the threads, close store and journal.
 
-        Records that the database does not take stay in the journal, and the next engine drains
-        them. Records that the disk does not take are given up, and an error is logged; no report of
-        them was acknowledged. If the disk hangs, store and journal stay open, and the cell is owned
-        until the process ends. A second call does nothing, nor does one in a forked process.
+        This ends within seconds, unless the outbox is `patient`, so that it waits for the disk and
+        the database without a time limit. Records that the database does not take stay in the
+        journal, which is logged, and the next engine copies them. Records that the disk does not
+        take are given up, and an error is logged; no call has said that they are on disk. If the
+        disk hangs, store and journal stay open, and the cell is owned until the process ends. A
+        second call does nothing, nor does one in a forked process.
         """
         if not self.is_usable:
             return
@@ -354,7 +363,7 @@ class JournalledStore(Outbox):
         return self._drainer.stop(seconds) and has_recorder_ended
 
     def _leave_store(self, can_close: bool) -> None:
-        """Log that the journal holds records that the database lacks.
+        """Log that the journal holds records that the database lacks, and why.
 
         If `can_close` (the disk answers), disconnect and close the journal without waiting, so that
         another engine can own the cell. If not, both stay open until the process ends.

@@ -88,6 +88,7 @@ class LabelTable(CellTable):
         Returns
         -------
         LabelledTraces
+            Numbers of the labels, traces, labels (1 or 0) and content hashes, as arrays.
 
         Raises
         ------
@@ -128,9 +129,10 @@ class LabelTable(CellTable):
     ) -> tuple[LabelledTraces, list[str]]:
         """Read the traces of label rows, which are sorted by number, oldest first.
 
-        `scope` says of which cells the rows are. Return the labelled traces in this order, and the
-        ids of decisions whose traces are missing or not as they were stored; these are left out.
-        Raise StoreError if traces have different shapes, or a label is not 0 or 1.
+        `scope` is the cell, or the cell with its product, whose labels the rows are. Return the
+        labelled traces in this order, and the ids of decisions whose traces are missing or not as
+        they were stored; these are left out. Raise StoreError if traces have different shapes, or a
+        label is not 0 or 1.
         """
         labels = {row.seq: row for row in rows}  # the forgotten are not among them
         traces: dict[int, TraceArray] = {}
@@ -184,6 +186,7 @@ class LabelTable(CellTable):
         Returns
         -------
         list of PastLabel
+            Each label with the bounds of its decision and what else a rule is updated with.
             Corrections are not applied.
         """
         query = (
@@ -216,16 +219,17 @@ class LabelTable(CellTable):
         since_version : int, default 0
             Only of decisions by this version or a later one.
         overdue_to : int, default 0
-            Up to this decision number a check without a label is overdue, which counts as an error
-            until its label comes; 0: none is. All overdue checks are included, whatever `seq` is:
-            each adds an outcome for each side, success and failure, for which its part had evidence
-            (`overdue_outcomes`). These outcomes stand where the running engine updated the rule
-            with them: before the first label whose stored `overdue_to` is not below the decision's
-            number, else at the end.
+            Up to this decision number a check without a label is overdue, and its decision counts
+            as wrong until its label comes; 0: none is. All overdue checks are included, whatever
+            `seq` is: each adds an outcome "failure" if the lower bound of its decision is above 0,
+            and an outcome "success" if the upper bound is below 1 (`overdue_outcomes`). These
+            outcomes stand where the running engine updated the rule with them: before the first
+            label that came when this check was overdue already, else at the end.
 
         Returns
         -------
         list of OutcomeRecord
+            Bounds of the decision, label, what the model alone would have done, and so on.
         """
         label = corrected_label()
         novel = DECISION.c.reason == Reason.NOVEL.value
@@ -290,10 +294,11 @@ class LabelTable(CellTable):
         )
 
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
-        """Record as damage that the trace or label of some decisions was left out.
+        """Write an event to the store that says that some traces or labels were left out.
 
-        `damaged` has the decisions' ids, and `part` is "trace" or "label". Nothing happens without
-        decisions.
+        `damaged` has the ids of their decisions, and `part` says what is damaged, "trace" or
+        "label". Nothing is written without ids, or if the cell has the same event already. If the
+        store cannot be written, this is logged instead.
         """
         if damaged:
             self._events.record_damage(

@@ -131,7 +131,9 @@ def ledger_key() -> bytes:
 
 
 def check_key(connection: sa.Connection, cell_id: str, key: bytes, begin: bool = False) -> None:
-    """Check that a cell's ledger was begun with this key.
+    """Check that a cell's ledger was begun with this key, or without a key.
+
+    With a key, the digest of each ledger entry is an HMAC that nobody can compute without it.
 
     Parameters
     ----------
@@ -174,7 +176,7 @@ def newest_entry(connection: sa.Connection, cell_id: str) -> Any:
     """Return a row (number, digest, chains) of a cell's newest ledger entry; None if it has none.
 
     `digest` is 32 bytes. `chains` is JSON: by the name of each table that an engine reads at its
-    start, the table's chain, a running digest over all rows that it has so far.
+    start, the table's chain, a digest over all rows that it has so far.
     """
     return connection.execute(
         sa.select(*LEDGER.c["number", "digest", "chains"])
@@ -373,7 +375,7 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     Returns
     -------
     str
-        The first difference, in words; "" if there is none.
+        The first difference, in words; "" if there is none. It is returned and not raised.
     """
     try:
         check_key(connection, cell_id, key)
@@ -407,12 +409,13 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
 def _find_table_error(
     connection: sa.Connection, cell_id: str, name: str, first: int, last_entry: int, chained: str
 ) -> str:
-    """Compare a table's rows with the ledger; return the first difference in words, or "".
+    """Compare a cell's rows of the table `name` with the ledger.
 
-    A difference is a row whose values do not fit its stored sum, or rows that were removed, added
-    or replaced. `chained` is the digest over all rows of the table that ledger entry `last_entry`
-    has. Rows of later entries are not read, since another connection may write meanwhile. Reading
-    begins at number `first`, or at an earlier row that belongs to the same ledger entry.
+    Return the first difference in words, or "". A difference is a row whose values do not fit its
+    stored sum, or rows that were removed, added or replaced. `chained` is the chain of the table,
+    the digest over all its rows so far, that ledger entry `last_entry` has. Rows of later entries
+    are not read, since another connection may write meanwhile. Reading begins at number `first`, or
+    at an earlier row that belongs to the same ledger entry.
     """
     number = IN_FORCE[name]
     table = number.table
@@ -465,11 +468,12 @@ def _chain_statement(
     """Add rows that are about to be inserted to the transaction's ledger entry.
 
     SQLAlchemy calls this before it executes a statement. The parameters are in `many`, a list of
-    rows, or in `single`, one row. Return the statement with its parameters. Rows for a table of
-    CHAINED get the number of the entry and their sum. All other statements, and all those outside a
-    write transaction of `Database`, are returned unchanged; if settings are written, the entry
-    notes it. Raise StoreError for an insert into a table of CHAINED whose rows are inside the
-    statement instead of its parameters.
+    rows, or in `single`, one row; `options` are not used. Return the statement with its parameters.
+    Copies of rows for a table of CHAINED, whose rows the ledger covers, get the number of the entry
+    and their sum. All other statements, and all those outside a write transaction of `Database`,
+    are returned unchanged; if settings are written, the entry will have a copy of them all. Raise
+    StoreError for an insert into a table of CHAINED whose rows are inside the statement instead of
+    its parameters.
     """
     entry: LedgerEntry | None = connection.get_execution_options().get("dengine_entry")
     if entry is None or not isinstance(statement, sa.Insert | sa.Update | sa.Delete):

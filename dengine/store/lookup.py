@@ -50,9 +50,10 @@ class BloomFilter:
         return bool((self._bytes[byte] & bit).all())
 
     def _bit_positions(self, ids: Iterable[str]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the four bits of each id, each as an index of a byte and a byte with one bit set.
+        """Return the four bits of the filter that belong to each id.
 
-        Both arrays have four entries per id; the second has dtype uint8.
+        The first array has the index of the byte in which a bit is, the second a byte in which only
+        this bit is set. Both arrays have four entries per id; the second has dtype uint8.
         """
         digests = bytearray()
         for id_ in ids:
@@ -94,7 +95,8 @@ class DecisionIndex:
     def add(self, record: Record, entry: Entry) -> None:
         """Add a record that was just recorded; an event, which has no id, changes nothing.
 
-        If there are more than N_RECENT decisions in memory, the oldest is dropped from memory.
+        `entry` says where the record is, in memory or in the journal. If there are more than
+        N_RECENT decisions (1,000) in memory, the oldest is dropped from memory.
         """
         if isinstance(record, StoredDecision):
             id_ = record.decision.id
@@ -113,8 +115,8 @@ class DecisionIndex:
     def remove_drained(self, entry: Entry) -> None:
         """Remove a record that the database has now, or that is lost.
 
-        The newest N_RECENT decisions stay in memory. If the record is a label, its decision there
-        gets the label.
+        `entry` says which record. The newest N_RECENT decisions (1,000) stay in memory. If the
+        record is a label, its decision there is replaced by a copy with the label.
         """
         if not self.is_replaced(entry):
             self._decisions.pop(entry.decision_id, None)
@@ -135,11 +137,12 @@ class DecisionIndex:
         Returns
         -------
         decision : StoredDecision or None
-            From the newest N_RECENT decisions, drained or not, or from the journal if it is not
-            drained; otherwise None. A label that is drained stands in it.
+            From the newest N_RECENT decisions (1,000) in memory, or from the journal if the
+            database lacks it; otherwise None. In memory it has its label, if the database has the
+            label.
         label : NewLabel or None
-            The undrained label of the decision. None if there is none, or if it is not on disk yet
-            and `unsynced` is False.
+            The label of the decision, if the database lacks it. None if there is none, or if it is
+            not on disk yet and `unsynced` is False.
 
         Raises
         ------

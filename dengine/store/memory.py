@@ -50,7 +50,7 @@ class MemoryStore(Outbox):
         store.database.before_use = self._write
 
     def _write(self) -> None:
-        """Write the versions and records that wait in memory to the database.
+        """Write the model versions and the records that wait in memory to the database.
 
         It is called before each use of the store, and when 40 versions wait. Raise StoreError if
         the database cannot be written; what was not written by then is lost.
@@ -66,7 +66,10 @@ class MemoryStore(Outbox):
             self.store.apply_records(part)
 
     def record_decision(self, item: StoredDecision) -> StoredDecision:
-        """Keep a decision in memory, and return it with the next number; no id is looked up."""
+        """Keep a copy of a decision with the cell's next number in memory, and return it.
+
+        That its id is new is not checked.
+        """
         self.n_decisions += 1
         item = replace(item, number=self.n_decisions)
         self._unwritten.append(item)
@@ -78,7 +81,11 @@ class MemoryStore(Outbox):
         raise KeyError(item.decision.id)
 
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
-        """Keep labels in memory, each with the present time and its decision's hash and time."""
+        """Keep copies of labels in memory; `labels` holds pairs of a decision and its label.
+
+        Each copy gets the present time, and the content hash and time of its decision. A decision
+        that is still in memory is replaced by a copy with the label.
+        """
         for item, label in labels:
             label = self._completed(item, label)
             self._unwritten.append(label)
@@ -107,11 +114,12 @@ class MemoryStore(Outbox):
     ) -> Future[int]:
         """Keep a retrain with copies of its arrays in memory; the future that is returned is done.
 
-        Its result is the report's version number. The retrain is written to the database together
-        with the other records, when somebody uses the store, or when 40 retrains wait: packing a
-        retrain takes as long as many decisions. Raise StoreError if `report.accepted` is True and
-        there are no arrays, for an array of Python objects, and if 40 retrains wait and the
-        database cannot be written.
+        `last_seq` is the number of the newest label that the retrain knew of, and `state` holds the
+        arrays by name. The result of the future is the report's version number. The retrain is
+        written to the database together with the other records, when somebody uses the store, or
+        when 40 retrains wait: packing a retrain takes as long as many decisions. Raise StoreError
+        if `report.accepted` is True and there are no arrays, for an array of Python objects, and if
+        40 retrains wait and the database cannot be written.
         """
         self._versions.append((report, last_seq, check_state(report, state), self.store.clock()))
         if len(self._versions) == MAX_UNWRITTEN_VERSIONS:

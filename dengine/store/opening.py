@@ -39,15 +39,16 @@ def open_store(
     Parameters
     ----------
     store : None, str, path or SqlStore
-        None: a store in memory. A file or URL: a database; a `CellAddress` (see `address`) also
-        names the cell and its product, otherwise the cell is "cell". A store is returned as it is.
+        None: a store in memory. A file or URL: a database; a `CellAddress`, a text that `address`
+        returns, also names the cell and its product, otherwise the cell is "cell". An open store is
+        returned unchanged.
     must_exist : bool, default False
         Raise a StoreError for a file or cell that does not exist, instead of creating it. Without
         effect on None and on an open store.
     wait : float or None
         Seconds that an engine on this store waits for the disk or database at most. None: the
-        environment's DENGINE_STORE_WAIT, or 0.4. Pass `LONG_WAIT` if no cell runs meanwhile. Not
-        used for a store in memory or an open one.
+        environment's DENGINE_STORE_WAIT, or 0.4. Pass `LONG_WAIT` (10) if no cell runs meanwhile.
+        Not used for a store in memory or an open one.
 
     Returns
     -------
@@ -82,7 +83,7 @@ def open_store(
 def opening(
     store: StoreLike | None, *, must_exist: bool = False, wait: float | None = None
 ) -> Iterator[SqlStore]:
-    """Context manager that opens a store with `open_store`, and yields it.
+    """Context manager that opens a store by `open_store`, with the same arguments, and yields it.
 
     The store stays open after the block. Only if the block raises, a store that was opened here is
     closed; a store that was passed open is never closed.

@@ -75,7 +75,10 @@ class Outbox(ABC):
         return os.getpid() == self._pid and not self._closed
 
     def check_usable(self) -> None:
-        """Raise a StoreError if the engine is closed, only reads, or was opened before a fork."""
+        """Raise a StoreError if the engine is closed, only reads, or was opened before a fork.
+
+        To use what was opened before a fork is an error only in the child process.
+        """
         if os.getpid() != self._pid:
             raise forked_error(self._pid, "the engine")
         if self._closed:
@@ -100,7 +103,9 @@ class Outbox(ABC):
         self._note_integrity(self.store.database.check_integrity(self._window, since))
 
     def _note_integrity(self, error: str) -> None:
-        """Set `integrity_error` and log it, unless it is set already; "" changes nothing.
+        """Set `integrity_error` to what in the store is not as it was written, and log it.
+
+        If it is set already, or `error` is "", nothing changes.
 
         From then on every part must be verified, until the store is opened again.
         """

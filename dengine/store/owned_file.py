@@ -19,9 +19,10 @@ LOCKED_BYTE = 2**31 - 2  # the last that the C library of Windows can lock
 
 
 def _lock_of_system() -> Callable[[int], object]:
-    """Return a function that locks a file's descriptor for this process, in this system's way.
+    """Return a function that locks an open file, given by its descriptor, for this process.
 
-    It does not wait: it raises BlockingIOError if another descriptor has the lock.
+    The function does not wait: it raises BlockingIOError if another descriptor has the lock. It is
+    `flock`, or on Windows the function of `_lock_of_windows`.
     """
     try:
         import fcntl
@@ -33,9 +34,10 @@ def _lock_of_system() -> Callable[[int], object]:
 
 
 def _lock_of_windows(msvcrt: Any) -> Callable[[int], object]:
-    """Return the function that locks a descriptor on Windows, and raises as `flock` does.
+    """Return a function that locks an open file, given by its descriptor, on Windows.
 
-    It locks one byte far behind the content, and moves the descriptor's offset there.
+    `msvcrt` is Python's module of that name. The function locks one byte far behind the content,
+    and moves the offset of the file there. It raises BlockingIOError if the byte is locked already.
     """
 
     def lock(descriptor: int) -> None:
@@ -96,7 +98,8 @@ class OwnedFile:
         """Create the file and its folder if need be, open and lock it; return the descriptor.
 
         If the file was deleted or replaced before it was locked, this starts again. Raise
-        BlockingIOError if it is locked already.
+        BlockingIOError if it is locked already, and OSError for a symbolic link and whatever else
+        the system refuses.
         """
         while True:
             self.path.parent.mkdir(parents=True, exist_ok=True)

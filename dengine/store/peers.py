@@ -59,11 +59,11 @@ def check_peer_settings(
     Parameters
     ----------
     settings, peer_settings : mapping of str to str
-        Of this cell and of the peer, as stored.
+        The stored settings of this cell and of the other one, the peer.
     name : str
-        Of the peer, for the error.
+        The peer's cell_id, for the error.
     product : str
-        For the error.
+        Name of the product, for the error.
 
     Raises
     ------
@@ -116,7 +116,9 @@ def check_cell_exists(url: str, cell_id: str) -> None:
 def list_cells(url: str) -> list[CellSummary]:
     """Return a summary of every cell of a database, sorted by cell_id.
 
-    Raise StoreError if it is no store. Nothing is written.
+    It has the cell's product, its numbers of decisions and labels, the newest version that was put
+    in force in the cell or its product, and the time of the newest decision or label. Raise
+    StoreError if the database is no store. Nothing is written.
     """
     accepted = (
         sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))

@@ -59,10 +59,10 @@ class Scope:
     def first_label(self, connection: sa.Connection, window: int) -> int:
         """Return a label number such that the newest `window` training labels are at or after it.
 
-        Training labels are those of traces that are not quarantined. 1 if there are fewer than
-        `window`. For a product the labels are not read, and the number is an estimate, 2 * `window`
-        below the newest: it may be below 1, and is too high if more than half of the newest labels
-        are no training labels.
+        Labels are numbered in the order in which they came; training labels are those of traces
+        that are not quarantined. 1 if there are fewer than `window`. For a product the labels are
+        not read, and the number is an estimate, 2 * `window` below the newest: it may be below 1,
+        and is too high if more than half of the newest labels are no training labels.
         """
         if self.product is not None:  # by their numbers, or all would be read to be sorted
             return self.newest(connection, LABEL.c.seq) + 1 - 2 * window
@@ -78,7 +78,8 @@ class Scope:
     def next_number(self, connection: sa.Connection, column: sa.Column[Any]) -> int:
         """Return the number of the next row of a table; nobody else gets it before the commit.
 
-        `column` is the table's column of numbers. Decisions and events are numbered by cell, and
+        `column` is the table's column of numbers, and `connection` is in a write transaction. The
+        number is one more than the largest so far. Decisions and events are numbered by cell, and
         the caller has locked the cell. All other rows are numbered by product, if the cell has a
         product, and this call locks the product.
         """
@@ -90,9 +91,10 @@ class Scope:
     def newest(
         self, connection: sa.Connection, column: sa.Column[Any], *conditions: sa.ColumnElement[bool]
     ) -> int:
-        """Return the largest number in a column over the rows of the cell, or of its product.
+        """Return the largest number in a column over the cell's rows.
 
-        With `conditions`, only over the rows that fulfil them all. 0 if there is none.
+        If the cell has a product, the rows of all cells of the product count. With `conditions`,
+        only over the rows that fulfil them all. 0 if there is none.
         """
         is_own = column.table.c.cell_id == self.cell_id
         query = sa.select(sa.func.max(column)).where(is_own, *conditions)
@@ -132,9 +134,10 @@ def newest_of(
 
 
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
-    """Return a cell's product, or None; enter a new cell into the product that is named.
+    """Return a cell's product, or None; make a new cell a cell of `product`.
 
-    An entered cell gets a new row in `setting`; the product is locked, and nothing is committed.
+    Such a cell gets a new row in the table `setting`; the product is locked until the transaction
+    ends, and nothing is committed.
 
     Parameters
     ----------
@@ -142,13 +145,13 @@ def join_product(connection: sa.Connection, cell_id: str, product: str | None) -
         In a write transaction.
     cell_id : str
     product : str or None
-        None: as the store says.
+        What the cell makes. None: what the store says, and nothing is written.
 
     Raises
     ------
     StoreError
         If the cell has another product, if the name is empty or not printable, and if the cell has
-        settings or labels already without a product: its labels have numbers of its own.
+        settings or labels already without a product: its labels were numbered without the others.
     """
     is_own = SETTING.c.cell_id == cell_id
     query = sa.select(SETTING.c.value).where(is_own, SETTING.c.key == PRODUCT_KEY)
@@ -216,8 +219,9 @@ def corrected_label(corrected_to: int | None = None) -> sa.ColumnElement[int | N
 def audit_columns() -> tuple[sa.ColumnElement[int], sa.ColumnElement[float]]:
     """Return two SQL columns of a decision: `predicted` and `inclusion_probability`.
 
-    `predicted` is what the model alone would have done, as an `ActionCode` (an integer).
-    `inclusion_probability` is `Decision.propensity` if the action is VERIFY, else 0.
+    `predicted` is what the model alone would have done, as an `ActionCode` (an integer): the
+    position of the action in ACTIONS. `inclusion_probability` is `Decision.propensity`, the
+    probability with which the part was to be verified, if the action is VERIFY, else 0.
     """
     positions = {action.value: position for position, action in enumerate(ACTIONS)}
     probability = sa.case(
@@ -241,9 +245,11 @@ SOURCE: sa.ColumnElement[str | None] = sa.case(
 
 
 def past_query(cell_id: str) -> sa.Select[Any]:
-    """Return the query for a cell's decisions with their corrected labels, for `read_decision`.
+    """Return the query for a cell's decisions with their corrected labels; it is not run.
 
-    Decisions without a label are included; traces are not. The rows are in no order.
+    `read_decision` reads its rows: all columns of a decision, and of its label success (None if it
+    was forgotten), source, number and time. Decisions without a label are included; traces are not.
+    The rows are in no order.
     """
     labels = (
         SUCCESS.label("success"),
@@ -259,11 +265,12 @@ def past_query(cell_id: str) -> sa.Select[Any]:
 
 
 def training_query(scope: Scope, corrected_to: int | None = None) -> sa.Select[Any]:
-    """Return the query for the labels that train: seq, success, content_hash, decision_id.
+    """Return the query for the labels that a model is trained on; it is not run.
 
-    Labels that were forgotten are left out, and so are labels of quarantined traces, which are
-    stored but never used in training. Corrections up to number `corrected_to` are applied; None:
-    all. Labels of all cells of the scope's product are included. The rows are in no order.
+    Its columns are seq (the label's number), success, content_hash and decision_id. Labels that
+    were forgotten are left out, and so are labels of quarantined traces, which are stored but never
+    used in training. Corrections up to number `corrected_to` are applied; None: all. The labels are
+    those of the cell that `scope` names, and of all cells of its product. The rows are in no order.
     """
     label = corrected_label(corrected_to)
     return sa.select(
@@ -299,8 +306,9 @@ def stretches_query(
     Returns
     -------
     sqlalchemy.Select
-        With the columns of `Stretch`, in their order. Stretches are sorted by their newest
-        decision.
+        With the columns of `Stretch`, in their order: the number of decisions, the time of the
+        newest, and how many were verified, novel, accepted, accepted and bad, rejected by the
+        model, and decided by a force limit. Stretches are sorted by their newest decision.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
     columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))

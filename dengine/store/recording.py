@@ -49,7 +49,10 @@ class Entry:
         return self.end > 0
 
     def place(self, offset: int, end: int) -> None:
-        """Note where the record stands in the journal; a decision is then dropped from memory."""
+        """Note where the record stands in the journal; a decision is then dropped from memory.
+
+        It takes the bytes from `offset` to before `end`. From now on `is_synced` is true.
+        """
         self.offset = offset
         self.end = end
         if self.decision_id:
@@ -100,9 +103,10 @@ class Recorder:
 
     @property
     def fault(self) -> str:
-        """Why the journal cannot be written: its last error, or a sync that exceeds the limit.
+        """Why the journal cannot be written: the last error, or that a sync takes too long.
 
-        "" if it can.
+        A sync takes too long if it lasts longer than `limit` seconds, an argument of `Recorder`. ""
+        if the journal can be written.
         """
         seconds = time.monotonic() - self._began
         if self._error or seconds <= self._limit:
@@ -116,9 +120,9 @@ class Recorder:
 
     @property
     def oldest(self) -> float | None:
-        """Time of recording of the oldest record that is not drained, by `time.monotonic`.
+        """Time of recording of the oldest record that the database lacks, by `time.monotonic`.
 
-        None if all are drained.
+        None if it lacks none.
         """
         for entries in (self.synced, self.unwritten):
             if entries:
@@ -126,7 +130,10 @@ class Recorder:
         return None
 
     def record(self, record: Record) -> Entry:
-        """Add a record in memory, wake the thread that writes it, and return its entry at once."""
+        """Add a record in memory, and wake the thread that writes it to the journal.
+
+        Return at once the record's `Entry`, which will say where it stands in the journal.
+        """
         id_ = record.decision.id if isinstance(record, StoredDecision) else ""
         entry = Entry(record, id_)
         with self.changed:
@@ -141,9 +148,10 @@ class Recorder:
         self.record(new_event(kind, text, self._clock()))
 
     def adopt(self, record: Record, offset: int, end: int) -> Entry:
-        """Add a record that an earlier process left in the journal, as recorded and synced.
+        """Add a record that an earlier process left in the journal; it counts as synced.
 
-        `offset` and `end` say where it stands there. The thread must not have been started.
+        It takes the bytes of the journal from `offset` to before `end`. Return its `Entry`, which
+        has these. The thread must not have been started.
         """
         entry = self.record(record)
         entry.place(offset, end)
@@ -160,8 +168,9 @@ class Recorder:
     def sync(self, seconds: float | None = None) -> None:
         """Wait until everything recorded so far is on the disk, at most `seconds`.
 
-        None: `limit` seconds. Raise NotTakenError if that takes longer, or a write fails meanwhile.
-        The records are not lost then: the thread tries to write them again.
+        None: `limit` seconds, an argument of `Recorder`. Raise NotTakenError if that takes longer,
+        or a write fails meanwhile. The records are not lost then: the thread tries to write them
+        again.
         """
         limit = self._limit if seconds is None else seconds
         with self.changed:
@@ -205,8 +214,10 @@ class Recorder:
     def _run(self, kept: object) -> None:
         """Write and sync new records in batches until stopped.
 
-        After an error, which is kept for `fault`, it wakes those who wait in `sync`, and tries the
-        same records again a second later, unless it was stopped: they then stay unwritten.
+        The thread runs this; `kept` is only kept alive by it. Before it ends, it writes the records
+        that wait. After an error, which is kept for `fault`, it wakes those who wait in `sync`, and
+        tries the same records again a second later, unless it was stopped: they then stay
+        unwritten.
         """
         while True:
             with self.changed:
@@ -231,12 +242,14 @@ class Recorder:
                     self.changed.wait(RETRY_SECONDS)
 
     def _write(self, batch: Sequence[Entry]) -> None:
-        """Append a batch to the journal, sync it, and move it from `unwritten` to `synced`.
+        """Append a batch of records to the journal, sync it, move them to the queue `synced`.
+
+        They are the oldest of the queue `unwritten`, and leave it.
 
         A journal of more than 8 MiB is cleared first, if the `Drainer` copies its last records to
-        the database within BATCH_SECONDS. If the journal's file was deleted, moved or replaced,
-        it is created again, and an event says so. Raise StoreError if the disk fails; the entries
-        then stay in `unwritten`.
+        the database within BATCH_SECONDS (0.05 s). If the journal's file was deleted, moved or
+        replaced, it is created again, and an event says so. Raise StoreError if the disk fails; the
+        entries then stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
@@ -265,8 +278,8 @@ class Recorder:
     def _recreate(self, error: LostJournalError) -> None:
         """Create a new file for a journal whose file was lost; log this, and record an event.
 
-        Records that the database lacks are copied into it. Raise StoreError if it cannot be
-        written.
+        Records that the database lacks are copied into it. `error` is the text of log and event.
+        Raise StoreError if the file cannot be written.
         """
         log.error("%s It is created again with what the store lacks.", error)
         with self.changed:  # nobody reads it or writes its header meanwhile

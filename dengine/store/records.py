@@ -117,7 +117,7 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 
 
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """Return an event's data as JSON gives it back, in a new dict; None for None.
+    """Return an event's data in a new dict, as if it was written to JSON and read; None for None.
 
     A tuple becomes a list, and a key that is a number a text. Raise StoreError for values that JSON
     does not have, NaN and infinity included.
@@ -497,7 +497,8 @@ class CellAddress(str):
 def address(store: FilePath, cell_id: str | None = None, product: str | None = None) -> str:
     """Return a store's file or URL as text; a `CellAddress` if a cell or product is given.
 
-    If only a product is given, the cell is named "cell".
+    A `CellAddress` is a text with the attributes `cell_id` and `product`. If only a product is
+    given, the cell is named "cell".
     """
     url = os.fspath(store)
     return (
@@ -509,8 +510,8 @@ def address(store: FilePath, cell_id: str | None = None, product: str | None = N
 def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
     """Return, by name, the type of each field of a record class, and whether it may be None.
 
-    The type is a plain one: that of `dict[str, int]` is `dict`. The result is cached; do not change
-    it.
+    A record class is a dataclass or NamedTuple with type hints. The type is a plain one: that of
+    `dict[str, int]` is `dict`. The result is cached; do not change it.
     """
     fields: dict[str, tuple[type, bool]] = {}
     for name, hint in get_type_hints(record_type).items():
@@ -547,6 +548,7 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
     Parameters
     ----------
     record_type : type
+        Class of the record, a dataclass or NamedTuple.
     row : mapping of str to value
         It may have more columns, and may lack those that are given or have a default.
     **given
@@ -594,10 +596,11 @@ def _to_column(value: Any, type_: type) -> Any:
 
 
 def _from_column(value: Any, type_: type) -> Any:
-    """Return the value of a field from its column, as `_to_column` wrote it.
+    """Return the value of a field from the column that `_to_column` wrote.
 
-    `type_` is the type of the field. A tuple must hold rows, and becomes a tuple of tuples. An
-    array becomes a flat one.
+    `type_` is the type of the field. None stays None, and a value of a str, int or float field is
+    returned unchecked. A tuple must hold sequences, and becomes a tuple of tuples. An array becomes
+    a flat array of float32. Raise ValueError or TypeError for a value that cannot be converted.
     """
     if value is None or type_ in (str, int, float):
         return value
@@ -629,8 +632,9 @@ def trace_row(item: StoredDecision) -> Row:
 def read_decision(row: Any) -> StoredDecision:
     """Return the decision of a row of the table `decision`, with its label and trace if selected.
 
-    Without the trace's columns its trace is NO_TRACE, of shape (0, 0). Raise StoreError for a field
-    that cannot be read. The trace must be intact (`is_intact`); another error is raised otherwise.
+    Without the trace's columns its trace has shape (0, 0). Raise StoreError for a field that cannot
+    be read. That the trace is as it was stored must have been checked (`is_intact`): another error
+    is raised for damaged bytes.
     """
     values = row._mapping
     trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in values else NO_TRACE
@@ -672,7 +676,8 @@ def to_npz(state: Arrays) -> bytes:
 def from_npz(blob: bytes, name: str) -> State:
     """Return the arrays that `to_npz` wrote, by name.
 
-    Raise StoreError, which names the store `name`, for anything else and for a pickle.
+    Raise StoreError for anything else and for a pickle; `name` is the name of the store, for the
+    message.
     """
     with instead(
         StoreError,

@@ -39,8 +39,8 @@ COLUMN_TYPES: dict[type, Any] = {
 def _columns(record: type, *names: str, key: str = "") -> list[sa.Column[Any]]:
     """Return new SQLAlchemy columns for the fields of a record class: for all, or only for `names`.
 
-    A field that may be None becomes a column that may be NULL. `key` names the field that is part
-    of the primary key.
+    A record class is a dataclass whose objects are stored as rows. A field that may be None becomes
+    a column that may be NULL. `key` names the field that is part of the primary key.
     """
     selected = {
         name: field for name, field in columns(record).items() if not names or name in names
@@ -154,8 +154,9 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     """Create the tables in an empty database, or check that they are those of a store.
 
     In PostgreSQL the tables of other programs may stand beside them. Columns that later versions of
-    dengine added (`ADDED`) are added to the tables of an older store. The cell is entered if it is
-    new. It does not commit.
+    dengine added (`ADDED`) are added to the tables of an older store. A new cell gets a row in the
+    table `setting`, with the version of the schema. The tables are locked until the transaction
+    ends, and nothing is committed.
 
     Parameters
     ----------
@@ -163,13 +164,13 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
         In a write transaction.
     cell_id : str
     name : str
-        Of the database, for the error.
+        Name of the database, for the error.
 
     Raises
     ------
     StoreError
-        For an SQLite file of another program, for another schema, and if a table or any other
-        column is missing.
+        For an SQLite file of another program, for another version of the schema, and if a table or
+        any other column is missing.
     """
     lock(connection, TABLES)  # two cells may create them at the same moment
     tables = set(sa.inspect(connection).get_table_names())
@@ -205,8 +206,8 @@ def _add_columns(connection: sa.Connection) -> None:
 def check_schema(connection: sa.Connection, name: str) -> None:
     """Raise a StoreError unless a database holds a store of this schema with all columns.
 
-    Columns that a later dengine added to the schema (ADDED) may be missing. `name` is the name of
-    the database, for the error.
+    The schema has a version, which each cell's settings name. Columns that a later dengine added to
+    the schema (ADDED) may be missing. `name` is the name of the database, for the error.
     """
     inspector = sa.inspect(connection)
     is_complete = True

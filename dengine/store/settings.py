@@ -35,9 +35,9 @@ class SettingTable(CellTable):
     def replace(self, connection: sa.Connection, settings: Mapping[str, str]) -> None:
         """Replace the engine's settings of the cell in a write transaction; nothing is committed.
 
-        The settings that the store itself keeps (`RESERVED`) stay; raise StoreError if `settings`
-        has one of them. Raise SettingError if another cell of the product would embed traces
-        differently. The product stays locked until the transaction ends.
+        `settings` holds texts by name. The settings that the store itself keeps (`RESERVED`) stay;
+        raise StoreError if `settings` has one of them. Raise SettingError if another cell of the
+        product would embed traces differently. The product stays locked until the transaction ends.
         """
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(

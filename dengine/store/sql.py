@@ -140,9 +140,13 @@ class SqlStore(AbstractContextManager["SqlStore"]):
     def claim_cell(self) -> Journal:
         """Claim the cell for this engine, and open its journal; `close` gives both up.
 
+        As long as the cell is claimed, no other engine can own it: the journal's file is locked,
+        and on a PostgreSQL server also the cell.
+
         Returns
         -------
         Journal
+            The cell's journal, created if need be.
 
         Raises
         ------
@@ -186,7 +190,10 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         return self._insertion.commit(records)
 
     def close(self) -> None:
-        """Disconnect from the database, and free the cell; a store in memory stays open."""
+        """Disconnect from the database; a store in memory stays open.
+
+        If an engine claimed the cell, its journal is closed, too, and another engine can own it.
+        """
         if not self.database.is_in_memory:
             self.database.close()
         if self._journal is not None:

@@ -161,6 +161,8 @@ def verify_history(
     Returns
     -------
     HistoryReport
+        For each cell the numbers of ledger entries, rows and records in its journal that the store
+        lacks, and the digest of the newest entry; and the faults of all cells.
 
     Raises
     ------
@@ -216,9 +218,10 @@ def verify_history(
 def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
     """Read a journal; nothing is raised if it is missing or damaged.
 
-    Return the ledger entries that it names, the number of records that its store has not taken, and
-    in words what it lost. If there is no journal, or it cannot be read, the head beside it gives
-    the ledger entry, the number is None and the text "".
+    Return the ledger entries that it names (number and digest), the number of records that its
+    store has not taken, and in words which records are damaged or missing, "" if none is. If there
+    is no journal, or it cannot be read, the head, a small file beside it, gives the ledger entry,
+    the number is None and the text "".
     """
     with suppress(StoreError):  # it is missing, damaged, or another user's
         records, journal = read_undrained(path)
@@ -228,9 +231,9 @@ def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
 
 
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
-    """Return the cell in a list, or all cells that any table names, sorted, if `cell_id` is None.
+    """Return `cell_id` in a list, or if it is None the ids of all cells in any table, sorted.
 
-    Raise StoreError for a cell that no table names. A table that cannot be read is left out.
+    Raise StoreError for a cell that no table has. A table that cannot be read is left out.
     """
     names: set[str] = set()
     for table in METADATA.tables.values():
@@ -283,8 +286,10 @@ class CellCheck:
     def run(self) -> list[HistoryFault]:
         """Read all rows of the cell, and return what is wrong, table by table; [] if nothing is.
 
-        Fill `digests` and `rows`, and call `on_rows`. A database error is a fault, too, and not
-        raised.
+        Fill `digests`, the digests of the ledger's entries, and `rows`, the number of rows read,
+        and call `on_rows` with the number of rows just read. A database error is a fault, too, and
+        not raised; after one, it is not checked whether decisions, traces and labels belong
+        together.
         """
         faults = [
             fault
@@ -308,7 +313,8 @@ class CellCheck:
     ) -> Iterator[HistoryFault]:
         """Yield the faults of a check; a database error ends the check and is yielded as a fault.
 
-        After such an error `run` does not look for missing rows.
+        `table` is the name of the table that this fault is about. After such an error `run` does
+        not look for missing rows.
         """
         try:
             yield from faults
@@ -340,8 +346,8 @@ class CellCheck:
         has a sum of its own, and a fault of its own.
 
         The sums of every row with an entry, also of a changed one, are kept for `_check_ledger`.
-        Each row adds 1 to `rows`. After each CHUNK rows `on_rows` is called; `run` calls it once
-        more for the rows after the last CHUNK.
+        Each row adds 1 to `rows`. After every 500th row (CHUNK) `on_rows` is called with 500; `run`
+        calls it once more with the number of the rows that are left.
         """
         for row in self._read_raw(table):
             self.rows += 1
@@ -368,8 +374,10 @@ class CellCheck:
     def _check_ledger(self) -> Iterator[HistoryFault]:
         """Yield a fault for each ledger entry that was changed or is missing; fill `digests`.
 
-        An entry must fit the digest of the entry before, and the sums of its rows, which
-        `_check_rows` has read. Only the first 20 missing entries are yielded.
+        `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
+        digest of the entry before, and the sums of its rows, which `_check_rows` has read. After an
+        entry that was changed, only this entry is a fault. Only the first 20 missing entries are
+        yielded.
         """
         sums = {table: np.frombuffer(packed, SUMS) for table, packed in self._sums.items()}
         sums = {
@@ -411,8 +419,8 @@ class CellCheck:
     def _check_settings(self) -> Iterator[HistoryFault]:
         """Yield a fault for each setting that was changed, or is only in the table or the ledger.
 
-        If the setting with the schema's version is missing (no engine has opened the cell), that is
-        a fault, too.
+        The ledger has a copy of the cell's settings. If the setting with the version of the tables
+        is missing (no engine has opened the cell), that is a fault, too.
         """
         for key, problem in find_settings_faults(self.connection, self.cell_id).items():
             yield self._fault(SETTING.name, key, problem)
@@ -431,7 +439,7 @@ class CellCheck:
     def _check_pairs(self, table: sa.Table, required: sa.Table) -> Iterator[HistoryFault]:
         """Yield a fault for each row of `table` that needs a row in `required` and has none.
 
-        The table of the fault is `required`.
+        The row that is needed has the same decision id. The fault names the table `required`.
         """
         key = table.c[KEY[table.name]]
         required_key = required.c[KEY[required.name]]

@@ -54,9 +54,10 @@ class VersionTable(CellTable):
         state: Arrays | None,
         time: float | None = None,
     ) -> int:
-        """Commit a retrain; if it is accepted, delete the states that are no longer kept.
+        """Commit a retrain; if its version is accepted, delete states that are no longer kept.
 
-        These are the arrays of older versions, by `keeps_state`.
+        A state is the stored arrays of a version; `keeps_state` says which older versions keep
+        theirs.
 
         Parameters
         ----------
@@ -92,7 +93,8 @@ class VersionTable(CellTable):
     ) -> Row:
         """Return the row of a retrain for the table `model_version`, its arrays packed as npz.
 
-        `state` is None, or the arrays by name; `now` is in seconds since 1970. Raise StoreError if
+        `last_seq` is the number of the newest label that the retrain knew of. `state` is None, or
+        the arrays by name; `now` is the time of the row, in seconds since 1970. Raise StoreError if
         `report.accepted` is True and `state` is None, and for an array of Python objects.
         """
         arrays = check_state(report, state)
@@ -197,8 +199,9 @@ class VersionTable(CellTable):
     def _load_retrain(self, retrain: int) -> ModelVersion:
         """Return the version that the retrain with this number made, with its arrays.
 
-        A version of another cell is returned without the state of its rule, and its `rule_last_seq`
-        is 0: the rule includes no label. Raise VersionError if the state is missing or damaged.
+        There must be such a retrain. A version of another cell is returned without the state of its
+        rule, and its `rule_last_seq` is 0: the rule includes no label. Raise VersionError if the
+        state is missing or damaged.
         """
         query = sa.select(*VERSION.c["cell_id", "version", "last_seq", "state", "state_sum"])
         is_retrain = self._scope.shared(VERSION.c.cell_id) & (VERSION.c.retrain == retrain)
@@ -229,6 +232,7 @@ class VersionTable(CellTable):
         Returns
         -------
         list of StoredVersion
+            Each with the report, the time, and whether the arrays of its version are kept.
         """
         kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")

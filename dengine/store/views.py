@@ -121,7 +121,7 @@ class DecisionGroup:
 
     @property
     def is_false_reject(self) -> bool:
-        """Whether the model, not an operator's limits, rejected these parts, and they were good."""
+        """Whether the model, not a force limit, rejected these parts, and they were good."""
         return (
             self.action is Action.REJECT
             and self.reason is not Reason.OUTSIDE
@@ -170,7 +170,10 @@ class Tally:
         return sum(group.n for group in self.groups if is_counted(group))
 
     def by(self, field: str) -> Counter[Any]:
-        """Return the number of decisions per value of a field or property of `DecisionGroup`."""
+        """Return the number of decisions for each value of a field of `DecisionGroup`.
+
+        `field` is the name of a field or property, like "action" or "label".
+        """
         counts: Counter[Any] = Counter()
         for group in self.groups:
             counts[getattr(group, field)] += group.n
@@ -178,7 +181,7 @@ class Tally:
 
     @property
     def outcomes(self) -> Outcomes:
-        """Counts of accepted, rejected and audited parts by label, for the certificate.
+        """Counts of accepted, rejected and audited parts by corrected label, for the certificate.
 
         An audited part is counted by what the model alone would have done, in the fields of audits
         alone and not among the accepted and rejected parts. Nor are parts counted as rejected that
