@@ -120,9 +120,14 @@ class Survey:
 def survey_dataset(data: Dataset) -> Survey:
     """Count the traces, labels, faults and repeats of a data set, and test its order for drift.
 
-    Labels are only counted, nothing is learned from them. Repeats, and the drift of the channels,
-    are looked for among the usable traces: finite, not constant and not too large. If the recorded
+    A repeat is a trace that equals, or nearly equals, that of another recording. Repeats, and the
+    drift of the channels, are looked for among the usable traces: finite, not constant, and without
+    a sample above `LARGEST`. Nothing is trained, and the data set is not changed. If the recorded
     order is not known, the survey has no drift.
+
+    Parameters
+    ----------
+    data : Dataset
 
     Returns
     -------
@@ -179,9 +184,10 @@ def _spread(values: NDArray[Any] | None) -> Spread | None:
 
 
 def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Drift, ...]:
-    """Return the drift of the labels, named "good", and then of each channel's mean.
+    """Return how the labels (named "good"), and then each channel's mean, change in recorded order.
 
-    The labels of all traces are used, but only the means of the usable traces of X (n, C, T).
+    `X` (n, C, T) are the traces of the data set, and `usable` (n,) says which of them have no
+    fault. The labels of all traces are used, but only the means of the usable ones.
     """
     means = channel_means(np.where(usable[:, None, None], X, 0))
     means = np.where(usable[:, None], means, np.nan)
@@ -190,9 +196,11 @@ def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Dr
 
 
 def _drift(name: str, values: Floats) -> Drift:
-    """Return the drift of values (n,) in recorded order, leaving out those that are NaN.
+    """Return how values (n,), one for each recording, change in recorded order, as a `Drift`.
 
-    The correlation and its p-value are NaN if there are fewer than three values, or all are equal.
+    That is their rank correlation with the position, its p-value, and their mean in each tenth.
+    Values that are not finite are left out. Correlation and p-value are NaN if fewer than three
+    values are left, or all are equal; a mean is NaN if its tenth has no value.
     """
     from scipy.stats import spearmanr
 
