@@ -352,12 +352,13 @@ class Replay:
             The settings: recipe, interval, alpha, lower_bound, guarantee, stops, confirm, seed.
             The numbers of cycles of `stretch` but verified and stops; cycles; certain, the number
             of parts that the model accepted or rejected; first_certain, the cycle of the first of
-            them, counted from 1. precision and npv, the shares of right decisions among the accepted and
-            the rejected parts, and accuracy, among both. retrains; retrains_dropped, their number;
-            dropped, the reason of the last of these, or "". Medians and largest values or 99th
-            percentiles of the times of retrains (s) and decisions (µs); seconds, of the replay.
-            saved_s, the seconds of checks that the certain parts saved; and net_s, which is saved_s
-            minus the cost of errors, in seconds, by the defaults of `Costs`.
+            them, counted from 1. precision and npv, the shares of right decisions among the
+            accepted and the rejected parts, and accuracy, among both. retrains, their number;
+            retrains_dropped, the number of those that were dropped; dropped, the reason of the last
+            of these, or "". Median and largest time of a retrain (s), median and 99th percentile of
+            a decision's (µs), and the seconds of the replay. saved_s, the seconds of checks that
+            the certain parts saved; and net_s, which is saved_s minus the cost of errors, in
+            seconds, by the defaults of `Costs`.
         """
         nan = float("nan")
         policy = self.recipe.policy
