@@ -100,12 +100,12 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
 def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
-    STORE is the file or URL of an engine's store. The options choose which decisions; --events adds
-    the retrains and events since the first of these decisions, or since --since, and before
-    --until. In the table good and bad are the labels that were counted, bound is the interval of
-    the success rate that follows from them, v is the version of the model, and label is what the
-    part turned out to be. If no decision fits, a sentence says so. `dengine explain` tells more
-    about one decision.
+    STORE is the file or URL of an engine's store, and must exist. The options choose which
+    decisions; --events adds the retrains and events since the first of these decisions, or since
+    --since, and before --until. In the table good and bad are the labels that were counted, bound
+    is the interval of the success rate that follows from them, v is the version of the model, and
+    label is what the part turned out to be. If no decision fits, a sentence says so. `dengine
+    explain` tells more about one decision.
     """
     from ..history.status import history as read_history
     from ..representation import to_jsonable
@@ -177,8 +177,9 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {
 def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> str:
     """Return a table of decisions as text, in the order of the items.
 
-    It has a row for each decision, with the columns `COLUMNS`. Retrains and events are lines
-    between its rows, cut to 119 characters. Without any item the text is a sentence that says so.
+    It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
+    Retrains and events are lines between its rows, cut to 119 characters. Without any item the text
+    is a sentence that says so.
     """
     from ..store.records import StoredDecision
 

@@ -115,14 +115,14 @@ def run(
 
     With a store that exists the engine continues where it was. The simulated cell then makes new
     parts, and a recording continues after its last part that was labelled or accepted: no part is
-    learned from twice. A robot runs dengine/cells/ur/ur_cell.script, or a program with the same
-    handshake; --trigger and --samples say what is recorded of it. If too many decisions are wrong,
-    or too many traces are unlike all known ones, the engine enters safe mode: parts are
-    verified until new outcomes allow decisions again. --shadow stays in force in the store, until
-    `dengine policy STORE --shadow off`. At the end a table shows what was decided, what was wrong
-    and what was saved. Ctrl-C or SIGTERM ends the run after the current cycle and shows what was
-    done; a second one ends it at once. If the cell fails, what was done is shown, too, and the exit
-    code is 1.
+    learned from twice. It is refused if it has fewer parts left than --cycles. A robot runs
+    dengine/cells/ur/ur_cell.script, or a program with the same handshake; --trigger and --samples
+    say what is recorded of it. If too many decisions are wrong, or too many traces are unlike all
+    known ones, the engine enters safe mode: parts are verified until new outcomes allow decisions
+    again. --shadow stays in force in the store, until `dengine policy STORE --shadow off`. At the
+    end a table shows what was decided, what was wrong and what was saved. Ctrl-C or SIGTERM ends
+    the run after the current cycle and shows what was done; a second one ends it at once. If the
+    cell fails, what was done is shown, too, and the exit code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")

@@ -54,11 +54,12 @@ ONLY_WHILE_RUNNING = ("retraining", "store_lag")
 def status(store: str, last: int, check_seconds: float) -> None:
     """Show how an engine is doing, and what its store holds.
 
-    STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`. If
-    it holds several cells and none is named, they are listed; cells of one product share labels and
-    versions. The interval of bad accepted parts is valid if you look once; the certificate is valid
-    however often you look. If the model was certain of parts that were verified, as in shadow mode,
-    a line says how much time the model would have saved, at `--check-seconds` for each check.
+    STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`,
+    and must exist. If it holds several cells and none is named, they are listed; cells of one
+    product share labels and versions. The interval of bad accepted parts is valid if you look once;
+    the certificate is valid however often you look. If the model was certain of parts that were
+    verified, as in shadow mode, a line says how much time the model would have saved, at
+    `--check-seconds` for each check.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable

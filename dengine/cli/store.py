@@ -204,12 +204,12 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     """Show the policy in force, or change it.
 
     Without options it is shown, even while an engine runs on the cell; a change is refused then. A
-    setting that is not given stays as it is. Earlier decisions keep their bounds. The certificate
-    starts again after any change. The rule also forgets what it learned, after a change of --alpha,
-    --lower-bound, --interval, --guarantee, --stops or --prices, and with some guarantees of
-    --audit-rate: a tolerance that is chosen after the data was seen needs fresh evidence. Shadow
-    mode lasts over restarts; `dengine status` counts what the model would have done, and how much
-    of it was wrong.
+    change is recorded as an event. A setting that is not given stays as it is. Earlier decisions
+    keep their bounds. The certificate starts again after any change. The rule also forgets what it
+    learned, after a change of --alpha, --lower-bound, --interval, --guarantee, --stops or --prices,
+    and with some guarantees of --audit-rate: a tolerance that is chosen after the data was seen
+    needs fresh evidence. Shadow mode lasts over restarts; `dengine status` counts what the model
+    would have done, and how much of it was wrong.
     """
     if settings:
         _change_and_print(

@@ -164,7 +164,8 @@ class HttpApi:
         channels: Annotated[int, Meta(ge=1, le=99_999, description="Of bytes.")] = 1,
     ) -> Json:
         """Decide on a trace. The same trace and request id get the same decision; another trace
-        with that id gets 409; a trace of a wrong shape, or an invalid id or part, gets 422.
+        with that id gets 409; a trace that the engine does not take, such as one of a wrong shape,
+        and an invalid id or part, get 422.
 
         If the body is bytes, the other fields are in the query. A decision that is not begun before
         the deadline is VERIFY with the reason late; if the store cannot take it, it is VERIFY with
@@ -232,7 +233,8 @@ class HttpApi:
         The label as it was reported stays on record. A forgotten label counts again. If the part
         already counts with this label, nothing changes. 404: an unknown id or part; 409: a part
         with several decisions that are no rejects; 422: a decision without a label, both or neither
-        of id and part, or no author (unless the token has a name).
+        of id and part, or no author (unless the token has a name); 503: the queue is full, or the
+        store does not answer.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -252,7 +254,7 @@ class HttpApi:
         decision has no label, or no id is given (422), no label is forgotten. 422 also for a
         request without an author, unless the token has a name. If a rollback pinned the version in
         force, and this version was trained with one of the labels, it is released, so that retrains
-        may replace it.
+        may replace it. 503: the queue is full, or the store does not answer.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -292,6 +294,7 @@ class HttpApi:
         A pinned version is released, so that the new version may replace it. If a retrain is under
         way already, the response says so, and nothing changes. /versions tells afterwards whether
         the new version was put in force or dropped. 422: no author, unless the token has a name.
+        503: the queue is full, or the store does not answer.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -357,7 +360,8 @@ class HttpApi:
         Only decisions with the given label, action, reason, predicted (what the model alone would
         have done) and part (the part's number) are returned, if these are given, and only those
         between the times since (included) and until (not included), in seconds since 1970. With
-        open, label and action are ignored.
+        open, label and action are ignored. 422: a value that a field cannot have; 503: the queue is
+        full, or the store cannot be read.
         """
         selection = HistoryFilter(label=label, **where)
         before_id = (await self._find(before)).decision.id if before else None
@@ -385,7 +389,8 @@ class HttpApi:
         shift of this length, and `start` is when one of the shifts begins. Without it all decisions
         are split into at most 120 stretches of at least 20 decisions; the newest stretch may have
         fewer. At most the newest 120 stretches are returned, but all retrains and safe modes of the
-        cell. 422: `hours` is shorter than one second and not 0.
+        cell. 422: `hours` is shorter than one second and not 0; 503: the queue is full, or the
+        store cannot be read.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,
