@@ -441,9 +441,10 @@ class DataChoice:
     def describe(self, *, propose: bool = False) -> Description | None:
         """Return the description with the stated keys; None for a source that needs none.
 
-        A bundled set, the file of a store and a file in a format of dengine need none, unless a key
-        is stated, or a description is given, or one is saved beside the file. A progress bar is
-        shown while the description is read or proposed. Nothing is saved.
+        A bundled set, the file of a store, and a file of traces and labels that dengine reads by
+        itself (such as an .npz file with X and y) need none, unless a key is stated, or a
+        description is given, or one is saved beside the file. A progress bar is shown while the
+        description is read or proposed. Nothing is saved.
 
         Parameters
         ----------

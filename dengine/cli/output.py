@@ -89,9 +89,9 @@ class Out:
     force: bool = False
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
-        """Write files and a manifest that lists them, and return the paths.
+        """Write files into the folder `path`, and a manifest that lists them; return their paths.
 
-        The folder is created. There is no manifest if the file is `path` itself.
+        The folder is created if it is missing. If the file is `path` itself, there is no manifest.
 
         Parameters
         ----------
@@ -252,7 +252,7 @@ def format_value(name: str, value: Any) -> str:
         A number, a text, a dataclass, or a mapping, list or tuple of these. None, NaN and "" give
         "-", a bool "yes" or "no". A dataclass gives its own `str`, or else its fields with their
         headings. Of a mapping only the items that are not 0 are shown; if there are none, the text
-        is "none". Passwords of database URLs in a text are masked.
+        is "none". Items are joined by commas. Passwords of database URLs in a text are masked.
     """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"

@@ -195,7 +195,9 @@ def _open_engine(
     """Open the engine that the server drives, or create it with its store, and return it.
 
     The engine trains in `executor`, and logs when safe mode begins or ends. If `shadow` is True,
-    shadow mode is turned on, and stays on in the store.
+    shadow mode is turned on, and stays on in the store. `seed` is the seed of a new store's engine,
+    None for 0; `settings` are further arguments of `DataEngine.open_or_create`. Raises what that
+    raises.
     """
     from ..engine.engine import DataEngine
     from ..serve.server import log_safe_mode

@@ -10,7 +10,7 @@ good), in one unit of the user's, over all parts of a replay, its beginning incl
 everything costs `check` per part. A part that an operator's limits reject costs `check`, too, so
 that no policy pays by the limits, which are the same under each.
 
-The candidates are levels of LB around break-even, 1 - check / escape, and the guarantees "pooled"
+The candidates are values of LB around break-even, 1 - check / escape, and the guarantees "pooled"
 and "cost". `PolicySearch` halves them: all play two shuffles, the cheaper half plays two more, and
 so on. The last two play fresh shuffles, which are all that is reported, so that no figure was
 picked for being small. The early rounds replay one engine that checks every part, and play each
@@ -603,7 +603,7 @@ def cost_curve(
     keep : path or None, default None
         Folder of finished replays: those in it are not played again, others are added.
     **settings
-        alphas, lower_bounds : sequences of float to try; by default 0.1, and levels around
+        alphas, lower_bounds : sequences of float to try; by default 0.1, and values around
         1 - check / escape that the number of recordings allows. repeats : fresh shuffles that the
         last policies play, 4, at least 2. seed : of the first shuffle, 0. cycles : parts of each
         shuffle, by default all.
@@ -616,7 +616,9 @@ def cost_curve(
     Raises
     ------
     SettingError
-        As `PolicySearch`; with `keep` also for a reducer that cannot be hashed.
+        A price, a policy, or a number of repeats or cycles out of range; a check that is not
+        cheaper than an escape; recordings of one label, or too few for any policy. With `keep` also
+        for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
     OutputError
@@ -640,8 +642,9 @@ def curve_of(
     """Return what a part costs under some policies at these prices, and which policy to choose.
 
     `groups` has each policy with its replays, all of the same shuffles in the same order. The
-    choice is repeated with each price halved and doubled, and what changes is noted. `left_behind`,
-    `out_of_reach` and `fresh` become the fields of `CostCurve` with these names.
+    choice is repeated with each price halved and doubled; what changes then is in the field
+    `price_changes` of the result. `left_behind`, `out_of_reach` and `fresh` become its fields with
+    these names.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)

@@ -143,13 +143,14 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
 
 
 def embedding_map(replay: Replay, title: str = "") -> Figure:
-    """Draw the embeddings of a replay's newest 300 parts, by truth (left) and decision (right).
+    """Draw the embeddings of a replay's newest 300 parts, and return the figure.
 
-    A point is the mean over the embedding spaces of the folds, in its first two dimensions, as it
-    was at the decision; later retrains do not move it. Parts that no model embedded are left out,
-    on the left also parts of unknown truth. A circle with the recipe's radius is the neighbourhood
-    of the newest point. If the first dimension is a probability, the second says little: the
-    vertical axis is then the cycle, and two vertical lines bound the neighbourhood.
+    The left panel shows which parts were good and bad, the right one what was decided. A point is
+    the mean over the embedding spaces of the folds, in its first two dimensions, as it was at the
+    decision; later retrains do not move it. Parts that no model embedded are left out, on the left
+    also parts of unknown truth. A circle with the recipe's radius is the neighbourhood of the
+    newest point. If the first dimension is a probability, the second says little: the vertical axis
+    is then the cycle, and two vertical lines bound the neighbourhood.
 
     Parameters
     ----------

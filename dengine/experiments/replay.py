@@ -498,6 +498,7 @@ def watch(
     engine : DataEngine
     cell : Cell
     cycles : int
+        Number of parts, one in each cycle.
     on_cycle : callable or None, default None
         Called with each finished cycle.
 

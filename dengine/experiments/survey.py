@@ -122,8 +122,8 @@ def survey_dataset(data: Dataset) -> Survey:
 
     A repeat is a trace that equals, or nearly equals, that of another recording. Repeats, and the
     drift of the channels, are looked for among the usable traces: finite, not constant, and without
-    a sample above `LARGEST`. Nothing is trained, and the data set is not changed. If the recorded
-    order is not known, the survey has no drift.
+    a sample beyond 1e18; near repeats only among the newest 500 of these. Nothing is trained, and
+    the data set is not changed. If the recorded order is not known, the survey has no drift.
 
     Parameters
     ----------

@@ -407,6 +407,7 @@ class HttpApi:
 
         The parts are the newest 250 references with a label of this cell and, of its newest 10
         decisions, those that the version in force made. There are none before the first version.
+        503: the queue is full, or the store cannot be read.
         """
         engine = self.service.engine
         parts = await self.service.read(
@@ -478,7 +479,8 @@ class HttpApi:
     async def _find(self, id_: str) -> StoredDecision:
         """Return the stored decision with this id, with its trace and label.
 
-        Raises UnknownDecisionError for an unknown id, and what `CellService.find` raises.
+        Raises UnknownDecisionError for an unknown id, ReportError for an invalid one, StoreError if
+        it cannot be looked up, and BusyError if the queue is full or the service is closing.
         """
         stored = await self.service.find(id_)
         if stored is None:

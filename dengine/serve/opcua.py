@@ -285,7 +285,7 @@ class AddressSpace:
             await asyncio.sleep(MIN_REFRESH)  # meanwhile the newest decisions reach the store
 
     async def refresh(self) -> None:
-        """Read the cell's status and write it into the variables.
+        """Read the cell's status and write it into the OPC UA variables.
 
         If the status cannot be read, a warning is logged, and the variables keep their values with
         the OPC UA status code UncertainLastUsableValue, which marks them as old. Nothing is raised.

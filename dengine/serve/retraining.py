@@ -54,7 +54,8 @@ class RetrainingProcess(Executor):
     def _start(self) -> None:
         """Start a process that imports the modules that a retrain needs, and do not wait for it.
 
-        `ready` is set to a new future, which is done when the modules are imported.
+        `ready` is set to a new future, which is done when the modules are imported. Raises OSError
+        if the process cannot be started.
         """
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _prepare_process)

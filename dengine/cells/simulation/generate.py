@@ -33,6 +33,7 @@ def simulate(
     Parameters
     ----------
     n : int
+        Number of cycles, one insertion in each.
     seed : int, default 0
     scenario : str, default "nominal"
         A name in `SCENARIOS`.

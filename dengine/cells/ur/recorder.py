@@ -141,8 +141,8 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         """Wait for the next insertion after the last one, or after a call of `arm`, and return it.
 
         An insertion that is not complete after `timeout` seconds, for example because the
-        controller fell silent, is returned with NaN for the missing samples. If the package in
-        which it began was lost, all samples are NaN.
+        controller fell silent, is returned with NaN for the missing samples. If packages are
+        missing where it began, so that its start is unknown, all samples are NaN.
 
         Parameters
         ----------
@@ -195,10 +195,10 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def feed(self, row: Row) -> InsertionRecord | None:
         """Add a package of the stream, `row`; return the insertion that it completes, else None.
 
-        Samples that were lost are NaN in the trace; all samples are NaN if the package in which the
-        insertion began was lost. If the clock of the controller went back, because it was
-        restarted, an insertion that has begun is returned as far as it was received, and all
-        earlier packages are discarded.
+        Samples that were lost are NaN in the trace; all samples are NaN if packages are missing
+        where the insertion began, so that its start is unknown. If the clock of the controller went
+        back, because it was restarted, an insertion that has begun is returned as far as it was
+        received, and all earlier packages are discarded.
         """
         record = None
         # An earlier time: the controller was restarted.
@@ -220,8 +220,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def cut(self) -> InsertionRecord:
         """Return the insertion as far as it was received, and discard its packages.
 
-        Samples that did not come are NaN. All samples are NaN if the package in which the insertion
-        began was lost, or if no insertion has begun. The recorder then looks for the next one.
+        Samples that did not come are NaN. All samples are NaN if packages are missing where the
+        insertion began, so that its start is unknown, or if no insertion has begun. The recorder
+        then looks for the next one.
         """
         start = self._start
         first = self._first_time()
@@ -250,8 +251,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _reset(self) -> None:
-        """Discard the packages and the start of an insertion, and what `arm` set; the recorder then
-        looks for the next insertion.
+        """Discard the packages and the start of an insertion that has begun, and look for the next.
+
+        The number of connections that `arm` noted is discarded, too.
         """
         self._finder.forget()
         self._rows = []

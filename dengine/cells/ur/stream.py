@@ -318,9 +318,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         All input fields that the stream was opened with are written: those that are left out become
         0, and other names are ignored. A lost connection raises nothing: the newest inputs are
         written again on the next connection, unless they are 10 s old by then or the controller was
-        restarted. Raises struct.error for a
-        number that its field cannot hold, and in an integer field ValueError for NaN and
-        OverflowError for an infinity.
+        restarted. Raises struct.error for a number that its field cannot hold, and in an integer
+        field ValueError for NaN and OverflowError for an infinity.
 
         Parameters
         ----------
