@@ -76,7 +76,7 @@ class Baseline(ABC):
     _last: tuple[Any, BaselinePrediction] | None = field(default=None, init=False)
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Train from scratch and return self; `is_trained` says whether that succeeded.
+        """Train from scratch and return self; the attribute `is_trained` says whether that worked.
 
         If the labels are of one class, or too few for the method, the baseline is untrained
         afterwards, and every part is verified.

@@ -441,9 +441,10 @@ class PolicySearch:
     def run(self, play: Play) -> None:
         """Halve the number of policies in rounds, and let the last two play fresh shuffles.
 
-        While more than two policies remain, they play two shuffles, and the dearer half is removed
-        from `remaining`; policies that verified every part count as the dearest. The replays are
-        kept in this object, and `curve` computes the result from them. Call this once.
+        Fresh shuffles are those by which no policy was chosen. While more than two policies remain,
+        they play two shuffles, and the dearer half is removed from `remaining`; policies that
+        verified every part count as the dearest. The replays are kept in this object, and `curve`
+        computes the result from them. Call this once.
 
         Parameters
         ----------
@@ -677,9 +678,10 @@ def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost,
 
     `groups` has each policy with its replays. The best row is the cheapest, unless there are rows
     that accept fewer bad parts, are not significantly dearer, and have an expected cost below the
-    price of a check: then it is the row of these that accepts fewest bad parts. The verdict is
-    "pays" if the whole interval of its cost is below the price of a check, "does not pay" if its
-    mean or its expected cost is not, else "may pay".
+    price of a check: then it is the row of these that accepts fewest bad parts. The expected cost
+    has half an error added to each share of wrong decisions. The verdict is "pays" if the whole
+    interval of its cost is below the price of a check, "does not pay" if its mean or its expected
+    cost is not, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))

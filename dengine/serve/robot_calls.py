@@ -184,8 +184,8 @@ class RobotCalls:
         Returns
         -------
         struct
-            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
-            queue is full or the service is closing: verify, an id "" and the reason "busy";
+            A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If
+            the queue is full or the service is closing: verify, an id "" and the reason "busy";
             nothing is recorded.
 
         Raises
@@ -238,8 +238,8 @@ class RobotCalls:
         Returns
         -------
         struct
-            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
-            queue is full or the service is closing, verify with an id "" and the reason "busy".
+            A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If
+            the queue is full or the service is closing, verify with an id "" and the reason "busy".
 
         Raises
         ------
@@ -339,12 +339,12 @@ class RobotCalls:
         Returns
         -------
         struct
-            decisions, accepted, rejected, bad (false accepts): counts so far. verified_share: share
-            of verified parts among the newest 500 decisions, 1 if there are none. version: number
-            of the version in force. safe_mode, alarm: their reasons as texts, "" if there is none.
-            shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy: since
-            the start, numbers of decisions that the engine had not begun by the service's
-            `deadline`, and of requests refused because the queue was full.
+            A dict: decisions, accepted, rejected, bad (false accepts): counts so far.
+            verified_share: share of verified parts among the newest 500 decisions, 1 if there are
+            none. version: number of the version in force. safe_mode, alarm: their reasons as texts,
+            "" if there is none. shadow: whether the shadow mode is on. waiting: requests in the
+            queue. late, busy: since the start, numbers of decisions that the engine had not begun
+            by the service's `deadline`, and of requests refused because the queue was full.
 
         Raises
         ------
