@@ -420,9 +420,10 @@ def _group_replays(
 def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> str:
     """Return the title of tables and pictures.
 
-    It names the recipes and baselines (the keys of `by_name`), the data set, the order of the
-    parts, the number of replays of each, and the number of cycles. The bundled data set is called
-    "simulated insertions". There must be at least one replay.
+    It names the recipes and baselines (the keys of `by_name`), the data set, the order of the parts
+    (recorded if `in_order`, else shuffled), the number of replays of each, and the number of
+    cycles. The bundled data set is called "simulated insertions". There must be at least one
+    replay.
     """
     counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
     n_cycles = len(next(iter(by_name.values()))[0])
@@ -441,7 +442,7 @@ def _replay_files(
     These are replays.csv, a table with a row for each replay (`frame`); curves.png, with the errors
     and the share of certain decisions over the cycles; and for each recipe a map of the embedding
     in its first replay, map_NAME.png. There is no map if no trace was embedded, such as in a
-    baseline's replay.
+    baseline's replay. `title` is the title of the curves.
     """
     import numpy as np
 

@@ -95,7 +95,7 @@ class Baseline(ABC):
         return self
 
     def add(self, x: ArrayLike, y: Any) -> Self:
-        """Learn one trace (C, T) with its label, 1 for success, and return self.
+        """Learn one trace `x` (C, T) with its label `y`, 1 for success, and return self.
 
         Nothing is learned before a training has succeeded, or if the method learns only in `fit`.
         """

@@ -676,7 +676,8 @@ def curve_of(
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
     """Return a row for each policy in `groups`, the cheapest first, the best row, and the verdict.
 
-    `groups` has each policy with its replays. The best row is the cheapest, unless there are rows
+    `groups` has each policy with its replays, and `costs` are the prices. The best row is the
+    cheapest, unless there are rows
     that accept fewer bad parts, are not significantly dearer, and have an expected cost below the
     price of a check: then it is the row of these that accepts fewest bad parts. The expected cost
     has half an error added to each share of wrong decisions. The verdict is "pays" if the whole

@@ -402,8 +402,8 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
 
 
 def _axis_labels(spec: TraceSpec) -> list[str]:
-    """Return a label for the axis of each channel of a trace: its name, and its unit in brackets if
-    known.
+    """Return a label for the axis of each channel of traces with this `TraceSpec`: its name, and
+    its unit in brackets if known.
 
     A single channel without a name is called "trace".
     """

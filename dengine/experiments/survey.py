@@ -196,7 +196,8 @@ def _drifts(data: Dataset, X: TraceArray, usable: NDArray[np.bool_]) -> tuple[Dr
 
 
 def _drift(name: str, values: Floats) -> Drift:
-    """Return how values (n,), one for each recording, change in recorded order, as a `Drift`.
+    """Return how values (n,), one for each recording, change in recorded order, as a `Drift` with
+    this name.
 
     That is their rank correlation with the position, its p-value, and their mean in each tenth.
     Values that are not finite are left out. Correlation and p-value are NaN if fewer than three

@@ -296,7 +296,7 @@ def _json_field_types(record: type) -> Json:
 
 @cache
 def _json_type(hint: Any) -> Any:
-    """Return the type that a value of a Python type has in JSON, as msgspec writes types.
+    """Return the type that a value of the Python type `hint` has in JSON, as msgspec writes types.
 
     A dataclass becomes a struct type, a list or a tuple a list of its first item's type, and a
     float may be null. In `X | Y` both types are converted. Other types are returned as they are.
@@ -438,7 +438,7 @@ def json_response(
     """Return an HTTP response with `body` as JSON; a number that is not finite becomes null.
 
     NumPy arrays become lists, and an object that JSON has no type for becomes `str(object)`.
-    `headers` are added to the response, and `media` is its media type.
+    `status` is the HTTP status, `headers` are added to the response, and `media` is its media type.
     """
 
     def encoded(value: Any) -> Any:

@@ -247,8 +247,8 @@ class HttpApi:
         author: Author = "",
         reason: Annotated[str, Meta(description="For the event log.")] = "",
     ) -> Json:
-        """Leave labels out of training and of all counts, record that as an event, and return what
-        changed.
+        """Leave the labels of the decisions `ids` out of training and of all counts, record that as
+        an event with the reason, and return what changed.
 
         /correct makes a forgotten label count again. If the id of one decision is unknown (404), a
         decision has no label, or no id is given (422), no label is forgotten. 422 also for a
@@ -325,7 +325,8 @@ class HttpApi:
     ) -> Json:
         """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
 
-        503: the queue is full, or the store cannot be read.
+        The counts are of all decisions, and of the newest `last`. 503: the queue is full, or the
+        store cannot be read.
         """
         status = await self.service.status(last, watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
@@ -354,8 +355,8 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return decisions without their traces, newest first, and in `older` the id that `before`
-        takes for the next page, null if none are left. An unknown `before` is 404.
+        """Return up to `limit` decisions without their traces, newest first, and in `older` the id
+        that `before` takes for the next page, null if none are left. An unknown `before` is 404.
 
         Only decisions with the given label, action, reason, predicted (what the model alone would
         have done) and part (the part's number) are returned, if these are given, and only those

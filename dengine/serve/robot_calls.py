@@ -303,8 +303,9 @@ class RobotCalls:
         return _as_struct(response.decision)
 
     async def report(self, decision_id: Any, success: Any) -> bool:
-        """Report the outcome of the part with this decision, True for good; wait until it is on
-        disk.
+        """Report the outcome of the part with this decision, and wait until it is on disk.
+
+        `success` is True or 1 for a good part, False or 0 for a bad one.
 
         Returns
         -------
@@ -371,7 +372,7 @@ class RobotCalls:
         }
 
     async def _find(self, request: Any) -> Struct | None:
-        """Return the decision that was made under this id, as the dict that the robot gets.
+        """Return the decision that was made under the id `request`, as the dict that a robot gets.
 
         None if the id has no decision, and also if the queue is full, the service is closing, or
         the store cannot look the id up. Raises ReportError for an invalid id.

@@ -108,8 +108,9 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
 
     `mujoco` is the module, `model` and `data` are its model and its state, which is advanced in
     place, and `steps` is the number of physics steps per sample. The force before the motion, with
-    the part in the gripper, counts as zero; pushing is positive. Near the force limit the push
-    slows down, and above the limit the gripper moves back.
+    the part in the gripper, counts as zero; pushing is positive. The conditions say when the
+    gripper starts, how fast it is, how far it goes, and the limit of the force. Near this limit the
+    push slows down, and above the limit the gripper moves back.
     """
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
