@@ -48,10 +48,11 @@ class Verbs(click.Group):
     """
 
     def main(self, *args: Any, **options: Any) -> Any:
-        """Parse the arguments and run a subcommand, like click; it usually ends the process.
+        """Parse the arguments and run a subcommand, like `click.Group.main`, whose arguments it
+        takes; it usually ends the process.
 
-        Before that stdout and stderr are set to print "?" for a character that their encoding
-        lacks.
+        Before that stdout and stderr, unless they are in UTF, are set to print "?" for a character
+        that their encoding lacks.
         """
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, TextIOWrapper) and not stream.encoding.lower().startswith("utf"):
@@ -65,9 +66,10 @@ class Verbs(click.Group):
         Expected are DengineError, OSError (but BrokenPipeError, which passes) and UnicodeError. An
         ImportRefusedError, which `--allow-import` avoids, becomes `click.UsageError`, exit code 2.
         The message is put on one line, and names the options of the command line in place of
-        Python's arguments. Passwords are masked, in click's own messages too. The current folder is
-        added to the end of `sys.path`, so that `module:Class` is found there. Ctrl-C ends the
-        process with exit code 130.
+        Python's arguments. Passwords are masked, also in the messages of click's own errors, which
+        are raised again. The current folder is added to the end of `sys.path`, so that
+        `module:Class` is found there. Ctrl-C ends the process with exit code 130. Other exceptions
+        pass unchanged.
         """
         folder = str(Path.cwd())
         if folder not in sys.path:

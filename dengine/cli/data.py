@@ -105,11 +105,16 @@ def data(
 def _print_open_keys(source: DataChoice, description: "Description", path: Path | None) -> None:
     """Print a description with `?` in it, and the keys that the user must state, with their notes.
 
-    A key without a note is "not known". With `--json` a document with the data, the description and
-    these keys is printed instead.
+    A note says what is open about the key; without one it is "not known". With `--json` a document
+    with the data's name, the description and these keys is printed instead.
 
-    source : where the data are; it names them in the document. path : the file to which the
-    description was written, which is printed; None: nothing was written.
+    Parameters
+    ----------
+    source : DataChoice
+        The data set that the user asked for; only its name is used.
+    description : Description
+    path : Path or None
+        The file to which the description was written, which is printed; None: nothing was written.
     """
     notes = description.notes
     questions = [f"- {key}: {notes.get(key, 'not known')}" for key in description.open_keys]
@@ -124,9 +129,12 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
 
 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
-    """Yield the tables and sentences that `dengine data` prints of a survey and of the notes.
+    """Yield what `dengine data` prints of a data set and its survey: tables, and sentences.
 
-    A sentence may be "".
+    These are the survey's counts with the first and last trace, the notes of the data set, the
+    drift over the tenths of the recorded order (or that the order is unknown), a sentence if many
+    traces nearly repeat another, and one if the tolerance of the default policy is too wide for
+    these parts. A sentence may be "".
     """
     from ..datasets.checks import tolerance_note
     from ..decision.policy import Policy
@@ -160,7 +168,8 @@ def _save(
 
 
 def _trace_line(dataset: "Dataset", i: int) -> str:
-    """Return a trace in words: its source, its label, and its first and last samples.
+    """Return a text on trace `i` of a data set: the file or row that it comes from, if known, its
+    label, and its first three and last two samples.
 
     Of several channels, these are the samples of the first.
     """
@@ -196,7 +205,8 @@ def simulate(n: int, out: Path, scenario: str, seed: int, n_jobs: int, force: bo
     """Simulate insertions and write their forces and labels.
 
     They go into an .npz file; one that exists is replaced only with --force. The number of
-    successes is printed.
+    successes, the parts that sit correctly, is printed. MuJoCo must be installed, which the extra
+    sim does; without it the exit code is 1.
     """
     from ..files import check_output
 

@@ -67,9 +67,10 @@ def export(
 
     STORE is the engine's store, as given to `dengine train` or `dengine run`; the cell may run
     meanwhile, and an event records the export. Before the first retrain there is nothing to export,
-    and the exit code is 1. --make-key and --cpp need neither STORE nor --out. If --make-key is
-    given together with STORE and --out, the new key also signs FILE; so --key and --make-key
-    exclude each other. Whoever has the key can check an exported file, and can also sign one.
+    and the exit code is 1. STORE needs --out, and --out needs STORE; --make-key and --cpp need
+    neither. If --make-key is given together with STORE and --out, the new key also signs FILE; so
+    --key and --make-key exclude each other. Whoever has the key can check an exported file, and can
+    also sign one. The output names the files, the version and its number of references.
     """
     if (store is None) is not (out is None) or not (store or new_key or cpp):
         raise click.UsageError(

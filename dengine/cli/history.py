@@ -51,7 +51,8 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     ) -> float:
         """Return the time in seconds since 1970; a usage error for a text that is no time.
 
-        "30m" is that long ago (s, m, h or d); a date without an offset is in UTC.
+        "30m" is 30 minutes before now (likewise s, h and d); otherwise the text is a date, with or
+        without a time, in ISO 8601, which is in UTC if it has no offset.
         """
         ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
         if ago:
@@ -99,10 +100,11 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
 def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
-    STORE is the file or URL of an engine's store. The options choose which decisions; --events adds
-    the retrains and events since the first of these decisions, or since --since. In the table good
-    and bad are the labels that were counted, bound is the interval of the success rate that follows
-    from them, v is the version of the model, and label is what the part turned out to be. `dengine
+    STORE is the file or URL of an engine's store, and must exist. The options choose which
+    decisions; --events adds the retrains and events since the first of these decisions, or since
+    --since, and before --until. In the table good and bad are the labels that were counted, bound
+    is the interval of the success rate that follows from them, v is the version of the model, and
+    label is what the part turned out to be. If no decision fits, a sentence says so. `dengine
     explain` tells more about one decision.
     """
     from ..history.status import history as read_history
@@ -129,7 +131,7 @@ def history(store: str, events: bool, **criteria: Any) -> None:
 
 
 def _label_text(stored: StoredDecision) -> str:
-    """Return a label and its `Source` as text, like "good verified" or "bad stop".
+    """Return a decision's label, and how it became known, as text: "good verified", "bad stop".
 
     It is "-" if there is no label, or if the label was forgotten.
     """
@@ -146,7 +148,10 @@ def _model_text(stored: StoredDecision) -> str:
 
 
 def _bound_text(stored: StoredDecision) -> str:
-    """Return the interval of the success rate as text, rounded outward, "-" if there is none."""
+    """Return the interval of a decision's success rate as text, such as 0.81-0.97.
+
+    It has two decimals and is rounded outward; "-" if the decision has no interval.
+    """
     decision = stored.decision
     if math.isnan(decision.lower):
         return "-"
@@ -172,8 +177,9 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {
 def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> str:
     """Return a table of decisions as text, in the order of the items.
 
-    Retrains and events are lines between its rows, cut to 119 characters. Without any item it is a
-    sentence that says so.
+    It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
+    Retrains and events are lines between its rows, cut to 119 characters. Without any item the text
+    is a sentence that says so.
     """
     from ..store.records import StoredDecision
 
@@ -227,11 +233,11 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     """Explain why a decision came out as it did.
 
     The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
-    by the word last. If a part has several decisions that are no rejects, its number is refused
-    with exit code 1; the message has their ids. Counts, bound and action are shown as they were
-    recorded. Neighbours are searched again with the version that decided, if the store still has
-    it. The picture shows the trace with its neighbours and with the band that holds 95 % of the
-    known successes.
+    by the word last, for the newest. If a part has several decisions that are no rejects, its
+    number is refused with exit code 1; the message has their ids. A decision that is not in the
+    store is refused, too. Counts, bound and action are shown as they were recorded. Neighbours are
+    searched again with the version that decided, if the store still has it. The picture of --out
+    shows the trace with its neighbours and with the band that holds 95 % of the known successes.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture
@@ -268,11 +274,12 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
 
 
 def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
-    """Yield (title, text) rows of an explanation.
+    """Yield rows of a table, (title, text), that explain a decision.
 
-    They say when the decision was made and by which version, on which part, and why. Then come the
-    notes on what was computed again, and the share of samples that leave the envelope, the band of
-    the known successes; or a sentence that there are too few successes for an envelope.
+    They say when the decision was made and by which version, on which part (if it has a number),
+    and why. Then come the notes on what was computed again, and the share of samples that leave the
+    envelope, the band of the known successes; or a sentence that there are too few successes for an
+    envelope. Of several sentences only the first has a title.
     """
     decision = explanation.decision.decision
     version = decision.model_version

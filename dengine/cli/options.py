@@ -52,13 +52,13 @@ def verb(example: str) -> Callable[[Command], click.Command]:
 def names_of(kind: str) -> tuple[str, ...]:
     """Return the names that an option of this kind accepts, such as "wilson" for an interval.
 
-    The tables that hold them are imported only when this is called.
+    The modules that define them are imported only when this is called.
 
     Parameters
     ----------
     kind : str
-        guarantee, interval, stops, recipe, baseline, method (recipes and baselines), fit (of live
-        traces), label, action or reason.
+        guarantee, interval, stops, recipe, baseline, method (recipes and baselines), fit (what is
+        done with live traces of another length), label, action or reason. Any other is a KeyError.
     """
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
@@ -103,7 +103,7 @@ class NameChoice(click.ParamType[Any]):
         return f"[{'|'.join(filter(None, [*names_of(self.kind), self.custom]))}]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the name; fail with a usage error for any other value.
+        """Return the value if it is one of the names; fail with a usage error for any other value.
 
         If the option takes an object of the user's own, a value with a dot, colon or slash is
         returned unchecked.
@@ -139,7 +139,7 @@ class CommaList(click.ParamType[Any]):
     ) -> tuple[Any, ...]:
         """Return the converted values as a tuple; a usage error if there is none or one is wrong.
 
-        A tuple, such as a default, is returned as it is.
+        Empty items between commas are left out. A tuple, such as a default, is returned as it is.
         """
         if isinstance(value, tuple):
             return value
@@ -184,9 +184,10 @@ def drop_none(**values: Any) -> dict[str, Any]:
 
 
 def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
-    """Return a store's address: its file or URL, as a `CellAddress` if a cell or product is given.
+    """Return a store's address: its file or URL, or a `CellAddress` if a cell or product is named.
 
-    None without a store; then a cell or product is a usage error.
+    A `CellAddress` has the file or URL and these names. The address is None without a store; a cell
+    or product is a usage error then.
     """
     from ..store.records import address
 
@@ -201,7 +202,9 @@ _CELL_ID = "The cell, if the store holds several; `dengine status` lists them.  
 
 
 def existing_store(store: Option) -> Option:
-    """Return a decorator that adds `store` and `--cell`, handed on as one address, `store`.
+    """Return a decorator that adds the option `store` and `--cell` to a subcommand.
+
+    The subcommand gets both as one address, its argument `store`.
 
     Parameters
     ----------
@@ -216,10 +219,11 @@ store_argument = existing_store(click.argument("store", metavar="STORE"))
 
 
 def store_option(text: str, *names: str, required: bool = False) -> Option:
-    """Return a decorator that adds `--store`, `--cell-id` and `--product`.
+    """Return a decorator that adds `--store`, `--cell-id` and `--product` to a subcommand.
 
-    The subcommand gets them as one address, its argument `store`; the store need not exist. The
-    address is None without `--store`. A cell or product without `--store` is a usage error.
+    The subcommand gets them as one address, its argument `store`; whether the store exists is not
+    checked. The address is None without `--store`. A cell or product without `--store` is a usage
+    error.
 
     Parameters
     ----------
@@ -259,16 +263,17 @@ class RecipeChoice:
     name : str or None
         As given to `--reducer`; None if it was not given.
     settings : mapping
-        The settings of a policy, and `novelty`, that were given beside it.
+        The settings of a policy, and `novelty` (the margin of the novelty gate), that were given
+        beside it, by name.
     """
 
     name: str | None
     settings: Options
 
     def load(self, base: Any = "conv") -> Recipe:
-        """Return the recipe, or `base` if no name was given, with the given settings.
+        """Return the recipe that the user named, with the settings that the user gave.
 
-        `base` is anything that `Recipe.load` takes.
+        If no name was given, `base` is taken, which is anything that `Recipe.load` takes.
 
         Raises
         ------
@@ -294,7 +299,7 @@ class RecipeChoice:
         return self.load() if self.name or self.settings else None
 
     def make_contender(self) -> Contender:
-        """Return what a replay plays: a `Contender`, which is a recipe or a baseline.
+        """Return who plays a replay: a `Contender`, which is a recipe or a baseline with its name.
 
         It is the baseline if the name is that of a baseline, and otherwise the recipe that `load`
         returns. Both get the settings that were given. Without a name it is the recipe conv. Raises
@@ -436,9 +441,10 @@ class DataChoice:
     def describe(self, *, propose: bool = False) -> Description | None:
         """Return the description with the stated keys; None for a source that needs none.
 
-        A bundled set, the file of a store and a file in a format of dengine need none, unless a key
-        is stated, or a description is given, or one is saved beside the file. A progress bar is
-        shown while the description is read or proposed. Nothing is saved.
+        A bundled set, the file of a store, and a file of traces and labels that dengine reads by
+        itself (such as an .npz file with X and y) need none, unless a key is stated, or a
+        description is given, or one is saved beside the file. A progress bar is shown while the
+        description is read or proposed. Nothing is saved.
 
         Parameters
         ----------
@@ -460,13 +466,12 @@ class DataChoice:
             return description_of(self.data, self.description, self.stated, propose)
 
     def load(self, description: Description | None = None) -> Dataset:
-        """Load the data set and return it.
+        """Load the data set, with a progress bar, and return it.
 
         Its notes, and the first three recordings that were left out, are printed to stderr, but not
-        with `--json`. Raises DataError if it cannot be read.
-
-        description : the description to read by; None takes the one that `describe` returns, which
-        raises DataError if one is needed and none is saved.
+        with `--json`. `description` is the description to read by; None takes the one that
+        `describe` returns. Raises DataError if the data set cannot be read, or if a description is
+        needed and none is saved.
         """
         from ..datasets import load_dataset
         from ..datasets.loading import count_files
@@ -487,7 +492,7 @@ class DataChoice:
 
 
 def fault_lines(data: Dataset, most: int) -> list[str]:
-    """Return lines that list the recordings that could not be read, for people.
+    """Return lines that list the recordings of a data set that could not be read, with the reasons.
 
     The first line counts them, at most `most` are named, and a last line counts the others. The
     list is empty if every recording could be read.
@@ -588,19 +593,20 @@ def parse_stated(items: Iterable[str]) -> dict[str, Any]:
 def data_options(
     default: str | None = "insertion", argument: bool = False, live: bool = False
 ) -> Option:
-    """Return a decorator that adds `--data` and the options of how it is read.
+    """Return a decorator that adds `--data`, and the options that say how it is read.
 
-    They are handed on as one `DataChoice`, the subcommand's argument `source`.
+    The subcommand gets them as one `DataChoice`, its argument `source`. These options are
+    `--samples`, `--channels`, `--description` and `--set`.
 
     Parameters
     ----------
     default : str or None, default "insertion"
-        None makes `--data` required.
+        Default of `--data`. None makes `--data` required.
     argument : bool, default False
         The data set is the subcommand's argument DATA, required, instead of an option; `default` is
         not used.
     live : bool, default False
-        Whether to add the options of live traces.
+        Whether to add the options of live traces: `--rate-hz`, `--unit`, `--fit` and `--trigger`.
     """
     metavar = "NAME|FILE|FOLDER"
     if argument:
@@ -629,11 +635,13 @@ def data_options(
 
 
 def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
-    """Return the settings of a robot's recorder, by its argument names, and its `TraceSpec`.
+    """Return the settings of an `RtdeRecorder`, by its argument names, and its `TraceSpec`.
 
-    They come from the options of `TRACE`, which say what traces look like, as far as they were
-    given; other options are ignored. The settings are samples, rate and channels. The `TraceSpec`
-    also has the unit and the fit. Raises SettingError for values that no trace can have.
+    They come from the values of `--samples`, `--channels`, `--rate-hz`, `--unit` and `--fit` in
+    `options`, by name, as far as they were given; other options are ignored. The settings are
+    samples, rate_hz and channels, and those that were not given are left out. The `TraceSpec` also
+    has the unit and the fit (what is done with traces of another length). Raises SettingError for
+    values that no trace can have.
     """
     from ..cells.ur.recorder import spec_of_recording
 
@@ -644,7 +652,7 @@ def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
 
 
 def trace_spec_from(options: Options) -> TraceSpec | None:
-    """Return the `TraceSpec` of live traces that the options in `TRACE` state.
+    """Return the `TraceSpec` that the options in `TRACE` state of live traces, those of a cell.
 
     If `--channels` is one number, this is the number of channels; otherwise it has their names.
 
@@ -684,7 +692,8 @@ def trace_spec_from(options: Options) -> TraceSpec | None:
 def n_jobs_option(default: int, text: str) -> Option:
     """Return a decorator that adds `--n-jobs`, a number of processes as joblib counts them.
 
-    0 is turned into -1, one process for each core.
+    `default` is its default, and `text` its help. The value 0 is turned into -1, one process for
+    each core.
     """
     return click.option(
         "--n-jobs",
@@ -697,15 +706,18 @@ def n_jobs_option(default: int, text: str) -> Option:
 
 
 def require_modules(purpose: str, extra: str, *modules: str) -> None:
-    """Raise SettingError if a module is not installed; the error has the command that installs it.
+    """Raise SettingError if one of the modules is not installed; nothing is imported.
+
+    The message names the missing modules and the command that installs them.
 
     Parameters
     ----------
     purpose : str
-        What they are needed for, for the error.
+        What they are needed for, for the message.
     extra : str
         Extra of dengine that installs them.
     *modules : str
+        Names of the modules.
     """
     if missing := ", ".join(name for name in modules if find_spec(name) is None):
         raise SettingError(
@@ -738,10 +750,11 @@ def out_option(
 ) -> Option:
     """Return a decorator that adds `--out` and `--force`.
 
-    The subcommand gets both as its argument `out`, an `Out`; it is None without `--out`. Before the
-    subcommand begins, OutputError is raised if a file of `names` below `--out` must not be written
-    (`check_output`), so that no work is lost. The name "" is `--out` itself. `kind` is the type of
-    the path, and `text` the help of `--out`.
+    The subcommand gets both as its argument `out`, an `Out`; it is None without `--out`. `names`
+    are the files that the subcommand will write into the folder `--out`; the name "" is `--out`
+    itself. Before the subcommand begins, OutputError is raised if one of them must not be written,
+    for example because it exists and there is no `--force`, so that no work is lost. `kind` is the
+    type of the path, and `text` the help of `--out`.
     """
 
     def make_out(out: Path | None, force: bool) -> Out | None:

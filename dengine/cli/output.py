@@ -40,9 +40,10 @@ EXPLAIN = "--explain"
 
 
 def _context_flag(name: str, text: str) -> Callable[[Any], Any]:
-    """Return a decorator that adds a flag whose value is kept in click's context under its name.
+    """Return a decorator that adds the flag `name`, whose help is `text`, to a subcommand.
 
-    The subcommand does not receive it as an argument.
+    Its value is kept in the `meta` of click's context under this name. The subcommand does not
+    receive it as an argument.
     """
 
     def keep(context: click.Context, option: click.Parameter, value: bool) -> None:
@@ -88,9 +89,9 @@ class Out:
     force: bool = False
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
-        """Write files and a manifest that lists them, and return the paths.
+        """Write files into the folder `path`, and a manifest that lists them; return their paths.
 
-        The folder is created. There is no manifest if the file is `path` itself.
+        The folder is created if it is missing. If the file is `path` itself, there is no manifest.
 
         Parameters
         ----------
@@ -195,15 +196,16 @@ def print_parts(*parts: Any) -> None:
 def table_of_rows(
     title: str, rows: Iterable[Sequence[str]], columns: Sequence[str] = ("", "")
 ) -> "Table":
-    """Return a rich Table whose first column is bold; passwords are masked.
+    """Return a rich Table whose first column is bold; passwords of database URLs are masked.
 
     Parameters
     ----------
     title : str
+        Title of the table.
     rows : iterable of sequences of str
         The cells of each row.
     columns : sequence of str
-        Titles; a table of empty titles has no header.
+        Titles of the columns; if all are empty, the table has no header.
     """
     from rich.table import Table
 
@@ -222,9 +224,10 @@ def table_of_records(title: str, records: Iterable[Any], *names: str) -> "Table"
 
 
 def field_rows(record: Any, *left_out: str) -> Iterator[tuple[str, str]]:
-    """Yield (heading, formatted value) for each field of a dataclass.
+    """Yield (heading, formatted value) for each field of the dataclass `record`.
 
-    Fields that are None or empty, and those named in `left_out`, are skipped.
+    `heading` and `format_value` make both texts. Fields that are None or empty, and those named in
+    `left_out`, are skipped.
     """
     for field in fields(record):
         value = getattr(record, field.name)
@@ -246,9 +249,10 @@ def format_value(name: str, value: Any) -> str:
     name : str
         The field's name. Its ending tells the unit, see `FORMATTERS`: `_s`, `_bytes`, `share` ...
     value : object
-        A number, a text, a dataclass, or a mapping or sequence of these. None, NaN and "" give "-",
-        a bool "yes" or "no". Of a mapping only the items that are not 0 are shown; if there are
-        none, the text is "none". Passwords in a text are masked.
+        A number, a text, a dataclass, or a mapping, list or tuple of these. None, NaN and "" give
+        "-", a bool "yes" or "no". A dataclass gives its own `str`, or else its fields with their
+        headings. Of a mapping only the items that are not 0 are shown; if there are none, the text
+        is "none". Items are joined by commas. Passwords of database URLs in a text are masked.
     """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"
@@ -274,7 +278,10 @@ def format_value(name: str, value: Any) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """Return a duration in seconds as people write it: 180 µs, 35 ms, 4.6 s, 240 s."""
+    """Return a duration, given in seconds, as text in µs, ms or s: 180 µs, 35 ms, 4.6 s, 240 s.
+
+    It is rounded to whole units, but from 1 to 10 ms, and from 1 to 100 s, to one decimal.
+    """
     if seconds < 0.9995e-3:
         return f"{1e6 * seconds:.0f} µs"
     if seconds < 9.95e-3:
@@ -324,6 +331,7 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
     Parameters
     ----------
     label : str
+        Text beside the bar; passwords in it are masked.
     total : int or None
         Number of steps; None if it is not known.
 
@@ -363,10 +371,11 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
 
 @contextmanager
 def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """Write the progress to stderr, a line every `LINE_SECONDS` while the block runs.
+    """Write a line on the progress to stderr every `LINE_SECONDS` while the block runs.
 
-    A thread writes the lines. The function that is yielded, `advance(n)`, adds n steps and writes
-    nothing itself.
+    A thread writes the lines: `label`, the number of steps done of `total` ("?" if it is None), and
+    the time so far. The function that is yielded, `advance(n)`, adds n steps and writes nothing
+    itself.
     """
     n_steps = 0
     ended = Event()
@@ -407,6 +416,7 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
     Parameters
     ----------
     label : str
+        Text beside the bar.
     total : int
         Number of steps.
 

@@ -99,10 +99,12 @@ class PlayedTasks(NamedTuple):
 
 
 def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
-    """Play the tasks with a progress bar; return the finished replays and the time they took.
+    """Play tasks, each a replay to be played, with a progress bar; return what was finished.
 
-    Ctrl-C or an error ends the work and is not raised: the replays that were finished until then
-    are returned, with the error, which the caller must pass to `_end`.
+    That is the finished replays in the order of their tasks, and the time they took. Of `stream`
+    the cycles, the number of processes and the folder of kept replays are used. Ctrl-C or an error
+    ends the work and is not raised: the replays that were finished until then are returned, with
+    the error, which the caller must pass to `_end`.
     """
     from ..experiments.grid import iterate_replays
 
@@ -148,9 +150,10 @@ _SHUFFLES = "Number of shuffled replays of each recipe."
 
 
 def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable[[Any], Any]:
-    """Return a decorator that adds the options of how streams are played.
+    """Return a decorator that adds the options that say how recorded streams are played.
 
-    The subcommand gets them as one `Stream`, its argument `stream`. `--repeats` together with
+    These are `--repeats`, `--seed`, `--cycles`, `--in-order`, `--n-jobs` and `--keep`. The
+    subcommand gets them as one `Stream`, its argument `stream`. `--repeats` together with
     `--in-order` is a usage error.
 
     Parameters
@@ -158,8 +161,8 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
     repeats, n_jobs : int
         Defaults of `--repeats` and `--n-jobs`.
     least : int
-        Smallest number of repeats. If it is above 1, there is no option `--in-order`, because that
-        plays the stream only once.
+        Smallest number that `--repeats` takes. If it is above 1, there is no option `--in-order`,
+        because that plays the stream only once.
     text : str
         Help of `--repeats`.
     """
@@ -288,10 +291,11 @@ def compare(
 ) -> None:
     """Replay the same streams through several methods.
 
-    Methods are reducers and baselines. They are played under one policy or a grid of policies: give
-    a setting either as one value (--alpha) or as a list to try (--alphas). For each method
-    the output is that of `dengine replay`. umap-learn takes much longer than the others. Ctrl-C, or
-    an error in a replay, ends it and shows the replays that were finished.
+    Methods are reducers and baselines, each with a name of its own. They are played under one
+    policy or a grid of policies: give a setting either as one value (--alpha) or as a list to try
+    (--alphas); both are a usage error. For each method the output is that of `dengine replay`.
+    umap-learn takes much longer than the others. Ctrl-C, or an error in a replay, ends it and shows
+    the replays that were finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -337,6 +341,21 @@ def _replay_and_print(
 
     After Ctrl-C or an error the finished replays are shown, if there are some. Then the process
     ends with exit code 130, or the error is raised.
+
+    Parameters
+    ----------
+    contenders : sequence of Contender
+        Who plays: recipes and baselines.
+    grid : mapping
+        Values to try, by the argument of `grid_tasks` that takes them, such as "alphas".
+    source : DataChoice
+        The data set that the user asked for.
+    stream : Stream
+        How it is played: seeds, cycles, order.
+    check_seconds : float
+        Duration of a verification, from which the saved time is computed.
+    out : Out or None
+        Folder of the files; None: no files.
     """
     from ..experiments import tables
     from ..experiments.grid import grid_tasks
@@ -374,8 +393,10 @@ def _replay_and_print(
 
 
 def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
-    """Return a sentence: how many replays were played, in what time, and how many were kept from
-    an earlier run.
+    """Return a sentence: how many replays there are, the wall time and the time of one core that
+    they took, and how many of them an earlier run had kept, if any.
+
+    `costs` has these numbers, as in `PlayedTasks`.
     """
     seconds = format_value("seconds", costs["seconds"])
     core_seconds = format_value("core_seconds", costs["core_seconds"])
@@ -386,7 +407,10 @@ def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
 def _group_replays(
     replays: Sequence[Replay], key: Callable[[Replay], str]
 ) -> dict[str, list[Replay]]:
-    """Return the replays grouped by their key; keys stand in the order of their first replay."""
+    """Return a dict: `key(replay)` -> the replays with this key, in their order.
+
+    The keys stand in the order of their first replay.
+    """
     groups: dict[str, list[Replay]] = {}
     for replay in replays:
         groups.setdefault(key(replay), []).append(replay)
@@ -396,8 +420,10 @@ def _group_replays(
 def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> str:
     """Return the title of tables and pictures.
 
-    It names the recipes and baselines, the data set, the order of the parts, the number of replays
-    of each, and the number of cycles. The bundled data set is called "simulated insertions".
+    It names the recipes and baselines (the keys of `by_name`), the data set, the order of the parts
+    (recorded if `in_order`, else shuffled), the number of replays of each, and the number of
+    cycles. The bundled data set is called "simulated insertions". There must be at least one
+    replay.
     """
     counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
     n_cycles = len(next(iter(by_name.values()))[0])
@@ -413,8 +439,10 @@ def _replay_files(
 ) -> Iterator[tuple[str, Any]]:
     """Yield the name and the content of each file that `--out` writes.
 
-    These are a table of all replays, their curves, and for each recipe a map of the embedding in
-    its first replay. There is no map if no trace was embedded, such as in a baseline's replay.
+    These are replays.csv, a table with a row for each replay (`frame`); curves.png, with the errors
+    and the share of certain decisions over the cycles; and for each recipe a map of the embedding
+    in its first replay, map_NAME.png. There is no map if no trace was embedded, such as in a
+    baseline's replay. `title` is the title of the curves.
     """
     import numpy as np
 
@@ -435,8 +463,8 @@ def _replay_files(
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
-    """Return a label for a replay in figures: the name of its recipe or baseline, and the settings
-    that vary in the frame, with commas between.
+    """Return a label for a replay in figures: the name of its recipe or baseline, and those of its
+    settings that vary in `frame`, the table of all replays, with commas between.
     """
     policy = replay.recipe.policy
     settings = {
@@ -524,11 +552,12 @@ def costs(
 
     Shows what a part of your recordings costs under the best policies, and what it costs if
     everything is verified. Says how certain these costs are, and how to set the policy. If no
-    policy pays or may pay, the choice is to verify everything, and the output names no policy. The
-    policies that are tried have the guarantees pooled and cost, or levels of LB, the --lower-bound,
-    around break-even, where accepting costs as much as verifying. All costs are in one unit, such
-    as seconds of production or money. Ctrl-C, or an error in a replay, ends it and shows what was
-    finished, if at least two shuffles are finished.
+    policy pays or may pay, the choice is to verify everything, and the output names no policy to
+    set. The policies that are tried have the guarantees pooled and cost, or values of LB, the
+    --lower-bound, around break-even, where accepting costs as much as verifying. One value
+    (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
+    seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
+    replay, ends it and shows what was finished, if at least two shuffles are finished.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of
@@ -596,10 +625,11 @@ def costs(
 
 
 def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
-    """Return the sentences below the table of a cost curve.
+    """Return the sentences below the table of a cost curve: what a part costs under each policy.
 
-    They say which policy was chosen, how the choice depends on the prices, how many recordings
-    repeat another, which policies were dearer in the first shuffles, and which were not tried.
+    They say which policy was chosen, and how the choice depends on the prices. If there are any,
+    they also say how many recordings of the data set repeat another, which policies were left
+    behind because they were dearer in the first shuffles, and which were not tried.
     """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset
@@ -617,7 +647,10 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
 
 
 def _as_flags(settings: Options) -> str:
-    """Return settings of a policy as options of the command line, in one text: --alpha 0.1 ..."""
+    """Return settings of a policy, given by name, as options of the command line in one text.
+
+    It is like "--alpha 0.1 --lower-bound 0.9"; the prices are joined by commas.
+    """
     texts = {
         name: ",".join(f"{price:g}" for price in value) if name == "prices" else str(value)
         for name, value in settings.items()
@@ -626,7 +659,11 @@ def _as_flags(settings: Options) -> str:
 
 
 def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
-    """Return the cells of a policy's row under the titles in `COLUMNS`, ">" for the chosen one."""
+    """Return the cells of a policy's row in the table of costs, under the titles in `COLUMNS`.
+
+    The first is ">" if the policy is chosen, else "". The others are its rule, LB, cost with its
+    interval, late cost, share of verified parts, and wrong accepts and rejects with their shares.
+    """
     policy = row.policy
     is_local = policy.guarantee == "local"
     return (
@@ -642,7 +679,8 @@ def _cost_cells(row: PolicyCost, is_chosen: bool) -> tuple[str, ...]:
 
 
 def _error_cell(error: ErrorRate) -> str:
-    """Return "wrong of decided", like "3 of 120", with the interval of the share in a second line.
+    """Return how many decisions were wrong, like "3 of 120", and in a second line the interval of
+    their share in percent.
 
     It is "-" if there was no decision.
     """

@@ -115,14 +115,14 @@ def run(
 
     With a store that exists the engine continues where it was. The simulated cell then makes new
     parts, and a recording continues after its last part that was labelled or accepted: no part is
-    learned from twice. A robot runs dengine/cells/ur/ur_cell.script, or a program with the same
-    handshake; --trigger and --samples say what is recorded of it. If too many decisions are wrong,
-    or too many traces are unlike all known ones, the engine enters safe mode: parts are
-    verified until new outcomes allow decisions again. --shadow stays in force in the store, until
-    `dengine policy STORE --shadow off`. At the end a table shows what was decided, what was wrong
-    and what was saved. Ctrl-C or SIGTERM ends the run after the current cycle and shows what was
-    done; a second one ends it at once. If the cell fails, what was done is shown, too, and the exit
-    code is 1.
+    learned from twice. It is refused if it has fewer parts left than --cycles. A robot runs
+    dengine/cells/ur/ur_cell.script, or a program with the same handshake; --trigger and --samples
+    say what is recorded of it. If too many decisions are wrong, or too many traces are unlike all
+    known ones, the engine enters safe mode: parts are verified until new outcomes allow decisions
+    again. --shadow stays in force in the store, until `dengine policy STORE --shadow off`. At the
+    end a table shows what was decided, what was wrong and what was saved. Ctrl-C or SIGTERM ends
+    the run after the current cycle and shows what was done; a second one ends it at once. If the
+    cell fails, what was done is shown, too, and the exit code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")
@@ -180,11 +180,11 @@ def run(
 
 
 def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
-    """Let the engine drive the cell with a progress bar, and return what was done.
+    """Let the engine drive the cell with a progress bar named `name`, and return what was done.
 
-    It ends after `cycles`, at Ctrl-C or SIGTERM, or when the cell fails, whose CellError is
-    returned and not raised; other errors are raised. When safe mode begins or ends, a line is
-    printed to stderr, unless `--json`.
+    It ends after `cycles` parts, or after the current one at Ctrl-C or SIGTERM; a second Ctrl-C
+    ends it at once. If the cell fails, its CellError is returned and not raised; other errors are
+    raised. When safe mode begins or ends, a line is printed to stderr, unless `--json`.
     """
     from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 
@@ -212,7 +212,10 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
 
 
 def _safe_mode_line(change: Record) -> str:
-    """Return a sentence: after which cycle safe mode began, and why, or that it ended."""
+    """Return a sentence: after which cycle safe mode began, and why, or that it ended.
+
+    `change` has the number of the cycle, `cycle`, and the `reason`, "" if safe mode ended.
+    """
     event = "safe mode ended"
     if change["reason"]:
         event = f"safe mode, parts are verified until outcomes allow decisions: {change['reason']}"
@@ -226,7 +229,9 @@ def _simulated_cell(
 
     The `TraceSpec` has what the options of `source` state; the rest is the simulation's own. The
     cell's seed depends on the number of decisions in the store, and in a product also on the cell,
-    so that no part comes twice. A verification takes `check_seconds` of simulated time.
+    so that no part comes twice. A verification takes `check_seconds` of simulated time. `scenario`
+    says what changes in the course of the `cycles`. `others` are settings of other kinds of cell,
+    and are ignored.
     """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
@@ -251,10 +256,11 @@ def _simulated_cell(
 def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of a recording, and a function that makes a cell which plays it.
 
-    The cell begins after the last part that was played before. A part was played before if its
-    trace has a label of this cell in the store, or if it is this cell's newest accepted part
-    without a report. The recording is loaded at once. Making the cell raises SettingError if fewer
-    parts than `cycles` are left.
+    The recording is the data set of `source`, and is loaded at once. The cell begins after the last
+    part that was played before. A part was played before if its trace has a label of this cell in
+    the store, or if it is this cell's newest accepted part without a report. Making the cell raises
+    SettingError if fewer parts than `cycles` are left. `others` are settings of other kinds of
+    cell, and are ignored. Raises DataError if the recording cannot be read.
     """
     import numpy as np
 
@@ -293,7 +299,8 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
 def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of a robot, and a function that connects to it and makes its cell.
 
-    The robot is a Universal Robots controller.
+    The robot is a Universal Robots controller at `host`, HOST or HOST:PORT. The options of `source`
+    say what is recorded, and when; `others` are settings of other kinds of cell, and are ignored.
 
     Raises
     ------
@@ -318,7 +325,7 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
 
 
 def host_and_port(address: str) -> tuple[str, int]:
-    """Split HOST[:PORT] of a robot controller, and return both; the default is RTDE's port.
+    """Split HOST[:PORT] of a robot controller, and return both; without PORT it is 30004, RTDE's.
 
     Raises
     ------
@@ -359,10 +366,12 @@ COLUMNS = {  # title -> count of a stretch
 def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> None:
     """Print the result of a run: a table of stretches, the cell's own report, and sentences.
 
-    A stretch is a number of consecutive cycles. The sentences say how much time was saved, how the
-    retrains went, when safe mode began and ended, and what the certificate is. The counts are added
-    to `record`, which `--json` prints in place of all that. run.csv and run.png are written to
-    `out`.
+    A stretch is a number of consecutive cycles. The cell's own report is shown if the cell has a
+    method `report`. The sentences say how much time was saved, how the retrains went, when safe
+    mode began and ended, and what the certificate is. `record` has the title, the duration of a
+    check, the changes of safe mode and the certificate; the counts are added to it, in place, and
+    `--json` prints it in place of all that. run.csv and run.png are written to `out`, if it is
+    given.
     """
     from ..experiments.figures import curves
     from ..experiments.metrics import Costs
@@ -412,9 +421,9 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
 def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
     """Return a table row, title -> cell, for the counts of a stretch of cycles.
 
-    Two columns are left out if they say nothing in the whole run, whose counts are `total`: parts
-    outside the force limits, if there were none, and good parts per hour, if the cell tells no
-    time.
+    `stretch` and `total`, the counts of the whole run, are as `Replay.stretch` returns them. Two
+    columns are left out if they say nothing in the whole run: parts outside the force limits, if
+    there were none, and good parts per hour, if the cell has no clock.
     """
     cells = {
         "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",

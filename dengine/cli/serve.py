@@ -125,11 +125,12 @@ def serve(
     SIGTERM or Ctrl-C, which end it in order, with exit code 0: waiting requests are answered, and
     everything known is written. --shadow stays in force in the store, until `dengine policy STORE
     --shadow off`. --demo plays recorded parts as a robot would, with a deadline of 5 s or more. It
-    keeps them in a new --store, or without --store forgets them at the end. Without --token-file,
-    programs on the same machine need no token. Other machines reach it only with --host, which
-    needs --token-file, and should have --cert and --key. --samples, --rate-hz, --unit, --channels
-    and --fit say what a trace looks like. Without them a new store takes the form of its first
-    trace, and rate and unit are unknown; with --robot, it takes 1000 samples at 500 Hz.
+    keeps them in a new --store, or without --store forgets them at the end; one of both must be
+    given. Without --token-file, programs on the same machine need no token. Other machines reach it
+    only with --host, which needs --token-file, and should have --cert and --key. --samples,
+    --rate-hz, --unit, --channels and --fit say what a trace looks like. Without them a new store
+    takes the shape of its first trace, and rate and unit are unknown; with --robot, it takes 1000
+    samples at 500 Hz. With --deploy nothing is served: examples are written, and that is all.
     """
     if deploy is not None:
         from shutil import copytree
@@ -194,7 +195,9 @@ def _open_engine(
     """Open the engine that the server drives, or create it with its store, and return it.
 
     The engine trains in `executor`, and logs when safe mode begins or ends. If `shadow` is True,
-    shadow mode is turned on, and stays on in the store.
+    shadow mode is turned on, and stays on in the store. `seed` is the seed of a new store's engine,
+    None for 0; `settings` are further arguments of `DataEngine.open_or_create`. Raises what that
+    raises.
     """
     from ..engine.engine import DataEngine
     from ..serve.server import log_safe_mode

@@ -54,11 +54,12 @@ ONLY_WHILE_RUNNING = ("retraining", "store_lag")
 def status(store: str, last: int, check_seconds: float) -> None:
     """Show how an engine is doing, and what its store holds.
 
-    STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`. If
-    it holds several cells and none is named, they are listed; cells of one product share labels and
-    versions. The interval of bad accepted parts is valid if you look once; the certificate is valid
-    however often you look. If the model was certain of parts that were verified, as in shadow mode,
-    a line says how much time the model would have saved, at `--check-seconds` for each check.
+    STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`,
+    and must exist. If it holds several cells and none is named, they are listed; cells of one
+    product share labels and versions. The interval of bad accepted parts is valid if you look once;
+    the certificate is valid however often you look. If the model was certain of parts that were
+    verified, as in shadow mode, a line says how much time the model would have saved, at
+    `--check-seconds` for each check.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable
@@ -92,9 +93,10 @@ def status(store: str, last: int, check_seconds: float) -> None:
 
 
 def _overview_table(store: str, report: "Status") -> Any:
-    """Return a rich Table of counts and shares, a row for each, false accepts first.
+    """Return a rich Table of the counts and shares in a store's status, false accepts first.
 
-    It has a column for the newest decisions and one for all since the store was made.
+    It has a row for each field, a column for the newest decisions, and one for all decisions since
+    the store was made. `store`, its address, stands in the title.
     """
     spans = (report.newest, report.ever)
     names = [field.name for field in fields(report.ever)]
@@ -108,11 +110,13 @@ def _overview_table(store: str, report: "Status") -> Any:
 
 
 def _present_rows(report: "Status") -> list[tuple[str, str]]:
-    """Return (title, text) rows on the present state of the engine, an alarm first.
+    """Return rows of a table, (title, text), on the present state of an engine, an alarm first.
 
-    They are the cell, the settings, the `TraceSpec`, the certificate, the last and the slowest
-    retrain, and the newest events, the newest first. The recipe is left out if the model was handed
-    in by the user, because the recipe has no effect on it.
+    They are the cell, the other fields of the status, the recipe, the `TraceSpec`, the certificate
+    on accepted and on rejected parts, the last and the slowest retrain, and the newest events, the
+    newest first. An alarm, or a retrain, has a row only if there is one. The recipe is left out if
+    the model was handed in by the user, because the recipe has no effect on it. Without audits, the
+    counts with the name "audit" are called "certain but checked": they come from shadow mode.
     """
     rows = []
     if report.alarm:
@@ -154,10 +158,12 @@ def _without_audits(counts: dict[str, int]) -> dict[str, int]:
 
 
 def _span_cell(name: str, span: "Span") -> str:
-    """Return the text of a span's field: a time, a number, or a share of errors and its verdict.
+    """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions with
+    its verdict.
 
-    A few words replace the share if there is none, because no part was accepted, or if the row of
-    bad accepted parts shows the same share.
+    A `Span` has the counts over the newest decisions, or over all, and `name` names its field. A
+    few words replace the share if there is none, because no part was accepted, or if the row of bad
+    accepted parts shows the same share.
     """
     value = getattr(span, name)
     if name in ("first", "last"):
@@ -172,10 +178,12 @@ def _span_cell(name: str, span: "Span") -> str:
 
 
 def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
-    """Return a text on the share of wrong decisions: counts, interval, verdict on the tolerance.
+    """Return a text on a share of wrong decisions: counts, interval, verdict.
 
-    Without known outcomes the counts are left out. If the verdict is open as well, so is the
-    interval, and the text only says that nothing, or nothing beside the line stops, is known.
+    The verdict says whether the share keeps to the tolerance, is beyond it, or may be beyond it
+    (open). Without known outcomes the counts are left out. If the verdict is open as well, the
+    interval is left out, too, and the text only says that nothing is known, or nothing beside the
+    line stops.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ MOST_FAULTS = 20  # that are shown
 
 
 def _login_name() -> str:
-    """Return the user's login name, "" if the system has none."""
+    """Return the login name of the user who runs the command, "" if the system has none."""
     try:
         return getpass.getuser()
     except (OSError, KeyError, ImportError):  # in a container a user's number may have no name
@@ -68,9 +68,10 @@ def _change_and_print(
 ) -> None:
     """Open the store's engine, call `change` with it and the author, and print what changed.
 
-    `change` returns a `Changed`, whose text is printed after the engine was closed; it may say that
-    nothing changed. The JSON document also has the policy and the certificate after the change. The
-    other arguments are those that `store_options` adds to a subcommand. Raises StoreError if an
+    `change` returns a `Changed`, whose text is printed after the engine was closed, with the number
+    of the event; the text may say that nothing changed. With `--json` a document is printed
+    instead, which also has the policy and the certificate after the change. `allow_import` permits
+    to import the reducer or rule, module:Class, that the store names. Raises StoreError if an
     engine runs on the cell, and whatever `change` raises.
     """
     from ..engine.engine import DataEngine
@@ -97,12 +98,13 @@ def report(part: str, label: str, **changing: Any) -> None:
     """Report whether a part was good or bad.
 
     Name the part by its number, or by the id of its decision. The number is enough if the part has
-    one decision, or one that is no reject. For an accepted part, bad is a line stop, and good a
-    confirmation. For a rejected part the label is that of an inspection, and the engine trains on
-    it. An event records the report. The same label again changes nothing. Another label than the
-    reported one is refused with exit code 1, unless it is a line stop; `dengine correct` puts a
-    wrong label right. The subcommand is refused while an engine runs on the cell. A store that
-    names a reducer or rule of your own, module:Class, needs --allow-import.
+    one decision, or one that is no reject; otherwise it is refused, and so is a part that is not in
+    the store. For an accepted part, bad is a line stop, and good a confirmation. For a rejected
+    part the label is that of an inspection, and the engine trains on it. An event records the
+    report. The same label again changes nothing. Another label than the reported one is refused
+    with exit code 1, unless it is a line stop; `dengine correct` puts a wrong label right. The
+    subcommand is refused while an engine runs on the cell. A store that names a reducer or rule of
+    your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -135,9 +137,9 @@ def correct(part: str, label: str, **changing: Any) -> None:
 
     The part is named as for `dengine report`. From now on its decision counts with the corrected
     label. The label as it was reported stays in the store, and so does the decision; the correction
-    is a later row. A correction makes a forgotten label count again. If this label counts already,
-    nothing changes. A decision without a label is refused. The subcommand is refused while an
-    engine runs on the cell.
+    is a later row, and an event. A correction makes a forgotten label count again. If this label
+    counts already, nothing changes. An unknown decision, and one without a label, is refused with
+    exit code 1. The subcommand is refused while an engine runs on the cell.
     """
     from ..history.explain import find_decision_id
 
@@ -202,12 +204,12 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     """Show the policy in force, or change it.
 
     Without options it is shown, even while an engine runs on the cell; a change is refused then. A
-    setting that is not given stays as it is. Earlier decisions keep their bounds. The certificate
-    starts again after any change. The rule also forgets what it learned, after a change of --alpha,
-    --lower-bound, --interval, --guarantee, --stops or --prices, and with some guarantees of
-    --audit-rate: a tolerance that is chosen after the data was seen needs fresh evidence. Shadow
-    mode lasts over restarts; `dengine status` counts what the model would have done, and how much
-    of it was wrong.
+    change is recorded as an event. A setting that is not given stays as it is. Earlier decisions
+    keep their bounds. The certificate starts again after any change. The rule also forgets what it
+    learned, after a change of --alpha, --lower-bound, --interval, --guarantee, --stops or --prices,
+    and with some guarantees of --audit-rate: a tolerance that is chosen after the data was seen
+    needs fresh evidence. Shadow mode lasts over restarts; `dengine status` counts what the model
+    would have done, and how much of it was wrong.
     """
     if settings:
         _change_and_print(
@@ -235,8 +237,9 @@ def retrain(store: str, author: str, allow_import: bool) -> None:
 
     An event records it. The new version replaces a pinned one, too. If the recipe's time budget
     ends before the training does, the output says how many steps are to go, and the next retrain
-    continues. If the new version fails its tests, it is dropped, the previous version stays in use,
-    and the exit code is 1. The subcommand is refused while an engine runs on the cell.
+    continues. If the training fails or has no label to train on, or the new version fails its
+    tests, it is dropped, the previous version stays in use, and the exit code is 1. The subcommand
+    is refused while an engine runs on the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -290,8 +293,9 @@ def verify(
 
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
     the rows, with its rows. The subcommand lists rows that were changed, that are missing or that
-    are in no entry, and data that was lost. If there are any, the exit code is 1. The subcommand
-    writes only with --acknowledge, and engines may run meanwhile.
+    are in no entry, and data that was lost, at most 20. If there are any, the exit code is 1. The
+    subcommand writes only with --acknowledge, after which it checks again, and engines may run
+    meanwhile.
     """
     from ..store.sql import SqlStore
     from ..store.verification import verify_history
@@ -310,7 +314,11 @@ def verify(
 
 
 def _verification_lines(report: HistoryReport) -> list[str]:
-    """Return lines for people: about each cell, then the faults, at most 20, then the verdict."""
+    """Return the lines that say what a check of a store's history found.
+
+    For each cell they say how many entries and rows it has, its newest digest, and what is known of
+    its journal. Then come the faults, at most 20, and whether everything is as it was written.
+    """
     lines = []
     for cell in report.cells:
         digest = cell.digest or "none"
@@ -420,9 +428,9 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
 
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
     imported. If a line was changed or is missing, the lines before it are imported, the others are
-    not, and the exit code is 1. A file that is no journal, has a line that cannot be read, or
-    belongs to another model (unless --any-model) is refused as a whole. The subcommand is refused
-    while an engine runs on the cell.
+    not, and the exit code is 1. A file that is no journal, has no accepted or labelled part, has a
+    line that cannot be read, or belongs to another model (unless --any-model) is refused as a
+    whole. The subcommand is refused while an engine runs on the cell.
     """
     from ..export.cell_journal import import_journal
 

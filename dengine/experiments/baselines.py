@@ -76,7 +76,7 @@ class Baseline(ABC):
     _last: tuple[Any, BaselinePrediction] | None = field(default=None, init=False)
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Train from scratch and return self.
+        """Train from scratch and return self; the attribute `is_trained` says whether that worked.
 
         If the labels are of one class, or too few for the method, the baseline is untrained
         afterwards, and every part is verified.
@@ -95,7 +95,7 @@ class Baseline(ABC):
         return self
 
     def add(self, x: ArrayLike, y: Any) -> Self:
-        """Learn one trace (C, T) with its label, 1 for success, and return self.
+        """Learn one trace `x` (C, T) with its label `y`, 1 for success, and return self.
 
         Nothing is learned before a training has succeeded, or if the method learns only in `fit`.
         """
@@ -124,9 +124,9 @@ class Baseline(ABC):
     def decide(self, X: ArrayLike) -> NDArray[Any]:
         """Return an `Action` for each trace of X (n, C, T), as an array of objects, shape (n,).
 
-        It is ACCEPT if the lower bound is at least the accept threshold, REJECT if the upper bound
-        is at most the reject threshold, and otherwise VERIFY. `thresholds` has both; if it is None,
-        they are LB and 1 - LB.
+        It is ACCEPT if the lower bound of the success probability is at least the accept threshold,
+        REJECT if the upper bound is at most the reject threshold, and otherwise VERIFY. The
+        attribute `thresholds` has both; if it is None, they are LB and 1 - LB.
         """
         from ..decision.rule import action_of
 
@@ -258,7 +258,11 @@ class AgreeingNeighbours(Baseline):
         self._references.add(_rows(X), good)
 
     def _predict(self, X: Traces) -> BaselinePrediction:
-        """Return the share of successes among the k nearest as both bounds, with their counts."""
+        """Return the share of successes among the k nearest labelled traces as both bounds.
+
+        The counts are the numbers of successes and failures among the k. X has shape (n, C, T), and
+        all four arrays (n,).
+        """
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
         n_success = self._references.good[nearest].sum(axis=1)

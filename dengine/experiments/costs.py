@@ -10,7 +10,7 @@ good), in one unit of the user's, over all parts of a replay, its beginning incl
 everything costs `check` per part. A part that an operator's limits reject costs `check`, too, so
 that no policy pays by the limits, which are the same under each.
 
-The candidates are levels of LB around break-even, 1 - check / escape, and the guarantees "pooled"
+The candidates are values of LB around break-even, 1 - check / escape, and the guarantees "pooled"
 and "cost". `PolicySearch` halves them: all play two shuffles, the cheaper half plays two more, and
 so on. The last two play fresh shuffles, which are all that is reported, so that no figure was
 picked for being small. The early rounds replay one engine that checks every part, and play each
@@ -185,9 +185,11 @@ class CostCurve:
 
     @property
     def missing(self) -> Missing | None:
-        """How many more parts would turn "may pay" into "pays".
+        """How many more parts would turn the verdict "may pay" into "pays", as a `Missing`.
 
-        None if the verdict is another, or if 10,000 times as many recordings are too few.
+        It assumes that the shares of wrong decisions stay as they were seen, and counts different
+        accepted parts, recordings, and parts of production. None if the verdict is another, or if
+        10,000 times as many recordings are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -231,10 +233,11 @@ class CostCurve:
 
     @property
     def sentence(self) -> str:
-        """The verdict for people: the best policy, its cost with the interval, what is missing.
+        """The verdict as sentences: the chosen policy, its cost with the interval, and, if it may
+        pay, how many more parts would show that it pays.
 
-        It says "Nothing pays" if no policy pays or may pay. It also says if another policy is
-        cheaper, but not significantly, and if the search was not finished.
+        They begin with "Nothing pays" if no policy pays or may pay. They also say if another policy
+        is cheaper, but not significantly, and if the search was interrupted.
         """
         row = self.marked
         cheapest = self.rows[0]
@@ -285,9 +288,10 @@ class CostCurve:
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each policy that was played.
 
-        It has costs, shares and error rates. `chosen` is True for the policy that pays or may pay,
-        if there is one. `reported` is False for the policies that were left behind. Shares are from
-        0 to 1, costs in the user's unit.
+        Its columns are the guarantee, alpha and lower_bound of the policy and the fields of
+        `PolicyCost`: costs in the user's unit, and shares and error rates from 0 to 1. `chosen` is
+        True for the policy that pays or may pay, if there is one. `reported` is False for the
+        policies that were left behind, because they were dearer in earlier shuffles.
         """
         import pandas as pd
 
@@ -314,7 +318,8 @@ def policy_name(policy: Policy) -> str:
 
 
 def settings_of(policy: Policy) -> dict[str, Any]:
-    """Return the settings that tell a candidate from others, as keyword arguments of `Policy`.
+    """Return the settings by which the policies of `dengine costs` differ, as keyword arguments of
+    `Policy`.
 
     They are alpha, lower_bound and guarantee, or only the prices under the guarantee "cost", since
     the prices imply the other three. audit_rate and stops are added if they are not the defaults.
@@ -409,10 +414,11 @@ class PolicySearch:
         self._fresh: set[int] = set()  # seeds of the shuffles that choose nothing
 
     def _add(self, contender: Contender, changes: dict[str, Any], n_good: float) -> None:
-        """Add a candidate to `remaining`, or to `out_of_reach` a note on why it is not tried.
+        """Add a policy to be tried to `remaining`, or to `out_of_reach` a note on why it is not.
 
-        It is not tried if its settings are refused, or if it needs more good parts to accept one
-        (`needed_parts`) than the `n_good` that a shuffle plays.
+        The policy is that of the contender with the settings `changes`. It is not tried if its
+        settings are refused, or if it needs more good parts before it can accept one
+        (`needed_parts`) than `n_good`, the number of good parts that a shuffle plays.
         """
         try:
             candidate = contender.with_policy(**changes)
@@ -433,11 +439,12 @@ class PolicySearch:
             self.remaining.append(candidate)
 
     def run(self, play: Play) -> None:
-        """Halve the candidates in rounds, and let the last two play fresh shuffles.
+        """Halve the number of policies in rounds, and let the last two play fresh shuffles.
 
-        While more than two remain, they play two shuffles, and the dearer half is removed from
-        `remaining`; candidates that verified every part count as the dearest. The replays are kept,
-        and `curve` computes the result from them. Call this once.
+        Fresh shuffles are those by which no policy was chosen. While more than two policies remain,
+        they play two shuffles, and the dearer half is removed from `remaining`; policies that
+        verified every part count as the dearest. The replays are kept in this object, and `curve`
+        computes the result from them. Call this once.
 
         Parameters
         ----------
@@ -457,11 +464,12 @@ class PolicySearch:
         self._play(play, fresh, None)
 
     def _play(self, play: Play, seeds: range, scores: Contender | None) -> bool:
-        """Play the remaining candidates over some seeds, and keep their replays.
+        """Play the remaining policies, each over a shuffle for each seed, and keep the replays.
 
-        If `scores` is None, each candidate has a replay of its own for each seed. Otherwise only
-        `scores`, a contender in shadow mode, is replayed, and each candidate's rule decides on its
-        predictions (`replay_policy`). Returns whether all tasks were played.
+        `play` returns the replays of tasks, perhaps not of all. If `scores` is None, each policy
+        has a replay of its own for each seed. Otherwise only `scores`, a contender in shadow mode,
+        is replayed, and the rule of each policy decides on its predictions (`replay_policy`).
+        Returns whether `play` returned as many replays as there were tasks.
         """
         players = [scores] if scores else self.remaining
         tasks = [Task(player, seed, self._cycles) for seed in seeds for player in players]
@@ -474,9 +482,8 @@ class PolicySearch:
         return len(replays) == len(tasks)
 
     def _screening_key(self, contender: Contender) -> tuple[bool, float]:
-        """Return what candidates are sorted by: those that verified all come last, then the cost.
-
-        The cost is the expected one, see `PolicyCost`.
+        """Return the key by which policies are sorted: whether every part was verified, and the
+        expected cost (see `PolicyCost`). So policies that verified every part come last.
         """
         row = self._row(contender.recipe.policy)
         return row.accepted + row.rejected == 0.0, row.expected_cost
@@ -486,12 +493,12 @@ class PolicySearch:
         return _policy_cost(policy, list(self._replays[policy].values()), self.costs)
 
     def curve(self) -> CostCurve | None:
-        """Return the cost curve of what was played; nothing is played here.
+        """Return what a part costs under each policy that was played; nothing is played here.
 
-        A shuffle counts if every policy in `remaining` has finished it. The curve is computed from
-        the fresh shuffles, by which no policy was left behind. If fewer than two of them count,
-        because the search was interrupted, it is computed from the earlier shuffles, and `fresh`
-        is False. If fewer than two of these count, too, the result is None.
+        A shuffle counts if every policy in `remaining` has finished it. The result is computed from
+        the fresh shuffles, which did not choose the policies that play them. If fewer than two of
+        them count, because the search was interrupted, it is computed from the earlier shuffles,
+        and its field `fresh` is False. If fewer than two of these count, too, the result is None.
         """
         played = {c.recipe.policy: self._replays[c.recipe.policy] for c in self.remaining}
         behind = [self._row(policy) for policy in self._replays if policy not in played]
@@ -511,13 +518,13 @@ def candidates(
 
     First come all pairs of an alpha and a lower bound LB (the success probability that accepted
     parts must have) for the guarantee "local", or for the user's own rule if the contender has one.
-    Then come "pooled" at a few LBs, and "cost" once, but not for a user's own rule or a baseline.
-    If stops="some" and no audits are set, these two get an audit rate of 5 %, because they need
-    outcomes of accepted parts.
+    Then come "pooled" at each LB, and "cost" once with the prices `costs`, but not for a user's own
+    rule or a baseline. If the contender's policy has stops="some" and no audits, these two get an
+    audit rate of 5 %, because they need outcomes of accepted parts.
 
-    If `alphas` is empty, it is 0.1 alone. "pooled" has the given `lower_bounds`, too. If these
-    are empty, LBs are taken around break-even, at which 1 - LB is check / escape, but none below
-    80 %.
+    If `alphas` is empty, it is 0.1 alone. If `lower_bounds` is empty, LBs are taken around
+    break-even, at which 1 - LB is check / escape: up to six for "local", up to three for "pooled",
+    the lowest first, and none below 80 %.
     """
     policy = contender.recipe.policy
 
@@ -547,10 +554,11 @@ def candidates(
 def needed_parts(policy: Policy) -> int:
     """Return the least number of good parts that a policy needs before it can accept a part.
 
-    For "local" this is the number of good labels near a trace, z^2 LB / (1 - LB) with Wilson's
-    interval. For "pooled" it is the number of good parts, without a bad one, whose score reaches
-    the threshold, until there is enough evidence at error level alpha. For other guarantees it is
-    0.
+    For the guarantee "local" this is the number of good labels within the radius, without a bad
+    one, that puts the lower end of the policy's interval at LB: z^2 LB / (1 - LB), rounded up, with
+    Wilson's interval. For "pooled" it is the number of good parts, without a bad one, whose score
+    reaches the accept threshold, until there is enough evidence at error level alpha. For other
+    guarantees it is 0.
     """
     if policy.guarantee == "local":
         counts = range(1, MOST_NEIGHBOURS)
@@ -596,7 +604,7 @@ def cost_curve(
     keep : path or None, default None
         Folder of finished replays: those in it are not played again, others are added.
     **settings
-        alphas, lower_bounds : sequences of float to try; by default 0.1, and levels around
+        alphas, lower_bounds : sequences of float to try; by default 0.1, and values around
         1 - check / escape that the number of recordings allows. repeats : fresh shuffles that the
         last policies play, 4, at least 2. seed : of the first shuffle, 0. cycles : parts of each
         shuffle, by default all.
@@ -609,7 +617,9 @@ def cost_curve(
     Raises
     ------
     SettingError
-        As `PolicySearch`; with `keep` also for a reducer that cannot be hashed.
+        A price, a policy, or a number of repeats or cycles out of range; a check that is not
+        cheaper than an escape; recordings of one label, or too few for any policy. With `keep` also
+        for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
     OutputError
@@ -630,9 +640,12 @@ def curve_of(
     out_of_reach: tuple[str, ...] = (),
     fresh: bool = True,
 ) -> CostCurve:
-    """Return the cost curve of some policies, from the replays of each, all of the same shuffles.
+    """Return what a part costs under some policies at these prices, and which policy to choose.
 
-    `left_behind`, `out_of_reach` and `fresh` become the fields of `CostCurve` with these names.
+    `groups` has each policy with its replays, all of the same shuffles in the same order. The
+    choice is repeated with each price halved and doubled; what changes then is in the field
+    `price_changes` of the result. `left_behind`, `out_of_reach` and `fresh` become its fields with
+    these names.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
@@ -661,12 +674,15 @@ def curve_of(
 
 
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
-    """Return the rows of a cost curve, the best row, and the verdict on it; see `CostCurve`.
+    """Return a row for each policy in `groups`, the cheapest first, the best row, and the verdict.
 
-    There is a row for each policy in `groups`, the cheapest first. The best row is the cheapest,
-    unless there are rows that accept fewer bad parts, are not significantly dearer, and have an
-    expected cost below the price of a check: then it is the row of these that accepts fewest bad
-    parts. The verdict is "pays", "may pay" or "does not pay".
+    `groups` has each policy with its replays, and `costs` are the prices. The best row is the
+    cheapest, unless there are rows
+    that accept fewer bad parts, are not significantly dearer, and have an expected cost below the
+    price of a check: then it is the row of these that accepts fewest bad parts. The expected cost
+    has half an error added to each share of wrong decisions. The verdict is "pays" if the whole
+    interval of its cost is below the price of a check, "does not pay" if its mean or its expected
+    cost is not, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
@@ -692,7 +708,11 @@ def _chosen_name(row: PolicyCost, verdict: str) -> str:
 
 
 def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> PolicyCost:
-    """Return one policy's costs, shares and errors over its replays."""
+    """Return what a part costs under a policy, from its replays: mean cost with an interval, shares
+    of decisions, and error rates, as the fields of `PolicyCost`.
+
+    All replays are equally long; the prices are `costs`.
+    """
     n = len(replays)
     verified, accepted, rejected = (
         float(np.mean([getattr(replay, name) for replay in replays]))
@@ -738,10 +758,13 @@ def _order_error(means: Floats) -> float:
 def _difference(
     first: Sequence[Replay], other: Sequence[Replay], costs: Costs
 ) -> tuple[float, float]:
-    """Return how much dearer a part is under one policy than under another, and its standard error.
+    """Return how much dearer a part is in the replays `first` than in `other`, and the standard
+    error of this difference.
 
-    Both policies have played the same shuffles. The standard error adds the variance between parts,
-    whose differences are summed over the shuffles first, and the variance between shuffles.
+    The first value is a mean over all parts, in the unit of `costs`; it is negative if `first` is
+    cheaper. The replays are those of two policies, which have played the same shuffles in the same
+    order. The standard error adds the variance between parts, whose differences are summed over the
+    shuffles first, and the variance between shuffles.
     """
     differences = np.array(
         [
@@ -757,9 +780,10 @@ def _difference(
 
 
 def part_costs(replay: Replay, costs: Costs) -> Floats:
-    """Return what each part of a replay cost, (n,): its check, or its wrong decision.
+    """Return what each of the n parts of a replay cost, (n,): its check, or its wrong decision.
 
-    A part that an operator's limits rejected costs as much as a checked one.
+    A right decision without a check costs 0. A part that left an operator's force limits costs as
+    much as a checked one, whether it was verified or rejected.
     """
     checked = costs.check * ~(replay.accepted | replay.rejected)
     wrong = costs.escape * replay.false_positive + costs.false_reject * replay.false_negative

@@ -73,7 +73,10 @@ TRUTH_MARKS: dict[Any, tuple[str, Style]] = {
 
 
 def blank(width: float, height: float, title: str = "") -> Figure:
-    """Return an empty figure with a title; width and height are in inches."""
+    """Return an empty matplotlib figure with a title; width and height are in inches.
+
+    It is made without pyplot, so that no global state keeps it.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -83,6 +86,8 @@ def blank(width: float, height: float, title: str = "") -> Figure:
 
 def finish(axes: Axes, legend: int = 3, **settings: Any) -> None:
     """Give axes a light grid, no box, and a legend above them, where it hides no curve.
+
+    Returns nothing; the axes are changed.
 
     Parameters
     ----------
@@ -107,7 +112,7 @@ def finish(axes: Axes, legend: int = 3, **settings: Any) -> None:
 
 
 def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) -> Path:
-    """Write a figure in the format that the file's suffix names, creating the folder.
+    """Write a figure in the format that the file's suffix names; create the folder if needed.
 
     Parameters
     ----------
@@ -115,6 +120,7 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
     path : path
         Written as it is: without a suffix the format is PNG, and none is appended.
     dpi : int, default 120
+        Dots per inch.
     force : bool, default False
         Whether a file that exists is replaced.
 
@@ -136,13 +142,14 @@ def save(figure: Figure, path: str | Path, dpi: int = 120, force: bool = False) 
 
 
 def embedding_map(replay: Replay, title: str = "") -> Figure:
-    """Draw the embeddings of a replay's newest 300 parts, by truth (left) and decision (right).
+    """Draw the embeddings of a replay's newest 300 parts, and return the figure.
 
-    A point is the mean over the embedding spaces of the folds, in its first two dimensions, as it
-    was at the decision; later retrains do not move it. Parts that no model embedded are left out,
-    on the left also parts of unknown truth. A circle with the recipe's radius is the neighbourhood
-    of the newest point. If the first dimension is a probability, the second says little: the
-    vertical axis is then the cycle, and two vertical lines bound the neighbourhood.
+    The left panel shows which parts were good and bad, the right one what was decided. A point is
+    the mean over the embedding spaces of the folds, in its first two dimensions, as it was at the
+    decision; later retrains do not move it. Parts that no model embedded are left out, on the left
+    also parts of unknown truth. A circle with the recipe's radius is the neighbourhood of the
+    newest point. If the first dimension is a probability, the second says little: the vertical axis
+    is then the cycle, and two vertical lines bound the neighbourhood.
 
     Parameters
     ----------
@@ -198,9 +205,10 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
 
 
 def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip: bool) -> None:
-    """Draw a point (2,) as a cross, and its neighbourhood, into all axes, and a legend below.
+    """Draw a point as a cross, with its neighbourhood, into all axes of a figure; add a legend.
 
-    The neighbourhood is a circle, or a strip between two vertical lines if `is_strip`.
+    `centre` (2,) is the point, and `radius` the radius of its neighbourhood, which is a circle, or
+    a strip between two vertical lines if `is_strip`.
     """
     from matplotlib.patches import Circle
 
@@ -228,8 +236,8 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
         Cycles in a window. At the first cycles, before there are so many, a window has all cycles
         so far.
     fewest : int, default 1
-        precision, false_positive and false_negative are NaN if the windows of all replays together
-        have fewer decisions of their kind, or none.
+        precision and false_positive are NaN if the windows of all replays together have fewer
+        accepted parts than this, or none; false_negative likewise for rejected parts.
 
     Returns
     -------
@@ -269,13 +277,16 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
 
 
 def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure:
-    """Draw the paper's curves, with a colour for each key: replays of a recipe, or a live run.
+    """Draw the paper's curves over a sliding window of cycles, in a colour for each key.
+
+    A key is a recipe with its replays, or a live run.
 
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the policy's
     lower bound LB; bad parts among the accepted parts (solid), good parts among the rejected parts
-    (dashed), and the tolerance 100 - LB. The legend below has the counts. Shares of fewer than 20
-    parts are not drawn. The window is 300 cycles, or a third of the longest replay if that is less.
+    (dashed), and the tolerance 100 - LB, all in percent. The legend below has the counts of wrong
+    decisions. Shares of fewer than 20 parts are not drawn. The window is 300 cycles, or a third of
+    the longest replay if that is less.
 
     Parameters
     ----------
@@ -390,7 +401,11 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
 
 
 def _axis_labels(spec: TraceSpec) -> list[str]:
-    """Return the label of each channel's axis: its name, and its unit in brackets if known."""
+    """Return a label for the axis of each channel of traces with this `TraceSpec`: its name, and
+    its unit in brackets if known.
+
+    A single channel without a name is called "trace".
+    """
     names = spec.names if spec.columns or spec.channels > 1 else ["trace"]
     return [
         f"{name} [{unit}]" if unit else name for name, unit in zip(names, spec.units, strict=True)
@@ -406,10 +421,11 @@ def _times(spec: TraceSpec, samples: int) -> tuple[Floats, str]:
 def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
-    It has a panel for each channel, of at most four, those that leave the envelope most. The
-    envelope is the band in which 95 % of the successes lie at each sample. Stretches in which the
-    trace leaves the envelope by more than a tenth of its width are shaded. Without an envelope only
-    the traces are drawn, of the first four channels.
+    It has a panel for each of at most four channels: those that are outside the envelope in most
+    samples. The envelope is the band in which 95 % of the successes lie at each sample. Samples
+    that are outside by more than a tenth of its width are shaded. Without an envelope only the
+    traces are drawn, of the first four channels. The title has the decision, its reason, the
+    version and the label.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -446,7 +462,10 @@ def explained_picture(explanation: Explanation) -> Figure:
 
 
 def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: int) -> None:
-    """Draw one channel of the traces of the nearest references, as far as these are stored."""
+    """Draw one channel of the traces of a decision's neighbours, good and bad ones in two styles.
+
+    `x` (T,) are the times of the samples. Neighbours whose trace is not stored are left out.
+    """
     for success, name, colour, line, _ in LABEL_STYLES:
         traces = [
             neighbour.trace[channel]
@@ -463,18 +482,23 @@ def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: i
 def _draw_band(
     axes: Axes, x: Floats, band: Sequence[NDArray[Any]], colour: str, line: str, label: str
 ) -> None:
-    """Draw a band of traces, given as its lower end, its median and its upper end."""
+    """Draw a band of traces, given by three curves (T,): its lower end, its median, its upper end.
+
+    `x` (T,) are the times of the samples, `line` is the style of the median, and `label` names it
+    in the legend.
+    """
     low, median, high = band
     axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
     axes.plot(x, median, line, color=colour, linewidth=1.2, label=label)
 
 
 def data_picture(data: Dataset, title: str = "") -> Figure:
-    """Draw a data set's traces, and how it changes in its order; return the figure.
+    """Draw a data set's traces, and how they change in their order; return the figure.
 
     Above, a panel for each of the first three channels shows the median trace of good and of bad
-    parts, and where the middle 80 % lie. Below are the share of good parts, and the mean of each
-    trace's first channel, in recorded order. Traces that are not finite are not drawn.
+    parts, and where the middle 80 % lie. Below are the share of good parts in a sliding tenth of
+    the set, and the mean of each trace's first channel, in recorded order. Traces with a sample
+    that is not finite are not drawn; their labels count in the share. `title` begins the title.
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
@@ -496,10 +520,12 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 
 
 def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: str) -> None:
-    """Draw the share of good parts in a sliding tenth of the set, and each finite trace's mean.
+    """Draw into `figure` the share of good parts in a sliding tenth of a data set, and the mean of
+    each finite trace.
 
     The share begins at the end of the first tenth. The mean is taken over the samples of the first
-    channel; `label` names the channel and its unit. `figure` is a Figure or SubFigure.
+    channel; `label` names this channel and its unit. `figure` is a Figure or SubFigure, and
+    `finite` (n,) says which of the n traces have no sample that is not finite.
     """
     import pandas as pd
 

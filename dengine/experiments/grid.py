@@ -90,10 +90,10 @@ class KeptReplays:
         self._data_digest = digest((data.name, data.X, data.y, data.part, data.rate_hz))
 
     def path(self, task: Task) -> Path:
-        """Return the path of a task's replay in the folder, whether or not it is there.
+        """Return the path of the file of a task's replay in the folder, whether or not it exists.
 
-        Its name is a hash of all that the decisions depend on: data, settings, source code and
-        libraries.
+        The name of the file is a hash of all that the decisions depend on: data, settings, seed,
+        source code and libraries.
 
         Raises
         ------
@@ -128,10 +128,11 @@ class KeptReplays:
         return self.folder / f"{name}.npz"
 
     def get(self, task: Task) -> Replay | None:
-        """Read the kept replay of a task; return None if there is none or its file is damaged.
+        """Read the replay of a task from the folder and return it; None if there is none, or if its
+        file is damaged.
 
-        The replay gets the name and recipe of the task's contender. Raises SettingError for a
-        reducer that cannot be hashed.
+        The replay gets the name and recipe of the task's contender, who played it. Raises
+        SettingError for a reducer that cannot be hashed.
         """
         path = self.path(task)
         try:
@@ -150,10 +151,11 @@ class KeptReplays:
             return None
 
     def put(self, task: Task, replay: Replay) -> None:
-        """Write the finished replay of a task, replacing an earlier one.
+        """Write the finished replay of a task into the folder, replacing an earlier file of it.
 
-        The file is written as a whole or not at all. Raises OutputError if it cannot be written,
-        and SettingError for a reducer that cannot be hashed.
+        The file is compressed, and is written as a whole or not at all. Name and recipe are not
+        written, since `get` takes them from the task. Raises OutputError if the file cannot be
+        written, and SettingError for a reducer that cannot be hashed.
         """
         arrays: dict[str, Any] = {}
         values: dict[str, Any] = {}
@@ -171,7 +173,8 @@ class KeptReplays:
 
 @cache
 def _digest_of_source() -> str:
-    """Return a hash of dengine's source and of the versions of Python and of the `LIBRARIES`.
+    """Return a hash, as hexadecimal text, of dengine's source and of the versions of Python and of
+    the `LIBRARIES`.
 
     It is computed once in a process. Libraries that are not installed are left out.
     """
@@ -199,10 +202,11 @@ def _source_of(class_or_function: Any) -> str:
 
 
 def _classes_and_functions(reducer: Any) -> list[Any]:
-    """Return the classes and functions whose code a scikit-learn transformer runs, without repeats.
+    """Return the classes and functions whose code a scikit-learn transformer (`reducer`) runs,
+    without repeats.
 
-    These are its class, the classes of the estimators among its parameters, and the functions among
-    its parameters.
+    These are its class, the classes of the estimators among its parameters (all objects with a
+    method `fit`, also those nested in others), and the functions among its parameters.
     """
     params = reducer.get_params(deep=True).values()
     estimators = [reducer, *(param for param in params if hasattr(param, "fit"))]
@@ -211,7 +215,10 @@ def _classes_and_functions(reducer: Any) -> list[Any]:
 
 
 def load_contenders(recipes: Sequence[Any]) -> list[Contender]:
-    """Load contenders, each from anything that `Contender.load` takes; one text is one contender.
+    """Return a list of contenders, each loaded from anything that `Contender.load` takes.
+
+    A contender, who plays a stream, is a recipe or a baseline with a name. If `recipes` is one
+    text, it gives one contender.
 
     Raises
     ------
@@ -257,10 +264,11 @@ def iterate_replays(
     keep: FilePath | None = None,
     on_cycle: Any = None,
 ) -> Iterator[PlayedReplay]:
-    """Play tasks and yield each replay as soon as it is finished.
+    """Play tasks, each a replay to be played, and yield each replay as soon as it is finished.
 
-    Replays that an earlier run kept come first. The other tasks are begun seed by seed, so that the
-    replays that an interrupted run has finished can be compared.
+    Replays that an earlier run kept in the folder `keep` come first. The other tasks are begun seed
+    by seed, so that the replays that an interrupted run has finished can be compared; they are
+    yielded in the order in which they end.
 
     Parameters
     ----------
@@ -315,7 +323,11 @@ def iterate_replays(
 
 
 def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay]:
-    """Play one task, in this process or a worker; return `i`, its position, and the replay."""
+    """Play one task, a replay of the data set to be played, in this process or a joblib worker.
+
+    Returns `i`, the position of the task among all tasks, and the replay. `on_cycle` is called with
+    the number of finished cycles after each; None: nothing is called. Raises what `replay` raises.
+    """
     played = replay(
         data,
         task.contender,
@@ -351,7 +363,9 @@ def run_grid(
     recipes : str or sequence
         A name, or a list of what `replay` takes, baselines included.
     alphas, lower_bounds : sequence of float
+        Settings of the policy to try.
     intervals : sequence of str, default ("wilson",)
+        Names of confidence intervals to try: "wilson" or "binomial".
     repeats : int, default 30
         Shuffles; the seeds count from 0.
     n_jobs : int, default -1
@@ -391,7 +405,7 @@ def grid_tasks(
     cycles: int | None = None,
     shuffle: bool = True,
 ) -> list[Task]:
-    """Return every combination of settings as a task, the seeds varying fastest.
+    """Return every combination of settings as a task, a replay to be played; seeds vary fastest.
 
     Parameters
     ----------

@@ -102,10 +102,10 @@ def pooled_error(replays: Sequence[Any], side: str = "accepted", alpha: float = 
 
 
 def _count_per_trace(replays: Sequence[Any], name: str, size: int) -> Floats:
-    """Return for each trace in how many cycles of all replays a field was True, shape (size,).
+    """Return for each trace of a data set in how many cycles of all replays a field was True.
 
-    `name` is a field of `Replay` with a bool for each cycle; `index` of the replay says which trace
-    a cycle had.
+    The result is float64, shape (size,), by the index of the trace in the data set. `name` is a
+    field of `Replay` with a bool for each cycle; its field `index` says which trace a cycle had.
     """
     counts = np.zeros(size)
     for replay in replays:
@@ -179,6 +179,6 @@ class Costs:
         """Return the mean cost of a part if the model accepts and rejects these shares of parts.
 
         `bad` is the share of bad parts among the accepted ones, `good` that of good parts among the
-        rejected ones. All other parts are checked.
+        rejected ones. All other parts are checked. Shares are from 0 to 1.
         """
         return self.check - self.saved(accepted + rejected, accepted * bad, rejected * good)

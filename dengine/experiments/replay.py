@@ -97,7 +97,7 @@ class Contender:
 
     @classmethod
     def load(cls, recipe: Any) -> "Contender":
-        """Return the contender for a recipe or for a baseline's name.
+        """Return the contender, who plays a stream, for a recipe or for a baseline's name.
 
         Parameters
         ----------
@@ -130,10 +130,12 @@ class Contender:
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
     def engine(self, seed: int, trace: TraceSpec | None = None) -> DataEngine:
-        """Return a new engine in memory; its model is the baseline if the contender is one.
+        """Return a new engine with a store in memory; its model is the baseline if the contender is
+        one.
 
-        A training ends after a number of steps and not by the time budget, so that the same seed
-        gives the same decisions. Raises SettingError if the baseline's library is not installed.
+        `trace` is the `TraceSpec` of the traces; None: the first trace sets it. A training ends
+        after a number of steps and not by the time budget, so that the same seed gives the same
+        decisions. Raises SettingError if the baseline's library is not installed.
         """
         model = None
         if self.baseline is not None:
@@ -271,8 +273,8 @@ class Replay:
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each cycle, numbered from 1.
 
-        Its columns are the fields of shape (n,), and one for each dimension of `position`:
-        embedding_1, embedding_2, ...
+        Its columns are the fields that have a value for each cycle, and one for each dimension of
+        `position`, the embedding: embedding_1, embedding_2, ...
         """
         import pandas as pd
 
@@ -287,10 +289,11 @@ class Replay:
         return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
 
     def stretches(self, n: int) -> list[Row]:
-        """Cut the run into stretches of about equal length; return the `stretch` of each.
+        """Cut the run into n stretches of about equal length; return the counts of each, as the
+        method `stretch` returns them.
 
-        A stretch is a number of consecutive cycles. There are n of them, or one for each cycle if
-        there are fewer cycles; none without cycles.
+        A stretch is a number of consecutive cycles. If there are fewer cycles than n, each has a
+        stretch of its own; without cycles the list is empty.
         """
         edges = np.unique(np.linspace(0, len(self), n + 1).round().astype(int)).tolist()
         return [self.stretch(slice(begin, end)) for begin, end in pairwise(edges)]
@@ -307,10 +310,12 @@ class Replay:
         -------
         counts : dict
             first_cycle and last_cycle, counted from 1. verified_share, NaN without cycles. Numbers
-            of cycles: verified, accepted, rejected (by the model), false_positive, false_negative,
-            novel, safe_mode, outside, and stops, the line stops. parts_per_hour, the good parts
-            passed on per hour: None if the cell has no clock, no time passed, or there is no cycle.
-            The time of the first cycle of the run begins at 0 of the cell's clock.
+            of cycles: verified, accepted, rejected (by the model), false_positive (accepted and
+            bad), false_negative (rejected and good), novel (verified as novel), safe_mode (after
+            which every part is verified), outside (the trace left the force limits), and stops, the
+            line stops. parts_per_hour, the good parts passed on per hour: None if the cell has no
+            clock, no time passed, or there is no cycle. The time of the first cycle of the run
+            begins at 0 of the cell's clock.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
@@ -344,11 +349,16 @@ class Replay:
         Returns
         -------
         row : dict
-            Among others certain, the number of parts that the model accepted or rejected;
-            first_certain, the cycle of the first of them, counted from 1; dropped, the reason of
-            the last retrain that was dropped, or ""; saved_s, the seconds of checks that these
-            parts saved; and net_s, which is saved_s minus the cost of errors, in seconds, by the
-            defaults of `Costs`.
+            The settings: recipe, interval, alpha, lower_bound, guarantee, stops, confirm, seed.
+            The numbers of cycles of `stretch` but verified and stops; cycles; certain, the number
+            of parts that the model accepted or rejected; first_certain, the cycle of the first of
+            them, counted from 1. precision and npv, the shares of right decisions among the
+            accepted and the rejected parts, and accuracy, among both. retrains, their number;
+            retrains_dropped, the number of those that were dropped; dropped, the reason of the last
+            of these, or "". Median and largest time of a retrain (s), median and 99th percentile of
+            a decision's (µs), and the seconds of the replay. saved_s, the seconds of checks that
+            the certain parts saved; and net_s, which is saved_s minus the cost of errors, in
+            seconds, by the defaults of `Costs`.
         """
         nan = float("nan")
         policy = self.recipe.policy
@@ -416,11 +426,12 @@ class ObservedCycle(NamedTuple):
 
 
 def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[ObservedCycle]:
-    """Let the engine drive a cell, and yield each cycle as it ends.
+    """Let the engine drive a cell for a number of cycles, and yield each cycle as it ends.
 
-    The truth is the cell's attribute `truth` if it has this attribute, otherwise the label that was
-    reported, or NaN if none was. The clock is the cell's attribute `clock`, or None. An exception
-    of the cell is raised after the engine has written what it knows.
+    With the cycle come the truth, whether the part was good, and the clock, the seconds of
+    production. The truth is the cell's attribute `truth` if it has this attribute, otherwise the
+    label that was reported, or NaN if none was. The clock is the cell's attribute `clock`, or None.
+    An exception of the cell is raised, after the engine has written its decisions and labels.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)
@@ -431,8 +442,8 @@ def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Obse
 def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
     """Return observed cycles, in their order, as a `Replay`; it is empty if there are none.
 
-    The fields of a recorded data set (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their
-    defaults.
+    `recipe` is the recipe of the engine that drove the cell. The fields that only a replay of a
+    recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
     """
     cycles = [item.cycle for item in observed]
     decisions = [cycle.decision for cycle in cycles]
@@ -458,11 +469,11 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 
 
 def _positions(decisions: list[Decision]) -> Floats:
-    """Return the embedding of each decision, the mean over its spaces, (n, d).
+    """Return the embedding of each of n decisions, the mean over the embedding spaces, (n, d).
 
     d is the dimension of the newest embedding, or 2 if there is none. A reducer may give more
-    dimensions as it sees more traces; rows with another dimension, or without an embedding, are
-    NaN.
+    dimensions as it sees more traces; a decision whose embedding has another dimension, or that has
+    none, has a row of NaN.
     """
     means = [
         np.mean(decision.embedding, axis=0) if decision.embedding else np.empty(0)
@@ -487,14 +498,15 @@ def watch(
     engine : DataEngine
     cell : Cell
     cycles : int
+        Number of parts, one in each cycle.
     on_cycle : callable or None, default None
         Called with each finished cycle.
 
     Returns
     -------
     run : Replay
-        The run of all `cycles`. An exception of the cell goes on to the caller, and then nothing is
-        returned; only `on_cycle` has got the cycles before the exception.
+        The run of all `cycles`. An exception of the cell or of `on_cycle` goes on to the caller;
+        then nothing is returned, and only `on_cycle` has got the cycles before the exception.
     """
     observed = []
     for item in observe_cycles(engine, cell, cycles):
@@ -592,24 +604,27 @@ def replay(
 
 
 def replay_policy(scores: Replay, policy: Policy) -> Replay:
-    """Play a policy on the predictions of a replay in shadow mode, without its model.
+    """Let a policy decide on the predictions that a replay in shadow mode recorded.
 
-    In shadow mode every part was verified, and the model's bounds were recorded. The policy's rule
-    learns only outcomes that it would know in a replay of its own: checks, audits and line stops,
-    and with `stops="all"` also that an accepted part was good. One difference stays: the
-    predictions come from a model that has learned all labels. Audits are drawn anew. A part that an
-    operator's limits reject is verified.
+    No model is asked. In shadow mode every part was verified, and the counts and embeddings of the
+    model were recorded. The rule of the policy decides on these, and learns only outcomes that it
+    would know in a replay of its own: checks, audits and line stops, and with `stops="all"` also
+    that an accepted part was good. One difference to such a replay stays: the predictions come from
+    a model that has learned all labels. Audits are drawn anew, by the seed of the replay. A part
+    for which the model was not asked, such as a novel one or one that left an operator's force
+    limits, is verified.
 
     Parameters
     ----------
     scores : Replay
-        With `Policy(shadow=True)`.
+        A replay with `Policy(shadow=True)`.
     policy : Policy
 
     Returns
     -------
     replay : Replay
-        With the actions and the recipe of the policy; all else is as in `scores`.
+        A copy with the actions of the policy, and with the policy in its recipe; all else, also the
+        reasons and bounds, is as in `scores`.
     """
     import torch
 

@@ -88,8 +88,13 @@ class Survey:
 def survey_dataset(data: Dataset) -> Survey:
     """Count the traces, labels, faults and repeats of a data set.
 
-    Labels are only counted, nothing is learned from them. Repeats are looked for among the usable
-    traces: finite, not constant and not too large.
+    A repeat is a trace that equals, or nearly equals, that of another recording. Repeats are looked
+    for among the usable traces: finite, not constant, and without a sample beyond 1e18; near
+    repeats only among the newest 500 of these. Nothing is trained, and the data set is not changed.
+
+    Parameters
+    ----------
+    data : Dataset
 
     Returns
     -------

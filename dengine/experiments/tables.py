@@ -64,10 +64,10 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
 
 
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
-    """Pool the replays that have the same settings.
+    """Pool the replays that have the same settings, and return a row for each of these settings.
 
     The settings are the columns in `CONDITION`, from the recipe to `confirm`. There is a row for
-    each combination of their values, in the frame's order.
+    each combination of their values that the frame has, in the frame's order.
 
     Parameters
     ----------
@@ -124,11 +124,13 @@ def _share_right(n_wrong: int, n_decided: int) -> float:
 
 
 def promise_lines(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each row of `pool`: were at least LB of its accepted parts good?
+    """Return a sentence for each row that `pool` returned: were at least LB of its accepted parts
+    good?
 
     LB is the lower bound of the row's policy. The sentence ends with "kept" or "broken", or says
     that no part, or too few parts, were accepted. It always names the recipe and the guarantee. It
     names the interval, alpha, and whether good parts are confirmed only if the rows differ in it.
+    It has the share of good parts, and the interval of the share of bad parts if the row has one.
     """
     varying = [
         name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1
@@ -156,11 +158,11 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
 
 
 def pooled_table(rows: Sequence[Row], title: str = "Replays", legend: str = LEGEND) -> Table:
-    """Return the rows of `pool` as a rich Table for the screen.
+    """Return the rows that `pool` returned as a rich Table for the screen, with a legend below.
 
     There must be at least one row. The first column has the recipe, the guarantee, "confirmed" if
     accepted good parts were confirmed or else the policy's `stops`, and the interval if the rows
-    differ in it.
+    differ in it. The others are those of `CELLS`: counts, shares, times and savings.
     """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []
@@ -182,6 +184,7 @@ def table_of_numbers(
     Parameters
     ----------
     title, caption : str
+        Texts above and below the table.
     rows : sequence of mappings
         A mapping for each row, at least one: column title -> cell, with the same titles in all. The
         first column has the names of the rows.
@@ -240,9 +243,11 @@ CELLS: dict[str, Any] = {
 
 
 def retrain_line(retrains: Sequence[RetrainReport]) -> str:
-    """Return a sentence: how many retrains there were, the slowest, and how many were dropped.
+    """Return a sentence: how many retrains there were, the seconds of the slowest, and how many new
+    versions were dropped.
 
-    It gives the reason of the last dropped retrain. If there was no retrain, it is "No retrain."
+    If any was dropped, it gives the reason of the last one. If there was no retrain, it is "No
+    retrain."
     """
     if not retrains:
         return "No retrain."

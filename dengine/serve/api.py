@@ -75,6 +75,8 @@ LARGE_SHARE = 0.025
 class Refusal(Exception):  # noqa: N818  # a response, not an error
     """Raised to answer a request with an HTTP error; `problem_response` makes the response.
 
+    A handler, the method that answers a request, raises it; so does what reads a request.
+
     Parameters
     ----------
     status : int
@@ -99,12 +101,13 @@ def field_types(record: type, *without: str) -> Json:
 
 
 def _request_type(handler: Callable[..., Any], optional_fields: Json) -> type[Struct]:
-    """Return a msgspec struct type with a field for each parameter of a handler but **keywords.
+    """Return a msgspec struct type, into which a request is decoded.
 
-    A parameter with a default may be left out of a request. The `optional_fields`, given as types
-    by name, may be left out too, and are UNSET then. Unknown fields are refused. Underscores at the
-    end of a parameter's name are left out in a request: `id_` is `id` there. The type gets the
-    handler's docstring.
+    It has a field for each parameter of the handler (the method that answers the request), except a
+    `**` parameter. A parameter with a default may be left out of a request. The `optional_fields`,
+    given as types by name, may be left out too, and are UNSET then. Decoding refuses unknown
+    fields. Underscores at the end of a parameter's name are left out in a request: `id_` is `id`
+    there. The type gets the handler's docstring.
     """
     hints = get_type_hints(handler, include_extras=True)
     members: list[tuple[Any, ...]] = []
@@ -134,10 +137,12 @@ def media_type(request: Request) -> str:
 
 
 async def read_body(request: Request, struct_type: type[T], *other_types: str) -> T:
-    """Decode a request's JSON body into a struct; the body is an object without nested objects.
+    """Decode a request's JSON body into a struct of `struct_type`, and return the struct.
 
-    Raises Refusal: 415 for another media type (the message lists JSON and the `other_types` as
-    accepted), 400 for a body that cannot be decoded or has a name twice, 422 for wrong fields.
+    The body is an object without nested objects. Raises Refusal: 415 for another media type than
+    JSON, 400 for a body that is no JSON or has a name twice, 422 for fields that the type does not
+    take. The message of 415 also lists `other_types`, the media types that the caller reads itself.
+    Raises ClientDisconnect if the client goes away before the whole body has come.
     """
     media = media_type(request)
     if media != JSON:
@@ -165,10 +170,11 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
 
 
 def read_query(request: Request, struct_type: type[T], **body: bytes) -> T:
-    """Convert a request's query, the parts of its path, and a raw body, into a struct.
+    """Convert the query of a request and the parameters in its path to a struct of `struct_type`.
 
-    `body` has the raw body's bytes under the name of its field. Texts are converted to the fields'
-    types. Raises Refusal 422 for an unknown or repeated name, a missing field and a wrong value.
+    If the body is bytes, `body` has these bytes under the name of the field that gets them. Texts
+    are converted to the types of the fields. Raises Refusal 422 for an unknown name, a name that
+    comes twice, a missing field and a wrong value.
     """
     pairs = [*request.query_params.multi_items(), *request.path_params.items(), *body.items()]
     try:
@@ -186,8 +192,8 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
     ----------
     value : bytes, list of float, or list of list of float
         Bytes are raw float32, little-endian, channel after channel. A nested list has a list for
-        each channel. None becomes NaN, and a number beyond float32 infinity; the engine recognizes
-        both.
+        each channel. None becomes NaN, and a number beyond float32 infinity; for the engine both
+        are faults of the trace.
     channels : int
         Number of channels in bytes; lists do not need it.
 
@@ -231,12 +237,13 @@ def as_samples(value: Any, channels: int = 1) -> TraceArray:
 
 
 def _look_like_float64(words: NDArray[np.float32]) -> bool:
-    """Return whether float32 words look like the halves of float64 numbers, low half first.
+    """Return whether float32 words (n,) look like halves of float64 numbers, each low half first.
 
-    The low half of a float64 number is the end of its fraction: random bits, or zeros. So the
-    result is True if all low halves are zero and some high half is not. It is also True if many low
-    halves, at least `LARGE_SHARE` of all words, are more than `LARGE_FACTOR` times as large as the
-    largest high half. It is False for fewer than `MIN_WORDS` words and for an odd number of words.
+    The low half of a float64 number, the words at even positions, is the end of its fraction:
+    random bits, or zeros. So the result is True if all low halves are zero and some high half is
+    not. It is also True if many low halves, at least `LARGE_SHARE` of all words, are more than
+    `LARGE_FACTOR` times as large as the largest high half, or as 1 if that is larger; words that
+    are not finite do not count. It is False for fewer than `MIN_WORDS` words and for an odd number.
     """
     if len(words) % 2 or len(words) < MIN_WORDS:
         return False
@@ -256,11 +263,12 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
 def _response_type(
     name: str, about: str, record: type | None = None, without: tuple[str, ...] = (), **more: Any
 ) -> type[Struct]:
-    """Make the struct type of a response, named `name`.
+    """Make and return a msgspec struct type named `name`, which describes a response.
 
-    It has the fields of the record, except those in `without`, with their types in JSON. It also
-    has the fields of `more`, given as types by name; they replace fields of the record with the
-    same name. Its description is `about`, followed by the record's docstring.
+    It has the fields of the dataclass `record`, if one is given, except those in `without`, with
+    their types in JSON. It also has the fields of `more`, given as types by name; they replace
+    fields of the record with the same name. Its docstring is `about`, followed by the docstring of
+    the record.
     """
     members = _json_field_types(record) if record else {}
     types = {key: hint for key, hint in members.items() if key not in without}
@@ -270,10 +278,11 @@ def _response_type(
 
 
 def _json_field_types(record: type) -> Json:
-    """Return the types of a record's fields in JSON, under the names that `to_jsonable` gives them.
+    """Return a dict: name of each field of the dataclass `record` -> its type in JSON.
 
-    The metadata of a dataclass field may have a mark: an "apart" field is left out, and a "flat"
-    field, itself a record, is replaced by its own fields.
+    The names are those that `to_jsonable` uses. A field is left out if its metadata has the key
+    "apart". If its metadata has the key "flat", the field holds a dataclass itself, and is replaced
+    by the fields of that dataclass.
     """
     hints = get_type_hints(record)
     members: Json = {}
@@ -287,10 +296,11 @@ def _json_field_types(record: type) -> Json:
 
 @cache
 def _json_type(hint: Any) -> Any:
-    """Return the type that a Python type has in JSON.
+    """Return the type that a value of the Python type `hint` has in JSON, as msgspec writes types.
 
-    A dataclass becomes a struct, a list or a tuple a list of its first item's type, and a float may
-    be null. In `X | Y` both types are converted. Other types are returned as they are.
+    A dataclass becomes a struct type, a list or a tuple a list of its first item's type, and a
+    float may be null. In `X | Y` both types are converted. Other types are returned as they are.
+    The result is cached.
     """
     if isinstance(hint, type) and is_dataclass(hint):
         return _response_type(hint.__name__, "", hint)
@@ -413,10 +423,10 @@ RESPONSES = {
 
 
 def response_fields(name: str, record: object = None, **more: Any) -> Json:
-    """Return the fields of the response type `name` as a dict for JSON.
+    """Return a dict for JSON with the fields of the response type that `RESPONSES` has by `name`.
 
-    Their values come from `more`, as they are, else from the record, as `to_jsonable` converts it;
-    fields without a value, and values without a field, are left out.
+    A value comes from `more`, as it is, else from the record, as `to_jsonable` converts it; fields
+    without a value, and values without a field, are left out.
     """
     values = (to_jsonable(record) or {}) | more
     return {key: values[key] for key in RESPONSES[name].__struct_fields__ if key in values}
@@ -425,9 +435,10 @@ def response_fields(name: str, record: object = None, **more: Any) -> Json:
 def json_response(
     body: Any, status: int = 200, headers: Mapping[str, str] | None = None, media: str = JSON
 ) -> Response:
-    """Return an HTTP response with a body as JSON; a number that is not finite becomes null.
+    """Return an HTTP response with `body` as JSON; a number that is not finite becomes null.
 
-    Arrays become lists, and what JSON does not know becomes its text.
+    NumPy arrays become lists, and an object that JSON has no type for becomes `str(object)`.
+    `status` is the HTTP status, `headers` are added to the response, and `media` is its media type.
     """
 
     def encoded(value: Any) -> Any:
@@ -439,10 +450,11 @@ def json_response(
 def problem_response(
     status: int, detail: str, headers: Mapping[str, str] | None = None
 ) -> Response:
-    """Return the response to a request that is not served, a `Problem` as JSON.
+    """Return the response to a request that is not served, in JSON with the fields of `Problem`.
 
-    Its detail is put on one line, and passwords of URLs are masked. With status 503 a header says
-    when to try again.
+    These are the status, its title, the detail, and the action "verify". The detail is put on one
+    line, and passwords of URLs in it are masked. `headers` are added to the response; with status
+    503 it also has the header Retry-After, with 1 second.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)} if status == 503 else {}
     line = " ".join(without_password(detail).split())
@@ -451,11 +463,12 @@ def problem_response(
 
 
 def _error_response(request: Request, error: Any) -> Response:
-    """Return the `Problem` response of an exception.
+    """Return the response that `problem_response` makes for an exception of a request.
 
-    Its status is the exception's own, or the one that `STATUSES` has for its type; it is 400 if the
-    client disconnected. Any other exception gets 500 with a general text, and is logged with its
-    traceback.
+    A Refusal and starlette's HTTPException have a status and headers of their own; for the statuses
+    404 and 405 of the latter, dengine has its own text. The status is 400 if the client
+    disconnected, and for other errors the one that `STATUSES` has for their type, with the error's
+    text. Any other exception gets 500 with a general text, and is logged with its traceback.
     """
     if isinstance(error, Refusal):
         return problem_response(error.status, error.detail, error.headers)
@@ -525,10 +538,11 @@ class Operation:
         """Read a request, call the handler with its fields, and return the response.
 
         The fields of a GET are read from its query and path, those of a POST from its JSON body. If
-        the body is bytes, it is the field `raw_parameter`, and the other fields are read from the
-        query. A result of the handler that is not a response is sent as JSON. Raises Refusal for a
-        request that cannot be read, and whatever the handler raises; the application turns both
-        into responses.
+        the operation has a `raw_parameter` and the body is bytes (application/octet-stream), the
+        body is the field of this name, and the other fields are read from the query. Optional
+        fields that were left out are not passed on. If the handler returns no response, its result
+        is sent as JSON. Raises Refusal for a request that cannot be read, and whatever the handler
+        raises; the application turns both into responses.
         """
         if self.method == "GET":
             values = read_query(request, self.request_type)
@@ -543,9 +557,11 @@ class Operation:
         return result if isinstance(result, Response) else json_response(result)
 
     def describe(self, schemas: Json) -> Json:
-        """Return the operation as an OpenAPI operation object.
+        """Return the operation as an OpenAPI operation object, a dict.
 
-        `schemas` has the JSON schema of every request type and response by name.
+        It has the summary, the parameters, the responses (200, and any other status as a problem),
+        and for a POST the request's body with its examples. `schemas` has the JSON schema of every
+        request type and response by name.
         """
         request_schema = schemas[self.request_type.__name__]
         is_json = self.response in RESPONSES
@@ -582,9 +598,10 @@ class Operation:
 
 
 def openapi_document(operations: Iterable[Operation], version: str) -> Json:
-    """Return the OpenAPI 3.1 document of these operations, which can be encoded as JSON.
+    """Return the OpenAPI 3.1 document of these operations, a dict that can be encoded as JSON.
 
-    `version` is the version of the interface. Tokens are described as optional.
+    `version` is the version of the interface. An operation is a method on a path. Tokens, which
+    authorize requests, are described as optional.
     """
     types = [*RESPONSES.values(), *(operation.request_type for operation in operations)]
     _, schemas = msgspec.json.schema_components(types, ref_template=REF)

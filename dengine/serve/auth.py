@@ -60,8 +60,8 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
 
     Each line is a secret, optionally followed by `viewer` or `operator` and the owner's name. A
     secret alone is an operator's. Empty lines are skipped, and what is beyond 64 KiB is not read. A
-    file in systemd's folder of credentials may also be readable by its group. On Windows no
-    permission is checked.
+    file in the folder that the variable CREDENTIALS_DIRECTORY names (systemd sets it) may also be
+    readable by its group. On Windows no permission is checked.
 
     Raises
     ------
@@ -102,7 +102,8 @@ def read_tokens(file: Path) -> tuple[Token, ...]:
 def is_loopback(host: str) -> bool:
     """Return whether only this machine can reach a server that listens at `host`.
 
-    True for localhost and a loopback address; False for every other name.
+    True for the name localhost and for a loopback address, also in brackets; False for every other
+    name or address.
     """
     try:
         return ip_address(host.strip("[]")).is_loopback
@@ -220,8 +221,8 @@ class Guard:
             await self.app(scope, _limit_body(receive), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
-        """Raise Refusal for a request that is not allowed; else set its token as `CURRENT_TOKEN`,
-        for the handlers.
+        """Raise Refusal for a request that is not allowed; otherwise set the context variable
+        `CURRENT_TOKEN` to its token.
 
         The checks are, in this order: a request to a server without tokens must call it localhost
         or by a loopback address (421); `_check_token` checks the token; a request that may change
@@ -250,12 +251,13 @@ class Guard:
             raise Refusal(*TOO_LARGE)
 
     def _check_token(self, scope: Scope, headers: Headers) -> None:
-        """Check a request's token, and set `CURRENT_TOKEN`.
+        """Check a request's token, and set the context variable `CURRENT_TOKEN` to it.
 
         Raises Refusal: 401 for a missing or wrong token, 403 for a viewer's token on a request that
-        may change something. A request for /healthz without a right token is allowed, and
-        `CURRENT_TOKEN` is then not set. A server without tokens allows every request. A secret in
-        the path is removed from `scope`.
+        may change something (a method other than GET, HEAD and OPTIONS). A request for /healthz
+        without a right token is allowed, and `CURRENT_TOKEN` is then not set. A server without
+        tokens allows every request, with the token `ANYBODY`. A secret in the path is removed from
+        `scope`, the ASGI scope of the request.
         """
         secret = take_token(scope, headers.get("authorization", ""))
         token = find_token(self.tokens, secret) if self.tokens else ANYBODY
@@ -276,7 +278,10 @@ class Guard:
 
 
 def _limit_body(receive: Receive) -> Receive:
-    """Return a `receive` that raises Refusal 413 beyond `MAX_BODY` bytes of a body."""
+    """Return an ASGI `receive` that passes on the messages of the given one.
+
+    It raises Refusal 413 once the body of the request has more than `MAX_BODY` bytes.
+    """
     bytes_left = MAX_BODY
 
     async def receive_body() -> Message:
@@ -292,7 +297,7 @@ def _limit_body(receive: Receive) -> Receive:
 
 
 def _with_headers(send: Send) -> Send:
-    """Return a `send` that adds the security headers to every response."""
+    """Return an ASGI `send` that adds the security headers in `HEADERS` to every response."""
 
     async def send_with_headers(message: Message) -> None:
         if message["type"] == "http.response.start":

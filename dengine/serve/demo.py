@@ -40,6 +40,11 @@ async def playing(
         Parts per second after the first `N_FAST`, which are played without a pause.
     seed : int
         Seed of the random order.
+
+    Raises
+    ------
+    DataError
+        If the recordings cannot be read.
     """
     cell = ReplayCell(data)
     cell.order = np.random.default_rng(seed).permutation(len(cell.data))
@@ -55,11 +60,12 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
     """Insert every part of a recording once, ask the service for a decision, and report the
     outcome.
 
-    The recorded result is reported for verified parts, and for accepted parts that are bad. After
-    each of the first `N_FAST` parts it only waits for the end of a retrain that is under way; later
-    parts come at `speed` parts per second. If the queue is full, the part or its report is left
-    out. A log line says when all parts were played. Any other exception is logged and ends the
-    demonstration, not the server.
+    `cell` plays the recording, from its first part on. The recorded result is reported for verified
+    parts, and for accepted parts that are bad, which stop the line. The first `N_FAST` parts come
+    without a pause, but a retrain that is under way is waited for; later parts come at `speed`
+    parts per second, and their report after 40 % of this time. If the queue is full, the part or
+    its report is left out. A log line says when all parts were played. Any other exception is
+    logged and ends the demonstration, not the server.
     """
     loop = asyncio.get_running_loop()
     run = uuid.uuid4().hex[:8]

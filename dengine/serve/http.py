@@ -101,7 +101,9 @@ class HttpApi:
 
     @cached_property
     def operations(self) -> list[Operation]:
-        """Every path and method, with its handler, the type of its response and examples."""
+        """The `Operation` of every path and method: its handler, the type of its response, and
+        examples; cached.
+        """
         one_channel: Json = {
             "trace": [0.1, 1.5, 2.25, None, 0.4],
             "request": "order-7",
@@ -162,7 +164,8 @@ class HttpApi:
         channels: Annotated[int, Meta(ge=1, le=99_999, description="Of bytes.")] = 1,
     ) -> Json:
         """Decide on a trace. The same trace and request id get the same decision; another trace
-        with that id gets 409, and a trace of a wrong shape 422.
+        with that id gets 409; a trace that the engine does not take, such as one of a wrong shape,
+        and an invalid id or part, get 422.
 
         If the body is bytes, the other fields are in the query. A decision that is not begun before
         the deadline is VERIFY with the reason late; if the store cannot take it, it is VERIFY with
@@ -190,14 +193,15 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        State either the decision's id or the part; both or neither is 422. An unknown id or part is
-        404. Only the newest 20 decisions on a part are looked at, and rejects count only if there
-        is nothing else; if several decisions count, it is 409. The same report twice is no error; a
-        report that contradicts an earlier one is 409. But `false` for an accepted part that was
-        confirmed as good before is a late line stop, and corrects the label. If the request has an
-        author or the token has a name, a new label is also recorded as an event. The response has
-        the label, whether it was known already, and the retrain that it set off if that is
-        finished.
+        State either the decision's id or the part; both or neither is 422, and so are a value that
+        is no label and an author that is not the token's. An unknown id or part is 404. Only the
+        newest 20 decisions on a part are looked at, and rejects count only if there is nothing
+        else; if several decisions count, it is 409. The same report twice is no error; a report
+        that contradicts an earlier one is 409. But `false` for an accepted part that was confirmed
+        as good before is a late line stop, and corrects the label. If the request has an author or
+        the token has a name, a new label is also recorded as an event. 503: the queue is full, or
+        the label may not be on disk; report it again. The response has the label, whether it was
+        known already, and the retrain that it set off if that is finished.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -223,11 +227,14 @@ class HttpApi:
         part: PartNumber = "",
         author: Author = "",
     ) -> Json:
-        """Correct a label, from the next decision on, and return what changed.
+        """Correct a label, from the next decision on, record that as an event, and return what
+        changed.
 
         The label as it was reported stays on record. A forgotten label counts again. If the part
         already counts with this label, nothing changes. 404: an unknown id or part; 409: a part
-        with several decisions that are no rejects; 422: a decision without a label.
+        with several decisions that are no rejects; 422: a decision without a label, both or neither
+        of id and part, or no author (unless the token has a name); 503: the queue is full, or the
+        store does not answer.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -240,11 +247,14 @@ class HttpApi:
         author: Author = "",
         reason: Annotated[str, Meta(description="For the event log.")] = "",
     ) -> Json:
-        """Leave labels out of training and of all counts, and return what changed.
+        """Leave the labels of the decisions `ids` out of training and of all counts, record that as
+        an event with the reason, and return what changed.
 
-        /correct makes a forgotten label count again. If the id of one decision is unknown (404), or
-        a decision has no label (422), no label is forgotten. If a rollback pinned the version in
-        force, and it was trained with one of the labels, it is released.
+        /correct makes a forgotten label count again. If the id of one decision is unknown (404), a
+        decision has no label, or no id is given (422), no label is forgotten. 422 also for a
+        request without an author, unless the token has a name. If a rollback pinned the version in
+        force, and this version was trained with one of the labels, it is released, so that retrains
+        may replace it. 503: the queue is full, or the store does not answer.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -283,7 +293,8 @@ class HttpApi:
 
         A pinned version is released, so that the new version may replace it. If a retrain is under
         way already, the response says so, and nothing changes. /versions tells afterwards whether
-        the new version was put in force or dropped.
+        the new version was put in force or dropped. 422: no author, unless the token has a name.
+        503: the queue is full, or the store does not answer.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -312,7 +323,11 @@ class HttpApi:
             bool, Meta(description="Include the state of the safe mode's detectors.")
         ] = False,
     ) -> Json:
-        """Return how the cell is doing: counts of decisions, version, faults, queue and alarm."""
+        """Return how the cell is doing: counts of decisions, version, faults, queue and alarm.
+
+        The counts are of all decisions, and of the newest `last`. 503: the queue is full, or the
+        store cannot be read.
+        """
         status = await self.service.status(last, watch)
         line = {name: getattr(self.service, name) for name in api.LINE}
         texts = {"alarm": status.alarm, "claim": status.certificate.sentence}
@@ -340,12 +355,14 @@ class HttpApi:
         ] = "",
         **where: Any,
     ) -> Json:
-        """Return decisions without their traces, newest first, and in `older` the id that `before`
-        takes for the next page, null if none are left. An unknown `before` is 404.
+        """Return up to `limit` decisions without their traces, newest first, and in `older` the id
+        that `before` takes for the next page, null if none are left. An unknown `before` is 404.
 
-        since and until are times in seconds since 1970; the first is included, the last is not.
-        predicted is what the model alone would have done. part is a part's number. With open, label
-        and action are ignored.
+        Only decisions with the given label, action, reason, predicted (what the model alone would
+        have done) and part (the part's number) are returned, if these are given, and only those
+        between the times since (included) and until (not included), in seconds since 1970. With
+        open, label and action are ignored. 422: a value that a field cannot have; 503: the queue is
+        full, or the store cannot be read.
         """
         selection = HistoryFilter(label=label, **where)
         before_id = (await self._find(before)).decision.id if before else None
@@ -369,11 +386,12 @@ class HttpApi:
     async def course(self, hours: ShiftHours = 0.0, start: ShiftStart = 0.0) -> Json:
         """Return counts of the decisions in stretches, oldest first, with retrains and safe modes.
 
-        A stretch is a number of decisions that are counted together. With `hours` a
-        stretch is a shift. Without it all decisions are split into at most 120 stretches of at
-        least 20 decisions; the newest stretch may have fewer. At most the newest 120 stretches are
-        returned, but all retrains and safe modes of the cell. 422: `hours` is shorter than one
-        second and not 0.
+        A stretch is a number of decisions that are counted together. With `hours` a stretch is a
+        shift of this length, and `start` is when one of the shifts begins. Without it all decisions
+        are split into at most 120 stretches of at least 20 decisions; the newest stretch may have
+        fewer. At most the newest 120 stretches are returned, but all retrains and safe modes of the
+        cell. 422: `hours` is shorter than one second and not 0; 503: the queue is full, or the
+        store cannot be read.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,
@@ -390,6 +408,7 @@ class HttpApi:
 
         The parts are the newest 250 references with a label of this cell and, of its newest 10
         decisions, those that the version in force made. There are none before the first version.
+        503: the queue is full, or the store cannot be read.
         """
         engine = self.service.engine
         parts = await self.service.read(
@@ -410,8 +429,10 @@ class HttpApi:
         return response_fields("Events", events=events[::-1])
 
     async def changes(self) -> Response:
-        """Server-sent events: hello with the server's version, then changed, at once and after each
-        change, and tick after `TICK` seconds without a change. They end when the server ends.
+        """Return a stream of server-sent events, which ends when the server ends.
+
+        The first is hello, with the server's version. Then comes changed, at once and after each
+        change, and tick after each 5 seconds without a change. Nothing says what has changed.
         """
 
         async def event_stream() -> AsyncIterator[str]:
@@ -436,7 +457,8 @@ class HttpApi:
 
         Degraded: the store or its journal cannot be written, the store differs from its ledger, or
         the last three or more retrains were dropped. Down: the engine's thread has ended, or was
-        busy with one thing for a minute. The texts of the faults come with it.
+        busy with one thing for a minute. The texts of the faults, and the number of requests in the
+        queue, come with it.
         """
         running = self.service.engine.state
         is_alive = self.service.silent_seconds < MAX_SILENT
@@ -456,7 +478,11 @@ class HttpApi:
         return FileResponse(STATIC / "docs.html")
 
     async def _find(self, id_: str) -> StoredDecision:
-        """Return a stored decision with its trace; raise UnknownDecisionError for an unknown id."""
+        """Return the stored decision with this id, with its trace and label.
+
+        Raises UnknownDecisionError for an unknown id, ReportError for an invalid one, StoreError if
+        it cannot be looked up, and BusyError if the queue is full or the service is closing.
+        """
         stored = await self.service.find(id_)
         if stored is None:
             raise unknown_decision(id_)
@@ -476,10 +502,11 @@ class HttpApi:
 
 
 def _checked_author(author: str) -> str:
-    """Return the author for the event log: the token's name if it has one, else the given name.
+    """Return the author for the event log: the name of the token that the present request has
+    (`CURRENT_TOKEN`), or the given name if this token has none.
 
-    Repeated spaces become a single one. Raises Refusal 422 if there is no name, if the name is too
-    long or not printable, and if the given name is not the token's.
+    In the given name repeated spaces become a single one. Raises Refusal 422 if there is no name,
+    if the name is too long or not printable, and if both names are given and differ.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
@@ -508,11 +535,11 @@ def _read_newest(
 
 
 def _read_explanation(store: SqlStore, id_: str) -> Json:
-    """Return the explanation of a decision, given by its id or its part's number, as a response.
+    """Return the explanation of a decision, named by its id or its part's number, as a JSON dict.
 
-    It has the decision's trace, the corrections of its label, the band of good parts (its three
-    curves are None if there is no band), and the newest `N_BADS` bad traces among the newest
-    `N_LABELS` labels (none if their shape differs).
+    Beside the fields of the `Explanation` it has the decision's trace, the corrections of its
+    label, the envelope (low, median and high are None if there is none), and the newest `N_BADS`
+    traces of bad parts among the newest `N_LABELS` labels (none if their shape differs).
 
     Raises StoreError if the trace of the decision or of a neighbour is damaged; other damaged rows
     are left out, and an event records that. Raises UnknownDecisionError if there is no such

@@ -76,10 +76,11 @@ class Metrics:
         service.observers.append(self.observe)
 
     def observe(self, response: ServiceResponse | ReportResponse | RetrainReport) -> None:
-        """Add the duration of a response or a retrain to the histogram of its type.
+        """Add the duration (`seconds`) of a response or a retrain to the histogram of its type.
 
-        The Prometheus labels of the histogram are the fields that `HISTOGRAMS` names: for a
-        decision, for example, its action and its reason.
+        There are three histograms: of decisions, reports and retrains. Their Prometheus labels are
+        values of the fields that `HISTOGRAMS` names, in lower case: for a decision its action and
+        its reason. Returns nothing.
         """
         kind = type(response)
         record = response.decision if isinstance(response, ServiceResponse) else response
@@ -93,8 +94,9 @@ class Metrics:
     def collect(self) -> Iterator[Metric]:
         """Yield gauges and counters with the present state of the engine and its queue.
 
-        Prometheus's registry calls this when the metrics are read. It reads no database, so that it
-        works while the store is unavailable.
+        They say for example which version is in force, whether it is in safe mode, how many
+        requests wait, and how many were late or refused. Prometheus's registry calls this when the
+        metrics are read. It reads no database, so that it works while the store is unavailable.
         """
         service = self._service
         engine = service.engine

@@ -94,8 +94,9 @@ class TokenUsers(UserManager):
     ) -> User | None:
         """Return the user of a new session, who may read and call; or None to refuse the session.
 
-        A session is refused if the server encrypts and the client has no certificate, or if the
-        server has tokens and the user name or the token is wrong.
+        The password is the token. A session is refused if the server encrypts and the client has no
+        certificate, or if the server has tokens and the user name or the token is wrong. `iserver`
+        is not used, and the content of the certificate is not checked.
         """
         if self._encrypted and not certificate:
             return None
@@ -212,8 +213,10 @@ class AddressSpace:
         self._alarm = ""
 
     async def build(self) -> None:
-        """Create the nodes of cell.xml, link the methods Decide and Report, and make the generator
-        of alarm events; call it once, before the server starts.
+        """Create the nodes of cell.xml in the server: the variables and the methods of the cell.
+
+        It also links the methods Decide and Report to `decide` and `report`, and makes the object
+        that sends alarm events. Call it once, before the server starts.
         """
         await self._server.import_xml(str(Path(__file__).with_name("cell.xml")))
         index = await self._server.get_namespace_index(NAMESPACE)
@@ -240,8 +243,9 @@ class AddressSpace:
     async def decide(self, trace: list[float], channels: int, request: str, part: str) -> list[Any]:
         """Decide on a flat trace: all samples of the first channel, then those of the next.
 
-        Returns a list of action (0 verify, 1 accept, 2 reject), id, reason, lower, upper, version.
-        A `request` "" gets a new id, a `part` "" means none. The same request id and trace get the
+        Returns a list: the action (0 verify, 1 accept, 2 reject), the id, the reason, the lower and
+        upper bound, and the version of the model. `request` is the caller's id of the trace, "" for
+        a new id; `part` is the part's number, "" for none. The same request id and trace get the
         same decision again.
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
@@ -281,7 +285,7 @@ class AddressSpace:
             await asyncio.sleep(MIN_REFRESH)  # meanwhile the newest decisions reach the store
 
     async def refresh(self) -> None:
-        """Read the cell's status and write it into the variables.
+        """Read the cell's status and write it into the OPC UA variables.
 
         If the status cannot be read, a warning is logged, and the variables keep their values with
         the OPC UA status code UncertainLastUsableValue, which marks them as old. Nothing is raised.
@@ -297,7 +301,7 @@ class AddressSpace:
                 await node.write_value(ua.DataValue(old.Value, status))
 
     async def write_status(self, status: Mapping[str, Any]) -> None:
-        """Write a status, as `RobotCalls.status` returns it, into the variables.
+        """Write a status, as `RobotCalls.status` returns it, into the OPC UA variables.
 
         If the text of the alarm differs from that of the last call (before the first call: ""), an
         event with the new text is sent. If the new text is empty, the event says that the alarm has
@@ -323,9 +327,11 @@ class AddressSpace:
     ) -> Callable[..., Awaitable[Any]]:
         """Return a method for asyncua that checks its arguments and calls `call` with their values.
 
-        The method raises nothing. It returns the results as variants. For wrong arguments, or if
-        `call` raises an error, it returns a bad status code and writes the reason into the variable
-        LastRefused; an unexpected error is also logged.
+        `arguments` and `results` are the OPC UA descriptions of both. The method raises nothing. It
+        takes a null text for "", and returns the results as OPC UA variants. If an argument is
+        missing, is too many or has a wrong type, or if `call` raises an error, it returns a bad
+        status code and writes the reason into the variable LastRefused; an unexpected error is also
+        logged.
         """
         forms = [_form(_type_of(item), item.ValueRank > 0) for item in arguments]
         listed = ", ".join(
@@ -365,7 +371,7 @@ def _type_of(argument: ua.Argument) -> VariantType:
 
 
 def _form(variant_type: VariantType, is_array: bool) -> str:
-    """Return a type of arguments, as messages name it."""
+    """Return the name of an argument's type for messages, such as "Float array"."""
     return f"{variant_type.name}{' array' * is_array}"
 
 

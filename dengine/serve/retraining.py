@@ -52,9 +52,10 @@ class RetrainingProcess(Executor):
         self._start()
 
     def _start(self) -> None:
-        """Start a process that imports what a retrain needs, and do not wait for it.
+        """Start a process that imports the modules that a retrain needs, and do not wait for it.
 
-        `ready` is set to a new future, which is done when the imports are.
+        `ready` is set to a new future, which is done when the modules are imported. Raises OSError
+        if the process cannot be started.
         """
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(1, context, _prepare_process)
@@ -118,9 +119,11 @@ class _SharedPickle:
 
 
 def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
-    """Return the value of a `_SharedPickle`, whose arrays are read from the file at `path`.
+    """Return the value that a `_SharedPickle` holds; this unpickles it in the other process.
 
-    `sizes` are the sizes of the arrays in bytes. Raises EOFError if the file is shorter.
+    `pickled` is the pickle of the value without its arrays. The arrays are read from the file at
+    `path`, one after another; `sizes` are their sizes in bytes. Raises EOFError if the file is
+    shorter.
     """
     arrays = [np.empty(size, np.uint8) for size in sizes]
     with Path(path).open("rb") as file:
@@ -133,9 +136,10 @@ _NEWEST_RESULT: list[_SharedPickle] = []  # of the last call, until the next one
 
 
 def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _SharedPickle:
-    """Call a function with its arguments, in the retraining process, and return its result.
+    """Call a function, in the retraining process, and return its result for pickling.
 
-    The result is kept until the next call ends; before that the server's process must have read it.
+    `call` is the function, its arguments and its keyword arguments. The result is kept until the
+    next call ends; before that the server's process must have read it.
     """
     fn, args, kwargs = call
     _NEWEST_RESULT[:] = [_SharedPickle(fn(*args, **kwargs))]
@@ -145,10 +149,11 @@ def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _
 def _prepare_process() -> None:
     """Set up the retraining process; this runs in it before anything else.
 
-    From now on the process ends when its parent ends, even during a call into C++; it ends at once
-    if the parent has ended already. If the system allows it, the process leaves one of several
-    cores to decisions and has a lower priority. It ignores the ending signals: Ctrl-C reaches all
-    processes of a terminal, but the server ends this process in order.
+    From now on the process ends when its parent ends, even during a call into C++; it ends at once,
+    with exit code 1, if the parent has ended already. If the system allows it, the process leaves
+    one of several cores to decisions and has a lower priority. It ignores the signals that ask a
+    process to end (`END_SIGNALS`): Ctrl-C reaches all processes of a terminal, but the server ends
+    this process in order.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned

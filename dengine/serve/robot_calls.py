@@ -88,11 +88,12 @@ class RobotCalls:
     async def begin(self, request: Any = "") -> str:
         """Begin a new part, and have the recorder wait for its insertion.
 
-        The pieces of its trace that `add` took before are discarded. Pieces are kept for the newest
-        `MAX_PARTS` parts; for an older part call this again. The recorder, which records the force
-        of one insertion, works for the newest part alone: the recording of an earlier part that was
-        not decided on is dropped. If the recorder fails, that is logged, and `decide_recorded` then
-        verifies the part. Without a recorder the part can only be sent by `add`.
+        A piece is some samples of a trace, which `add` takes in a call of its own. Pieces that were
+        added under this id before are discarded. Pieces are kept for the newest `MAX_PARTS` parts;
+        for an older part call this again. The recorder, which records the force of one insertion,
+        works for the newest part alone: the recording of an earlier part that was not decided on is
+        dropped. If the recorder fails, that is logged, and `decide_recorded` then verifies the
+        part. Without a recorder the trace can only be sent, by `add` or `decide`.
 
         Parameters
         ----------
@@ -183,8 +184,8 @@ class RobotCalls:
         Returns
         -------
         struct
-            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
-            queue is full or the service is closing: verify, an id "" and the reason "busy";
+            A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If
+            the queue is full or the service is closing: verify, an id "" and the reason "busy";
             nothing is recorded.
 
         Raises
@@ -195,14 +196,15 @@ class RobotCalls:
         return await self.decide_array(as_samples(trace), request, part)
 
     async def decide_added(self, request: Any, part: Any = "") -> Struct:
-        """Decide on the pieces that `add` took of a part's trace; return the struct that `decide`
-        returns.
+        """Decide on the trace whose pieces `add` took; return the dict that `decide` returns.
 
-        If the request already has a decision, it is returned again, and the pieces are ignored. A
-        new decision drops the pieces, even if the store did not record it (reason "no_store"). If
-        the queue is full, or the service or its engine is closed, the result is VERIFY with an
-        empty id, and the pieces stay, so that the call can be repeated. Raises TraceError if there
-        are no pieces or the engine does not take the trace, and ReportError for an invalid id.
+        `request` is the id that `begin` returned, and `part` the part's number, "" for none. If the
+        id already has a decision, it is returned again, and the pieces are ignored. A new decision
+        drops the pieces, even if the store did not record it (reason "no_store"). If the queue is
+        full, or the service or its engine is closed, the result is VERIFY with an empty id and the
+        reason "busy", and the pieces stay, so that the call can be repeated. Raises TraceError if
+        there are no pieces or the engine does not take the trace, ReportError for an invalid id,
+        and SettingError for a first trace that the settings do not allow.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -220,10 +222,11 @@ class RobotCalls:
     async def decide_recorded(self, request: Any = "", part: Any = "") -> Struct:
         """Decide on the trace that the recorder took of the insertion since `begin`.
 
-        If the request already has a decision, it is returned again. Otherwise the call waits up to
+        If the id already has a decision, it is returned again. Otherwise the call waits up to
         `RECORD_SECONDS` for the recording. Only the part of the newest `begin` has a recording, and
-        only for one call, even if that call times out or is refused. Without a recording the result
-        is verify with an id "" and the reason "not_recorded", and nothing is stored.
+        only for one call, even if that call times out or is refused. If there is no recording, or
+        the recorder fails, which is logged, the result is verify with an id "" and the reason
+        "not_recorded", and nothing is stored.
 
         Parameters
         ----------
@@ -235,13 +238,13 @@ class RobotCalls:
         Returns
         -------
         struct
-            action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If the
-            queue is full or the service is closing, verify with an id "" and the reason "busy".
+            A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If
+            the queue is full or the service is closing, verify with an id "" and the reason "busy".
 
         Raises
         ------
         SettingError
-            For a server without a recorder.
+            For a server without a recorder, and for a first trace that the settings do not allow.
         TraceError, ReportError
             For a trace, or an id, that the engine does not take.
         """
@@ -281,14 +284,15 @@ class RobotCalls:
         return int((await self.decide_recorded(request, part))["action"])
 
     async def decide_array(self, trace: ArrayLike, request: Any, part: Any) -> Struct:
-        """Decide on a trace of shape (T,) or (C, T); return action, id, reason, bounds and version.
+        """Decide on a trace of shape (T,) or (C, T); return a dict of action, id, reason, lower,
+        upper and version.
 
-        If the queue is full, or the service or its engine is closed, that is logged, and the struct
-        is an unrecorded VERIFY with an id "" and the reason "busy". A request "" gets a new id, a
-        part "" means none. The same request id and trace get the same decision again. Raises
-        TraceError for a trace or part that the engine does not take and for an id of another trace,
-        ReportError for an invalid id, and SettingError for a first trace that the settings do not
-        allow.
+        `request` is the caller's id of the trace, "" for a new one; `part` is the part's number, ""
+        for none. The same request id and trace get the same decision again. If the queue is full,
+        or the service or its engine is closed, that is logged, and the dict is an unrecorded VERIFY
+        with an id "" and the reason "busy". Raises TraceError for a trace or part that the engine
+        does not take and for an id of another trace, ReportError for an invalid id, and
+        SettingError for a first trace that the settings do not allow.
         """
         id_ = as_id(request) if request != "" else None
         try:
@@ -299,13 +303,16 @@ class RobotCalls:
         return _as_struct(response.decision)
 
     async def report(self, decision_id: Any, success: Any) -> bool:
-        """Report the outcome of a part, True for good; wait until it is on disk.
+        """Report the outcome of the part with this decision, and wait until it is on disk.
+
+        `success` is True or 1 for a good part, False or 0 for a bad one.
 
         Returns
         -------
         bool
             True if the label is on disk, also if it was reported before. False if the id is "" or
-            unknown, and False if the report cannot be stored now; only then repeat it.
+            unknown. False also if the report cannot be stored now, which is logged; only then
+            repeat it.
 
         Raises
         ------
@@ -333,12 +340,12 @@ class RobotCalls:
         Returns
         -------
         struct
-            decisions, accepted, rejected, bad (false accepts): counts so far. verified_share: share
-            of verified parts among the newest 500 decisions, 1 if there are none. version: number
-            of the version in force. safe_mode, alarm: their reasons as texts, "" if there is none.
-            shadow: whether the shadow mode is on. waiting: requests in the queue. late, busy: since
-            the start, numbers of decisions that the engine had not begun by the service's
-            `deadline`, and of requests refused because the queue was full.
+            A dict: decisions, accepted, rejected, bad (false accepts): counts so far.
+            verified_share: share of verified parts among the newest 500 decisions, 1 if there are
+            none. version: number of the version in force. safe_mode, alarm: their reasons as texts,
+            "" if there is none. shadow: whether the shadow mode is on. waiting: requests in the
+            queue. late, busy: since the start, numbers of decisions that the engine had not begun
+            by the service's `deadline`, and of requests refused because the queue was full.
 
         Raises
         ------
@@ -365,10 +372,10 @@ class RobotCalls:
         }
 
     async def _find(self, request: Any) -> Struct | None:
-        """Return the decision that a request already has, as the struct that the robot gets.
+        """Return the decision that was made under the id `request`, as the dict that a robot gets.
 
-        None if it has no decision, and also if the queue is full or the store cannot look it up.
-        Raises ReportError for an invalid id.
+        None if the id has no decision, and also if the queue is full, the service is closing, or
+        the store cannot look the id up. Raises ReportError for an invalid id.
         """
         try:
             stored = await self._service.find(as_id(request))
@@ -397,8 +404,9 @@ def _as_struct(decision: Decision) -> Struct:
 
 
 def _unrecorded_verify(reason: str) -> Struct:
-    """Return the struct of a VERIFY that was not recorded: its id is "", its version 0, its lower
-    and upper bound 0 and 1.
+    """Return the dict of a VERIFY that was not recorded, for a robot, with the given reason.
+
+    Its action is 0, its id "", its version 0, and its lower and upper bound are 0 and 1.
     """
     return {
         "action": ACTIONS.index(Action.VERIFY),

@@ -71,10 +71,11 @@ class LineFormatter(logging.Formatter):
 
 
 def log_lines() -> None:
-    """Write the logs of all libraries to stderr, a line each, in place of all earlier handlers.
+    """Write each log message of every library to stderr, on a line of its own.
 
-    dengine's own messages are written from level INFO on, those of other libraries from the level
-    that is set for them, which is WARNING by default.
+    `LineFormatter` makes the line. The handlers that the root logger had are removed. dengine's own
+    messages are written from level INFO on, those of other libraries from the level that is set for
+    them, which is WARNING by default.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(LineFormatter())
@@ -117,7 +118,8 @@ def serve(
         Each is called with the service and returns an async context that lasts as long as the
         server. If one fails to start, the server ends, and the error is raised.
     recorder : callable
-        Returns a context manager that opens the recorder of a robot's insertions, or gives None.
+        Returns a context manager that opens the recorder of a robot's insertions for as long as the
+        server runs, or gives None.
     host : str
         Address to listen on.
     port : int
@@ -213,13 +215,13 @@ class CellServer(uvicorn.Server):
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Handle the ending signals, within the block, as a request to end in order.
+        """Handle SIGINT, SIGTERM and Ctrl-Break, within the block, as a request to end in order.
 
         Each signal is logged, ends every iteration over `CellService.changes`, and asks uvicorn to
         end after the requests under way; a second SIGINT makes it end without waiting for them. The
-        earlier handlers are set again after the block. uvicorn's own method would raise the signals
-        again then, which would change the exit code. In another thread than the main thread nothing
-        is handled.
+        earlier handlers are set again after the block. The signals are not raised again then,
+        unlike by uvicorn's own method, so the exit code is 0. In another thread than the main
+        thread no handler is set.
         """
         # Python delivers signals to the main thread alone.
         if threading.current_thread() is not threading.main_thread():
@@ -244,9 +246,10 @@ class CellServer(uvicorn.Server):
 def quick_switches() -> Iterator[None]:
     """Shorten, within the block, the time that a decision can wait for another thread.
 
-    For the whole process it shortens the interval after which Python switches threads, and excludes
-    the objects that exist now from garbage collection. The end of the block sets the old interval,
-    and lets all objects be collected again, also those that other code froze (`gc.freeze`).
+    For the whole process it shortens the interval after which Python switches threads to
+    `SWITCH_INTERVAL` seconds, and excludes the objects that exist now from garbage collection. The
+    end of the block sets the old interval, and lets all objects be collected again, also those that
+    other code froze (`gc.freeze`).
     """
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_INTERVAL)
@@ -259,9 +262,11 @@ def quick_switches() -> Iterator[None]:
 
 @contextmanager
 def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
-    """Open a listening TCP socket at the host's first address; close it when the block ends.
+    """Open a listening TCP socket at the host's first address, yield it, and close it when the
+    block ends.
 
-    Port 0 takes a free one. Raises SettingError if it cannot be opened.
+    Port 0 takes a free port. Raises SettingError if the socket cannot be opened, for example
+    because the port is in use or the host is unknown.
     """
     with instead(
         SettingError,
@@ -282,10 +287,10 @@ def listening_socket(host: str, port: int) -> Iterator[socket.socket]:
 
 
 def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
-    """Return uvicorn's options for TLS, an empty dict without files.
+    """Return uvicorn's options for TLS with a certificate and its key, both PEM files.
 
-    The files are loaded once to check them. Raises SettingError for only one of the two, for files
-    that cannot be used, and for a key with a password.
+    Without both the dict is empty. The files are loaded once to check them. Raises SettingError for
+    only one of the two, for files that cannot be used, and for a key with a password.
     """
     if cert is None and key is None:
         return {}
@@ -303,7 +308,9 @@ def _tls_options(cert: Path | None, key: Path | None) -> dict[str, str]:
 
 
 def log_safe_mode(reason: str) -> None:
-    """Log that the safe mode began for a reason, or that it ended (an empty reason)."""
+    """Log a warning that the safe mode began for this reason, or, if the reason is "", a message
+    that it ended.
+    """
     if reason:
         log.warning("safe mode, parts are verified until outcomes allow decisions: %s", reason)
     else:

@@ -64,10 +64,10 @@ class Job(NamedTuple):
     read_only: bool = False
 
     def run(self, engine: DataEngine) -> None:
-        """Do the work, and set the future's result or exception.
+        """Do the work with the engine, and set the future's result or exception.
 
-        If the caller has timed out, the work is done too; its result is dropped, and an exception
-        is logged. Nothing is raised.
+        If the future was cancelled, because its caller has timed out, the work is done too; its
+        result is dropped, and an exception is logged. Nothing is raised.
         """
         has_caller = self.future.set_running_or_notify_cancel()
         try:
@@ -211,7 +211,8 @@ class CellService:
             Otherwise the response counts in `late`; it has the decision that the id already has, or
             else VERIFY with `Reason.LATE` or the fault of the trace or the store. If the store
             cannot be written or cannot look up the id, the decision is VERIFY with
-            `Reason.NO_STORE`, and may not be recorded.
+            `Reason.NO_STORE`, and may not be recorded. The response is also passed to each of
+            `observers`.
 
         Raises
         ------
@@ -219,7 +220,8 @@ class CellService:
             For a wrong shape, a first trace of less than 10 samples, an invalid part number, or an
             id that belongs to another trace.
         SettingError
-            For the reasons of `DataEngine.decide`.
+            For a first trace that the policy's force limits do not fit, or whose `TraceSpec`
+            contradicts that of another cell of the product.
         ReportError
             For an invalid id.
         StoreError
@@ -265,6 +267,8 @@ class CellService:
         Returns
         -------
         ReportResponse
+            It is also passed to each of `observers`, after the retrain that the label set off if
+            that is finished.
 
         Raises
         ------
@@ -336,14 +340,14 @@ class CellService:
         return self._enqueue(lambda engine, late: work(engine), read_only)
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
-        """Call a function with a store and return its result; the engine first writes its decisions
-        to it.
+        """Let the engine write its decisions to the store, call `work` with the store, and return
+        what it returns.
 
-        For that this call waits in the queue. Decisions that the disk or the store does not take in
-        time are missing, without an error. The function must only read. It runs in another thread
-        over a second connection to the store (`read_store`), or in the engine's thread if the store
-        is in memory. Raises BusyError if the queue is full or the service is closing, and whatever
-        the function raises.
+        The writing waits in the queue. Decisions that the disk or the store does not take in time
+        are missing, without an error. `work` must only read. It runs in another thread over a
+        second connection to the store (`read_store`), or in the engine's thread if the store is in
+        memory. Raises BusyError if the queue is full or the service is closing, and whatever `work`
+        raises.
         """
         with suppress(NotTakenError):
             await self.call(lambda engine: engine.flush(), read_only=True)
@@ -375,6 +379,7 @@ class CellService:
     async def changes(self, quiet: float | None = None) -> AsyncIterator[bool]:
         """Yield True at once, and then whenever something has changed since the last yield.
 
+        A change is each call of the engine that is not read-only, and each retrain that has ended.
         After `quiet` seconds without a change False is yielded; None: never. The iteration ends
         when `end_listening` is called, and yields nothing if it was called before.
         """
@@ -400,8 +405,8 @@ class CellService:
     def close(self) -> None:
         """Answer the requests in the queue, close the engine and the stores, and end the threads.
 
-        It blocks until all this is done. Requests that come after the call get BusyError. A second
-        call does nothing.
+        Every iteration over `changes` ends. It blocks until all this is done. Requests that come
+        after the call get BusyError. A second call does nothing.
         """
         if self._closing:
             return
@@ -424,9 +429,8 @@ class CellService:
 
         `work` is called with the engine and with whether the future was cancelled. A cancelled
         future does not stop the work, but the result is dropped. After the work every iteration
-        over `changes` (of the clients that wait for news) is woken, unless the work is `read_only`.
-        Raises BusyError if the service is closing, or if the queue is full; only the latter counts
-        in `busy`.
+        over `changes` goes on, unless the work is `read_only`. Raises BusyError if the service is
+        closing, or if the queue is full; only a full queue is counted, in `busy`.
         """
         job = Job(Future(), work, read_only)
         if self._closing or not self._thread.is_alive():
@@ -442,9 +446,11 @@ class CellService:
         return job.future
 
     def _notify_observers(self, response: T) -> T:
-        """Pass a response or a retrain to all observers, log a retrain, and return the argument.
+        """Call each function in `observers` with a response or a `RetrainReport`; return the
+        argument.
 
-        What an observer raises is raised; the observers after it are not called then.
+        A `RetrainReport` is also logged. What an observer raises is raised; the observers after it
+        are not called then.
         """
         # Decisions and reports are in the store: only a retrain needs a line of the log.
         if isinstance(response, RetrainReport):
@@ -459,12 +465,11 @@ class CellService:
         return response
 
     def _run_jobs(self, make: Callable[[], DataEngine], opened: Future[DataEngine]) -> None:
-        """Open the engine, run jobs until None comes, and close it; the body of the engine's
-        thread.
+        """Open the engine by `make`, run jobs until None comes out of the queue, and close it.
 
-        `opened` gets the engine, or the exception that opening it raised; the thread ends after
-        such an exception. After each job that is not `read_only` the iterations over `changes` are
-        woken.
+        This is the body of the engine's thread. `opened` gets the engine, or the exception that
+        `make` raised; the thread ends after such an exception. After each job that is not
+        `read_only` the iterations over `changes` go on.
         """
         try:
             engine = make()
@@ -482,9 +487,10 @@ class CellService:
         """Wait for the next job in the queue and return it; None means that the service ends.
 
         While the queue is empty, the engine does its other work (`DataEngine.poll`): it retrains if
-        that is due, puts a trained version in force step by step, and calls `on_safe_mode` if a
-        safe mode began or ended. The report of a finished retrain is passed to all `observers`, and
-        every iteration over `changes` is woken. An error in this work is logged and not raised.
+        that is due, puts a trained version in force step by step, and calls `on_safe_mode`, a
+        function that it was made with, if a safe mode began or ended. After a finished retrain each
+        of `observers` is called with its report, and every iteration over `changes` goes on. An
+        error in this work is logged and not raised.
         """
         # The time right after a response is best for other work: the next part is farthest away.
         timeout = SHORT_WAIT

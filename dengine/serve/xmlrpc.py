@@ -37,10 +37,10 @@ NO_REPORT = 2  # a report that does
 
 
 def parse_call(body: bytes) -> tuple[str, tuple[Any, ...]]:
-    """Return the method's name and the arguments of an XML-RPC call.
+    """Return the method's name and a tuple of the arguments of an XML-RPC call.
 
-    The arguments are of any type that XML-RPC has. Raises ValueError for XML that is no call, is
-    malformed, or has a document type.
+    The arguments are Python values of the types that XML-RPC has, base64 as bytes. Raises
+    ValueError for a body that is no XML, is no call, or has a document type.
     """
     values: Any = xmlrpc.client.Unmarshaller(use_builtin_types=True)
     parser = DefusedExpatParser(values, forbid_dtd=True)
@@ -85,8 +85,9 @@ def routes(service: CellService, recorder: RtdeRecorder | None = None) -> list[R
 async def call_method(calls: dict[str, Call], body: bytes) -> bytes:
     """Call the method that an XML-RPC request names, and return its value or a fault as XML.
 
-    It raises nothing: a body that cannot be read, an unknown method, wrong arguments and each error
-    of the method become faults. An unexpected error is logged.
+    `calls` has the methods by name, and `body` is the request. It raises nothing: a body that
+    cannot be read, an unknown method, wrong arguments and each error of the method become faults,
+    with a code and one line of text. An unexpected error is logged.
     """
     try:
         name, arguments = await asyncio.to_thread(parse_call, body)

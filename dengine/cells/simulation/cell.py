@@ -173,9 +173,11 @@ def insert_once(
 def _find_cause(conditions: Conditions, pushed: Push) -> str:
     """Return the cause of a failed insertion, one of `CAUSES` but "none".
 
-    If a missed grasp or a wrong part was drawn, that is the cause. Debris that was drawn is the
-    cause only if the part stopped on it. Otherwise the cause follows from where the part stopped,
-    and whether it slipped in the gripper.
+    `conditions` are those that were drawn, and `pushed` is what came of them. If a missed grasp or
+    a wrong part was drawn, that is the cause. Debris that was drawn is the cause only if the part
+    stopped on it. Otherwise the cause is "slip" if the part moved more than `SLIP_MM` in the
+    gripper, and else where it stopped: "rim_contact" on the rim of the hole, "stuck" near its seat,
+    "wedging" in between.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):
@@ -192,7 +194,8 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
 def _make_generators(
     seed: int, cycle: int
 ) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
-    """Return three independent random generators of one cycle: for world, sensor and line.
+    """Return three independent random generators of one cycle: for the physical conditions, for the
+    sensor, and for what becomes known of a part that was passed on.
 
     They depend on seed and cycle alone.
     """
@@ -253,9 +256,10 @@ class SimulatedCell:
     def insert(self) -> TraceArray:
         """Pick a part, push it into the fixture, and return the force, float32 of shape (1000,).
 
-        The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and the clock goes on
-        by `cycle_s`. Raise DengineError if the last part still waits for verify, proceed or reject,
-        or if MuJoCo is not installed, and the other errors of `insert_once`; nothing changes then.
+        The force is in newtons, 2 s at 500 Hz. `last` becomes this insertion, and `clock` goes on
+        by `cycle_s` seconds, a setting of the cell. Raise DengineError if the last part still waits
+        for verify, proceed or reject, or if MuJoCo is not installed, and SettingError or ValueError
+        for settings that cannot be simulated; nothing changes then.
         """
         if self._waiting:
             raise DengineError(
@@ -281,10 +285,11 @@ class SimulatedCell:
     def proceed(self) -> Outcome:
         """Pass the part on without a check; return what became known of it.
 
-        A bad part stops the line: the result is STOPPED, and the clock goes on by `stop_s`. But
-        with the probability `CellParameters.unreported_share` nothing becomes known of a bad part
-        (UNKNOWN). A good part is CONFIRMED with the probability `confirm_share`, else UNKNOWN.
-        Raise DengineError if no part waits.
+        A bad part stops the line: the result is STOPPED, and `clock` goes on by `stop_s` seconds.
+        But with the probability `unreported_share` nothing becomes known of a bad part (UNKNOWN). A
+        good part is CONFIRMED with the probability `confirm_share`, else UNKNOWN. All three are
+        fields of `CellParameters`. The same seed and cycle have the same result. Afterwards no part
+        waits. Raise DengineError if no part waits for a decision.
         """
         success = self._take_waiting("proceed").success
         # It depends on the part alone.

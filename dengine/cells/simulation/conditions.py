@@ -189,10 +189,10 @@ _DRAWN_BY: dict[str, str | Range] = {
 def draw_conditions(parameters: CellParameters, rng: np.random.Generator) -> Conditions:
     """Draw the conditions of one insertion, its fault included; `rng` is advanced.
 
-    Every quantity is drawn in every cycle, even if it is not used, so that another range for one
-    quantity does not change the others. At most one fault is drawn; its values replace the normal
-    ones, for example a weak grip the normal grip. A missed grasp replaces no value: only the field
-    `fault` says so.
+    Every quantity is drawn each time, even if it is not used, so that another range for one
+    quantity does not change the others. At most one fault is drawn (missed grasp, weak grip, debris
+    or wrong part); its values replace the normal ones, for example a weak grip the normal grip. A
+    missed grasp replaces no value: only the field `fault` says so.
 
     Parameters
     ----------
@@ -249,9 +249,10 @@ def nominal(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
 
 
 def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return the parameters with more friction as the tool wears.
+    """Return the parameters with more friction in later cycles, because the tool wears.
 
-    Both ends of the range grow linearly, by 0.35 from the first to the last cycle; then they stay.
+    Both ends of the range of the friction grow linearly, by 0.35 from cycle 0 to the last of the
+    `cycles`; then they stay.
     """
     low, high = parameters.friction
     grown = 0.35 * min(1.0, cycle / max(1, cycles - 1))
@@ -259,11 +260,12 @@ def wear(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
 
 
 def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return the parameters: unchanged in the first half of the cycles, then those of another part.
+    """Return the parameters of a cycle: unchanged in the first half, then those of another part.
 
-    That part is 2.5 times as heavy. Its clearance and chamfer are fixed ranges, 0.04 to 0.16 mm and
-    0.5 to 1.0 mm: tighter and smaller than the default ones. An odd number of cycles has the
-    smaller half first.
+    `cycle` counts from 0, and `cycles` is their number; of an odd number the first half is the
+    smaller one. The other part is 2.5 times as heavy. Its clearance in the hole is drawn from 0.04
+    to 0.16 mm, and the chamfer of the hole from 0.5 to 1.0 mm, whatever the parameters say; both
+    are smaller than by default.
     """
     if cycle < cycles // 2:
         return parameters
@@ -277,9 +279,10 @@ def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
 
 
 def bias_jump(parameters: CellParameters, cycle: int, cycles: int) -> CellParameters:
-    """Return the parameters, from half way on with 8 N more offset of the force sensor.
+    """Return the parameters of a cycle; in the second half the force sensor reads 8 N more.
 
-    An odd number of cycles has the smaller half first.
+    `cycle` counts from 0, and `cycles` is their number; of an odd number the first half is the
+    smaller one.
     """
     if cycle < cycles // 2:
         return parameters

@@ -26,13 +26,14 @@ def simulate(
     progress: Callable[[int], object] = lambda n: None,
     time_step_s: float = TIME_STEP_S,
 ) -> list[SimulatedInsertion]:
-    """Simulate the first n cycles of a cell in parallel processes.
+    """Simulate the first n cycles of a cell in parallel processes; return their insertions.
 
-    In the nominal scenario insertion i depends on (seed, i) alone; in the others also on n.
+    In the scenario "nominal" insertion i depends on (seed, i) alone; in the others also on n.
 
     Parameters
     ----------
     n : int
+        Number of cycles, one insertion in each.
     seed : int, default 0
     scenario : str, default "nominal"
         A name in `SCENARIOS`.

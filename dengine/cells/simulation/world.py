@@ -51,9 +51,10 @@ class Push:
 
 
 def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
-    """Lower the gripper until its target or its force limit; record the force for 2 s at 500 Hz.
+    """Lower the gripper with the part into the fixture for 2 s; return what came of it.
 
-    The simulation has no randomness.
+    The gripper goes down to a target below the seat, and moves back while the force is above its
+    limit. The force is recorded at 500 Hz. The simulation has no randomness.
 
     Parameters
     ----------
@@ -103,11 +104,13 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
 
 
 def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: int) -> Floats:
-    """Run the controller of the push; return the force (1000,) in newtons, at 500 Hz.
+    """Let the simulated gripper push; return the force (1000,) in newtons, at 500 Hz.
 
-    `steps` is the number of physics steps per sample; `data` is advanced. The force before the
-    motion, with the part in the gripper, counts as zero; pushing is positive. Near the force limit
-    the push slows down, and above the limit the gripper moves back.
+    `mujoco` is the module, `model` and `data` are its model and its state, which is advanced in
+    place, and `steps` is the number of physics steps per sample. The force before the motion, with
+    the part in the gripper, counts as zero; pushing is positive. The conditions say when the
+    gripper starts, how fast it is, how far it goes, and the limit of the force. Near this limit the
+    push slows down, and above the limit the gripper moves back.
     """
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)
@@ -130,10 +133,11 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
 
 
 def cell_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
-    """Return the MuJoCo model (MJCF, as text) of the whole cell under these conditions.
+    """Return the MuJoCo model of the whole cell under these conditions, as text in MJCF.
 
-    It has the fixture, the carriage with its drive, the elastic wrist with the force sensor, and
-    the part, unless the grasp missed it.
+    It has the fixture, the carriage, which a drive moves up and down, the elastic wrist with the
+    force sensor, and the part, unless the grasp missed it. `time_step_s` is the step of the physics
+    in seconds.
     """
     c = conditions
     tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06
@@ -189,9 +193,10 @@ def _damping(stiffness: float, inertia: float, ratio: float = 0.6) -> float:
 
 
 def _part_xml(c: Conditions) -> str:
-    """Return the MJCF of the part in the gripper, as text; "" if the grasp missed it.
+    """Return the part of MuJoCo's model (MJCF, as text) that is the part in the gripper.
 
-    Dry friction holds the part until the push exceeds the grip.
+    It is "" if the grasp missed the part. Dry friction holds the part in the gripper until the
+    force of the push exceeds `c.grip_n` newtons; then it slides. `c` are the conditions.
     """
     if c.fault == "missed_grasp":
         return ""
@@ -212,9 +217,10 @@ def _part_xml(c: Conditions) -> str:
 
 
 def _fixture_xml(c: Conditions) -> str:
-    """Return the MJCF of the fixture, as text: four walls with a 45° chamfer, a floor, debris.
+    """Return the part of MuJoCo's model (MJCF, as text) that is the fixture.
 
-    Debris, a soft box on the floor, is there only if its thickness is above 0.
+    It has four walls with a chamfer of 45° around a square hole, a floor, and debris, a soft box on
+    the floor, only if its thickness in the conditions `c` is above 0.
     """
     half = (WIDTH_MM + c.clearance_mm) / 2000
     depth = DEPTH_MM / 1000
@@ -233,10 +239,11 @@ def _fixture_xml(c: Conditions) -> str:
 
 
 def _wall_xml(side: int, half: float, chamfer: float, depth: float) -> str:
-    """Return the MJCF of one wall of the hole, as text: three boxes, one of which is the chamfer.
+    """Return one wall of the fixture's square hole as text in MuJoCo's MJCF.
 
-    Wall 0 is at +x; wall `side` (0 to 3) is turned by `side` quarter turns about z. The half width
-    `half`, the chamfer and the depth of the hole are in metres.
+    A wall is three boxes, one of which is the chamfer. Wall 0 is at +x; wall `side` (0 to 3) is
+    turned by `side` quarter turns about z. The half width `half` of the hole, the width of the
+    chamfer and the depth of the hole are in metres.
     """
     wall = _WALL_MM / 1000
     reach = half + chamfer + wall

@@ -150,7 +150,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         return replace(self.recorder.report(), incomplete=self.incomplete)
 
     def insert(self) -> TraceArray:
-        """Have a part inserted, wait for it, and return its trace, (T,) or (C, T).
+        """Have the robot insert a part, wait for that, and return the trace, (T,) or (C, T).
 
         Lost samples are NaN. All samples are NaN if no insertion was seen, for example because its
         start was lost or the trigger is wrong. `last` becomes the record of this insertion (trace
@@ -182,14 +182,14 @@ class UrCell(AbstractContextManager["UrCell"]):
         self._execute_order(Verb.REJECT)
 
     def _execute_order(self, verb: Verb) -> ResultCode:
-        """Send an order, wait at most `order_timeout` seconds for its result, and return the
-        result.
+        """Send an order (`verb`) to the robot, wait for its result, and return the result.
 
-        Packages that were received before are discarded. While this waits, a new connection has the
-        order written again, as `RtdeStream.write` says. INSERT also waits, within the same time,
-        for the end of a trace that has begun. It sets `last` to the insertion, or to None if none
-        was complete by then. Raise CellError if the robot does not answer in time, fails, or its
-        program stops; after that the order is not written again.
+        It waits at most `order_timeout` seconds. Packages that were received before are discarded.
+        If the connection is lost meanwhile, the order is written again on the next one, as
+        `RtdeStream.write` says. The order INSERT also waits, within the same time, for the end of a
+        trace that has begun. It sets `last` to the insertion, or to None if none was complete by
+        then. Raise CellError if the robot does not answer in time, fails, or its program stops. At
+        the end, also after an error, the order is discarded and never written again.
         """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
@@ -211,9 +211,10 @@ class UrCell(AbstractContextManager["UrCell"]):
         return result
 
     def _timeout_error(self, expected: str) -> CellError:
-        """Return the CellError for a robot that did not do in time what `expected` says.
+        """Return (and do not raise) the CellError for a robot that was too slow.
 
-        The message ends with why there is no connection, or with advice if there is one.
+        `expected` says what it had to do, like "to send its state". The message ends with why there
+        is no connection, or with advice if there is one.
         """
         stream = self.recorder.stream
         reason = "it did not; does its program do what ur_cell.script does, is it paused?"
@@ -222,10 +223,11 @@ class UrCell(AbstractContextManager["UrCell"]):
         return CellError(f"Expected the robot at {stream.where} {expected} in time, {reason}")
 
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
-        """Return the result code of the present order if this package holds it, else None.
+        """Return the result of the present order (`verb`) if the package `row` holds it, else None.
 
-        Raise CellError if the result is FAILED, VOID or one that this order cannot have, or if the
-        robot's program has stopped and this package holds no result.
+        Raise CellError if the result is FAILED, VOID (the program was started anew) or one that
+        this order cannot have, or if the robot's program has stopped and this package holds no
+        result.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
         state = int(row.values[RUNTIME])

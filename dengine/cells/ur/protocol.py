@@ -115,7 +115,10 @@ class RtdeRecipe:
 
     @cached_property
     def columns(self) -> tuple[str, ...]:
-        """Name of each value: `timestamp`, or `actual_TCP_force[2]` for an element of a vector."""
+        """Name of each value of a data package, cached.
+
+        It is like `timestamp`, or like `actual_TCP_force[2]` for an element of a vector.
+        """
         sizes = [TYPES[field_type][1] for field_type in self.types]
         fields = zip(self.names, sizes, strict=True)
         return tuple(
@@ -123,12 +126,13 @@ class RtdeRecipe:
         )
 
     def pack(self, values: Mapping[str, float]) -> bytes:
-        """Return a data package, with its header, of these values by column.
+        """Return a data package, with its header, that holds these values.
 
-        Columns that are left out are 0, and names that are no columns are ignored. A number for an
-        integer field loses its fraction. Raise struct.error for a number that its field cannot
-        hold, for example one that is too large; in an integer field ValueError for NaN, and
-        OverflowError for an infinity.
+        `values` has numbers by column, the name of a value such as `timestamp` or
+        `actual_TCP_force[2]`. Columns that are left out are 0, and names that are no columns are
+        ignored. A number for an integer field loses its fraction. Raise struct.error for a number
+        that its field cannot hold, for example one that is too large; in an integer field
+        ValueError for NaN, and OverflowError for an infinity.
         """
         numbers = [
             values.get(name, 0) if letter == "d" else int(values.get(name, 0))
@@ -137,9 +141,9 @@ class RtdeRecipe:
         return Package(PackageType.DATA, self.layout.pack(self.number, *numbers)).to_bytes()
 
     def unpack(self, payload: bytes) -> dict[str, float]:
-        """Return the values in the payload of a data package, by column.
+        """Return the values in the payload of a data package by column, the name of the value.
 
-        Raise CellError for a package of another recipe or size.
+        Raise CellError for a package of another size, or of another RTDE recipe (list of fields).
         """
         if len(payload) != self.layout.size or payload[0] != self.number:
             number = payload[0] if payload else "none"
@@ -151,7 +155,9 @@ class RtdeRecipe:
 
 
 def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRecipe:
-    """Return the recipe in a controller's response to a request for fields.
+    """Return the RTDE recipe (a numbered list of fields and their types) that a controller made.
+
+    The recipe is its response to a request for fields.
 
     Parameters
     ----------

@@ -138,11 +138,11 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return self.stream.report()
 
     def record(self, timeout: float = 60.0) -> InsertionRecord:
-        """Wait for the next insertion after the last one, or after `arm`, and return it.
+        """Wait for the next insertion after the last one, or after a call of `arm`, and return it.
 
         An insertion that is not complete after `timeout` seconds, for example because the
-        controller fell silent, is returned with NaN for the missing samples. If its start was lost,
-        all samples are NaN.
+        controller fell silent, is returned with NaN for the missing samples. If packages are
+        missing where it began, so that its start is unknown, all samples are NaN.
 
         Parameters
         ----------
@@ -176,8 +176,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def rows(self, seconds: float) -> Iterator[Row]:
         """Yield the packages of the robot, each removed from the buffer, for this many seconds.
 
-        Packages that are buffered already come first. The time runs from the first call of `next`.
-        If the stream is closed, the iteration ends when the buffer is empty or the time is over.
+        Packages that are buffered already come first. The time runs from the first call of `next`
+        on the iterator. If the stream is closed, the iteration ends when the buffer is empty or the
+        time is over.
         """
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -192,11 +193,12 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return self._start is not None
 
     def feed(self, row: Row) -> InsertionRecord | None:
-        """Add a package of the stream; return the insertion that it completes, else None.
+        """Add a package of the stream, `row`; return the insertion that it completes, else None.
 
-        Samples that were lost are NaN in its trace; all samples are NaN if its start was lost. If
-        the clock of the controller went back, because it was restarted, an insertion that has begun
-        is returned as far as it was received, and all earlier packages are discarded.
+        Samples that were lost are NaN in the trace; all samples are NaN if packages are missing
+        where the insertion began, so that its start is unknown. If the clock of the controller went
+        back, because it was restarted, an insertion that has begun is returned as far as it was
+        received, and all earlier packages are discarded.
         """
         record = None
         # An earlier time: the controller was restarted.
@@ -216,10 +218,11 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return self.cut() if row.timestamp > last else record
 
     def cut(self) -> InsertionRecord:
-        """Return the insertion as far as it was received, and discard it.
+        """Return the insertion as far as it was received, and discard its packages.
 
-        Samples that did not come are NaN. All samples are NaN if its start was lost, or if no
-        insertion has begun.
+        Samples that did not come are NaN. All samples are NaN if packages are missing where the
+        insertion began, so that its start is unknown, or if no insertion has begun. The recorder
+        then looks for the next one.
         """
         start = self._start
         first = self._first_time()
@@ -248,8 +251,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _reset(self) -> None:
-        """Discard the packages and the start of an insertion, and what `arm` set; the recorder then
-        looks for the next insertion.
+        """Discard the packages and the start of an insertion that has begun, and look for the next.
+
+        The number of connections that `arm` noted is discarded, too.
         """
         self._finder.forget()
         self._rows = []

@@ -132,10 +132,10 @@ class RtdeClient:
     def _request(self, type_: PackageType, payload: bytes) -> bytes:
         """Send a request, wait for its response, and return the payload of the response.
 
-        Packages of another type that arrive before it are dropped. But if the request is START, a
-        data package that arrives first counts as the response "accepted", and is kept for `rows`.
-        Raise CellError if the connection is lost or silent for `timeout` seconds, or for bytes that
-        are no RTDE.
+        The response has the type of the request, `type_`. Packages of another type that arrive
+        before it are dropped. But if the request is START, a data package that arrives first counts
+        as the response "accepted" (the byte 1), and is kept for `rows`. Raise CellError if the
+        connection is lost or silent for `timeout` seconds, or for bytes that are no RTDE.
         """
         self._send(Package(type_, payload).to_bytes())
         while (package := next(self._incoming)).type is not type_:
@@ -155,10 +155,11 @@ class RtdeClient:
             self._socket.sendall(data)
 
     def _receive_packages(self) -> Iterator[Package]:
-        """Yield packages as they arrive, without an end; the controller's texts are left out.
+        """Yield packages as they arrive, without an end; text messages of the controller are left
+        out.
 
-        The newest text is kept for error messages. Raise CellError if the connection is lost or
-        silent for `timeout` seconds (its message quotes the text), or for bytes that are no RTDE.
+        The newest text message is kept, for errors to quote. Raise CellError if the connection is
+        lost or silent for the `timeout` of the client, or for bytes that are no RTDE.
         """
         packages = PackageReader()
         while True:
@@ -312,19 +313,19 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             return self._session
 
     def write(self, values: Values | None) -> None:
-        """Write inputs now, or once there is a connection again; a lost connection raises nothing.
+        """Write inputs of the controller now, or once there is a connection again.
 
-        All fields that the stream was opened with are written: columns that are left out become 0,
-        and names that are no columns are ignored.
-
-        If the connection is lost, the newest inputs are written again on the next connection,
-        unless they are 10 s old by then or the controller was restarted. Raises struct.error for a
-        number that its field cannot hold.
+        All input fields that the stream was opened with are written: those that are left out become
+        0, and other names are ignored. A lost connection raises nothing: the newest inputs are
+        written again on the next connection, unless they are 10 s old by then or the controller was
+        restarted. Raises struct.error for a number that its field cannot hold, and in an integer
+        field ValueError for NaN and OverflowError for an infinity.
 
         Parameters
         ----------
         values : mapping of str to float, or None
-            By column. None writes nothing, and discards the newest inputs.
+            By the name of the value, such as `input_int_register_24`. None writes nothing, and
+            discards the newest inputs.
         """
         with self._news:
             self._written = values
@@ -332,10 +333,11 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             self._send()
 
     def _send(self) -> None:
-        """Write the newest inputs; do nothing without inputs or a connection.
+        """Write the newest inputs to the controller; do nothing without inputs or a connection.
 
-        The caller holds the lock `_news`. A lost connection is noted in `trouble` and not raised:
-        the thread reconnects and writes the inputs again, unless they are old by then.
+        The caller holds the lock `_news`. A lost connection is noted in the attribute `trouble` and
+        not raised: the thread reconnects and writes the inputs again, unless they are 10 s old by
+        then.
         """
         if self._client is not None and self._written is not None:
             try:
@@ -344,9 +346,10 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
                 self.trouble = str(error)
 
     def _read_loop(self) -> None:
-        """Receive packages and reconnect until the stream is closed: the body of the thread.
+        """Receive packages and buffer them until the stream is closed: the body of the thread.
 
-        Each new connection is counted. While there is no connection, `trouble` says why.
+        If the connection is lost, it reconnects, as often as that takes, and counts each new
+        connection. While there is no connection, the attribute `trouble` says why.
         """
         while self._client is not None:
             client = self._client
@@ -373,9 +376,11 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         """Count a package and the packages missing before it, buffer it, and wake callers of
         `take`.
 
-        If the buffer is full, its oldest package is dropped. At the first package of a new
-        connection the newest inputs are written again, if they are less than 10 s old. But if the
-        package shows that the controller was restarted, the inputs are discarded.
+        `row` is the package. One with the same time as the package before is counted as repeated;
+        one with an earlier time shows that the controller was restarted, which is counted, and the
+        newest inputs are discarded. If the buffer is full, its oldest package is dropped. At the
+        first package of a new connection the newest inputs, if they were not discarded, are written
+        again if they are less than 10 s old.
         """
         with self._news:
             if self._newest is not None:
@@ -394,11 +399,13 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
             self._news.notify_all()
 
     def _connect(self, until: float = float("inf")) -> RtdeClient | None:
-        """Try to connect until it succeeds; return the connection, None if the stream is closed.
+        """Try to connect until that succeeds; return the connection, None if the stream is closed.
 
-        The first connection gives `until`, a time of `time.monotonic`. A failure then raises its
-        CellError or SettingError at once; only if another client still writes an input, the
-        attempts go on until that time. Later failures are noted in `trouble`.
+        Failures are noted in the attribute `trouble`, and the attempts go on, at growing intervals
+        of up to 1 s. But for the first connection of the stream `until` is given, a time of
+        `time.monotonic`: then a failure raises its CellError or SettingError at once, unless
+        another client of the controller still writes an input; for this the attempts go on until
+        that time.
         """
         wait, longest_wait = RETRY_S
         while not self._closing.is_set():
