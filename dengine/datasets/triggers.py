@@ -167,11 +167,13 @@ class StartFinder:
     def feed(self, time: float, active: bool) -> Start | None:
         """Take the next sample; return where an insertion begins if the sample shows it, else None.
 
-        It begins if the trigger is on at this sample and was off for `quiet_s` before. A trigger
-        that is on at the first sample gives no start until it was off.
+        It begins if the trigger is on at this sample (`active`) and was off for `quiet_s`, less
+        half a step, before. A trigger that is on at the first sample gives no start until it was
+        off. `time` is in seconds and increases.
 
-        If samples are missing just before this one, the insertion may have begun in the gap, and
-        `Start.seen` is False; `Start.time` is then the first time in the gap.
+        If the sample before came 1.5 steps ago or more, samples are missing; the insertion may have
+        begun in this gap, and `Start.seen` is False. `Start.time` is then the first time in the
+        gap, else the time of this sample.
         """
         if not active:
             self._off_since = time if self._off_since is None else self._off_since
@@ -193,10 +195,11 @@ def place(
     Parameters
     ----------
     times : sequence of n floats
-        Seconds, increasing.
+        Times of the samples in seconds, increasing.
     values : array of float64, shape (n, C)
+        The samples of the channels at these times.
     start : float
-        Time of the first place.
+        Time of the first place, in seconds.
     samples : int
         Number of places in the trace.
     step : float

@@ -115,13 +115,15 @@ def _rows_of(
     events: Events,
     faults: list[Fault],
 ) -> list[Any]:
-    """Return a row (time, header time, *values) of each message with the channels, times in ns.
+    """Return a row (log time, header time, *values) of each message with the channels.
 
-    The header time is 0 without a header. `topics` holds the topic of the channels. Messages of
-    topics that are keys of `events` are appended there as (time, data); others are not read. A file
-    that is damaged, or has a message that lacks a field, adds a fault, and what came before stays.
-    Raises DataError if no message has the channels, or if a trigger cuts the bag and there is a
-    fault before its last file.
+    Times are in nanoseconds; the header time is 0 without a header. The values are the fields that
+    are the channels. `files` has the path and the name in errors of each file, and `topics` the
+    topic of the channels. Messages of topics that are keys of `events` are appended there as (log
+    time, data); others are not read. For a file that is damaged, or has a message that lacks a
+    field, a fault is appended to `faults`, and what came before stays. Raises DataError if no
+    message has the channels, or if a trigger cuts the bag and there is a fault before its last
+    file.
     """
     fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
@@ -147,10 +149,14 @@ def _rows_of(
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
-    """Return the column of a topic: its message for each row, as `read_bag` describes it.
+    """Return the column of a topic, which has a message or None for each row of the channels.
 
-    messages : (time in ns, data) of the topic; they are sorted in place. logs : the times of the
-    rows.
+    In each row stands the newest message so far, None before the first. But if `is_verdict`, the
+    messages are labels, and each stands only in the last row before it; of several messages
+    between two rows the first stands there.
+
+    messages : (time in ns, data) of each message; they are sorted in place. logs : the times of the
+    rows in ns, increasing.
     """
     messages.sort(key=itemgetter(0))
     times = [time for time, _ in messages]
