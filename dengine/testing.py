@@ -315,8 +315,8 @@ def check_reducer(reducer: Any) -> None:
     Raises
     ------
     AssertionError
-        For the first check that fails; the message names it. An error of TorchScript becomes one
-        as well. Any other error passes unchanged.
+        For the first check that fails; the message names it. It is raised as well if TorchScript
+        compiles the reducer's module and cannot run it. Any other error passes unchanged.
     """
     for check in REDUCER_CHECKS:
         try:

@@ -292,9 +292,9 @@ class TraceGate(nn.Module):
         Returns
         -------
         reason : int
-            Position in `REASONS` of the first fault found: not finite, constant (all samples of all
-            channels are equal), saturated (a sample at or beyond ±`limit`) or too large (beyond
-            1e18); 0 if there is none.
+            Position in `REASONS`, the tuple of all `Reason`, of the first fault found: not finite,
+            constant (all samples of all channels are equal), saturated (a sample at or beyond
+            ±`limit`) or too large (beyond 1e18); 0 if there is none.
         content_hash : int
             Hash of the samples, 64 bits, by which equal traces are known; it is equal to that of
             `folds.content_hash`. A faulty trace has one, too: NaN and infinities count as 0.

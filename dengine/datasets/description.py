@@ -335,7 +335,8 @@ class Description:
     def load(cls, path: FilePath) -> "Description":
         """Read a description from a TOML file.
 
-        Raises DataError if the file cannot be read or has more than 1 MB, and as `from_toml` does.
+        Raises DataError if the file cannot be read, has more than 1 MB or is no TOML, for an
+        unknown key or a value of the wrong type, and for a description of a newer version.
         """
         with instead(
             DataError, f"Expected a description in {path}", OSError, ValueError, TypeError
@@ -420,8 +421,8 @@ class Description:
 
         Of the keys `column`, `path`, `line`, `topic` and `listing` in `[label]`, stating one clears
         the others, and likewise those in `[part]`; words for good and bad stay. Stating a channel
-        replaces the channel `?`. The notes stay. Raises DataError like `from_dict`, and if what
-        stands before the dot in a key is no section.
+        replaces the channel `?`. The notes stay. Raises DataError for an unknown key, for a value
+        of the wrong type, and if what stands before the dot in a key is no section.
         """
         values = self.to_dict()
         for section, sources in SOURCES.items():

@@ -56,7 +56,8 @@ def in_form_of(store: "StoreLike", description: Description) -> Description:
     `traces.samples` becomes the number of samples in the store's `TraceSpec`, and `traces.lengths`
     its `fit` unless that is "strict". Traces of another length would have other hashes, so those
     that the store has would be imported again. The description is returned as it is if the store is
-    new, cannot be opened, or has no readable `TraceSpec`. A store object stays open.
+    new, cannot be opened, or has no readable `TraceSpec`. `store` is a path or URL, or an open
+    store, which stays open.
     """
     try:
         with opening(store, must_exist=True) as opened:
@@ -202,8 +203,9 @@ def import_parts(
 ) -> ImportReport:
     """Store parts with their decisions and labels, in chunks of 500.
 
-    Each chunk is one transaction; chunks before an error stay. If the store, or the chunk, has a
-    label for a decision, nothing is changed: the new label is counted as repeated or contradicted.
+    Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
+    has a label for a decision, nothing is changed: the new label is counted as repeated or
+    contradicted.
     A trace with a fault is stored but never used in training, and its decision gets the fault as
     its reason. With `stops="some"` each label also stores the number of accepted parts without a
     report since the label before; the label of a trace with a fault stores 0, and the next label
@@ -298,9 +300,10 @@ def _as_stored(
 def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:
     """Yield a VERIFY decision, made without a model, for each of the traces (n, C, T).
 
-    Its id is made of the hash of the trace's content and a counter of equal traces, so that the
-    same data set gives the same ids. The parts' numbers are those of `data`. Raises TraceError for
-    a part's number of more than 200 characters, or with characters that do not print.
+    The id of a decision is made of the hash of the trace's content and a counter of equal traces,
+    so that the same data set gives the same ids. The parts' numbers are those of `data`. Raises
+    TraceError for a part's number of more than 200 characters, or with characters that do not
+    print.
     """
     n_equal = Counter[int]()
     parts = [None] * len(data) if data.part is None else data.part.tolist()

@@ -193,7 +193,10 @@ class Recording:
 
 
 def as_word(cell: Any) -> str:
-    """Return a cell as a text: "" for NaN and None, no decimal point for whole numbers."""
+    """Return a cell as a text without blanks around it.
+
+    NaN and None are "", and a whole number has no decimal point: 1.0 is "1".
+    """
     if cell is None or cell != cell:
         return ""
     is_whole = isinstance(cell, float) and cell.is_integer()

@@ -141,7 +141,7 @@ def row_of(column: Column) -> Literal["", "same", "last", "first"]:
     """Return which row of a recording has the label, if this column holds it; "" if it cannot.
 
     "same": each recording has one word in all rows. "last" and "first": this row has the label, and
-    all others have the same word or a word for unchecked.
+    all others have the same word or one that means that the part is not checked, like "pending".
     """
     if column.fixed:
         return "same"

@@ -30,11 +30,12 @@ Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, d
 
 
 def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Message]:
-    """Yield (topic, time in ns, message) for each message of some topics, as the file has them.
+    """Yield (topic, time in ns, message) for each message of some topics, in the file's order.
 
-    `topics` None means all topics. Raises DataError if the file is not a .mcap file, or if a
-    package that reads such files is not installed. If the file is damaged, was not closed or cannot
-    be read, the whole messages are yielded first; then UnreadableError is raised.
+    The time is that of the bag's log. `topics` None means all topics. Raises DataError if the file
+    is not a .mcap file, or if a package that reads such files is not installed. If the file is
+    damaged, was not closed or cannot be read, the whole messages are yielded first; then
+    UnreadableError is raised.
     """
     if path.suffix.lower() != SUFFIX:
         raise DataError(
@@ -68,10 +69,11 @@ def read_bag(
 ) -> Table:
     """Return a table with a row for each message that has the channels, in the order of its time.
 
-    Other topics that the description names are columns too. If a topic is a label, each of its
-    messages stands in the last row before it, other rows have None; of several messages after one
-    row, the first stands there. Any other topic has its newest message in each row, None before the
-    first.
+    Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
+    message's header, 0 without one; both are in nanoseconds. Other topics that the description
+    names are columns, too. If a topic is a label, each of its messages stands in the last row
+    before it, other rows have None; of several messages after one row, the first stands there. Any
+    other topic has its newest message in each row, None before the first.
 
     Parameters
     ----------
@@ -80,6 +82,7 @@ def read_bag(
     title : str
         The bag's name in error messages.
     description : Description
+        Of the bag.
     faults : list
         Gets a fault for each file that is damaged, or has a message without a field that is read;
         its messages before that are read.

@@ -74,7 +74,8 @@ def columns_of(prefix: str, value: Any) -> Columns:
     for each of its C channels. Nested values are treated in the same way. Raises UnreadableError if
     the items of a list are not all alike.
 
-    prefix : the name of the value; a dot and the key, or the channel from 0, are appended.
+    prefix : the name of the value; a dot and the key, or the channel from 0, are appended. Without
+    a name, "", a column is called by the key alone.
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()

@@ -65,10 +65,11 @@ def words_of(
 ) -> list[str]:
     """Return the words that a source of labels or of part numbers has for a recording.
 
-    If the source states a path or a line, that gives one word; otherwise each of `columns` of the
-    recording's table gives one, "" for an empty cell: that of all rows if `at` is "same", or of the
-    "first" or "last" row. Raises UnreadableError if a column, the line or a match is missing, or if
-    rows differ under "same", and DataError if the path is no regular expression with one group.
+    If the source states a path or a line above the header, that gives one word; otherwise each of
+    `columns` of the recording's table gives one, "" for an empty cell: that of all rows if `at` is
+    "same", or of the "first" or "last" row. Raises UnreadableError if a column, the line or a match
+    is missing, or if rows differ under "same", and DataError if the path is no regular expression
+    with one group.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -136,8 +137,8 @@ class LabelReader:
         `table` is the table of the recording, and `part` its part number. If the source is a
         listing, they are the words of all its rows with the key of the recording. The key is the
         first of these that is listed: the number of the part, the path, the file name, the path
-        without suffix, the file name without suffix. It is added to `used`. Any other source gives
-        one word.
+        without suffix, the file name without suffix. It is added to `used`, the set of keys found
+        so far. Any other source gives one word.
 
         Raises
         ------
@@ -166,9 +167,10 @@ class LabelReader:
         """Return the label of a recording: 1 good, 0 bad, None not checked.
 
         `table` is the table of the recording, and `part` its part number. If the source is a
-        listing, the key that was found is added to `used`. Raises UnreadableError if there is no
-        label, if rows of the listing contradict each other, or if a word has no stated meaning, and
-        DataError if `source.path` is no regular expression with one group.
+        listing, the key that was found in it is added to `used`, the set of keys found so far.
+        Raises UnreadableError if there is no label, if rows of the listing contradict each other,
+        or if a word has no stated meaning, and DataError if `source.path` is no regular expression
+        with one group.
         """
         source = self.source
         words = self.words(table, part)
