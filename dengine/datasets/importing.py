@@ -159,6 +159,8 @@ def import_labelled(
     Returns
     -------
     ImportReport
+        How many labels were stored, or quarantined with a faulty trace, and how many the store had
+        already or contradicts.
 
     Raises
     ------
@@ -204,12 +206,11 @@ def import_parts(
     """Store parts with their decisions and labels, in chunks of 500.
 
     Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
-    has a label for a decision, nothing is changed: the new label is counted as repeated or
-    contradicted.
-    A trace with a fault is stored but never used in training, and its decision gets the fault as
-    its reason. With `stops="some"` each label also stores the number of accepted parts without a
-    report since the label before; the label of a trace with a fault stores 0, and the next label
-    counts these parts.
+    has a label for a decision, also a forgotten one, nothing is changed: the new label is counted
+    as repeated or contradicted. A trace with a fault is stored but never used in training, and its
+    decision gets the fault as its reason. With `stops="some"` each label also stores the number of
+    accepted parts without a report since the label before; the label of a trace with a fault stores
+    0, and the next label counts these parts.
 
     Parameters
     ----------
@@ -218,7 +219,7 @@ def import_parts(
         The decision, the trace and the label of each part; None if there is no report. A part
         whose label came later may stand in the sequence a second time, with the label.
     trace_spec : TraceSpec
-        Of the traces.
+        Shape of the traces, and the range of the sensor, by which faults are found.
     policy : Policy
         The policy under which the decisions were made. Each stored decision gets its propensity
         from it; `Decision.propensity` is not read.
@@ -228,7 +229,8 @@ def import_parts(
     Returns
     -------
     ImportReport
-        It counts labels, not parts; `resumed` is True.
+        It counts labels, not parts: those that were stored, quarantined with a faulty trace, known
+        already and contradicted. `resumed` is True.
     """
     gate = TraceGate(trace_spec)
     counts: dict[str, Any] = dict.fromkeys(
@@ -282,7 +284,7 @@ def _count_unreported(store: "SqlStore", policy: Policy) -> int:
 def _as_stored(
     decision: Decision, trace: TraceArray, gate: TraceGate, policy: Policy, time: float
 ) -> StoredDecision:
-    """Return the record of a decision and its trace (C, T) for the store; it is not stored here.
+    """Return a record of a decision and a copy of its trace (C, T), without storing it.
 
     Its propensity, the probability of a check, is the policy's audit rate (1 in shadow mode) if the
     model was certain, else 1. If `gate` finds a fault in the trace, this becomes the reason of the

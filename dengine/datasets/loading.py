@@ -153,8 +153,8 @@ def count_files(source: str, description: Description | None) -> int:
 def missing_text(path: Path, proposal: Description) -> str:
     """Return the error message for recordings at `path` without a description.
 
-    It lists the open keys of the proposed description, whose value is `?`, and has the commands
-    that show and save the proposal.
+    It lists the open keys of the proposed description, whose value is `?`, with the notes on them,
+    and has the commands that show and save the proposal.
     """
     notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
     questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())

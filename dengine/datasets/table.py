@@ -75,7 +75,10 @@ class Table:
     path: str = ""
 
     def column(self, name: str) -> Cells:
-        """Return the cells of a column; raise UnreadableError if there is none of this name."""
+        """Return the cells of a column, an array of shape (rows,), or (1,) if one holds for all.
+
+        Raises UnreadableError if there is no column of this name.
+        """
         if name not in self.columns:
             columns = listed(self.columns) or "none"
             raise UnreadableError(f"Expected a column {name}, got {columns}", self.header, name)

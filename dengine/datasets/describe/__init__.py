@@ -107,9 +107,9 @@ def choose_files(p: Proposal, root: Path) -> bool:
     suffix that several files have; the suffix of a bag, `.mcap`, counts even for one file. If no
     suffix qualifies, all suffixes do. If several suffixes qualify, or each part has several files
     with the names of signals in them (`signal_endings`), `files` is set to `?` with a note that
-    lists the choices, nothing else is set, and the result is False. Otherwise `p.base` becomes the
-    folder, `p.names` these files and `p.others` all other files, and the format is that of the
-    first file's suffix, `text` for an unknown one. Raises DataError if there is no file of
+    lists the choices, a note on `channels` says so, and the result is False. Otherwise `p.base`
+    becomes the folder, `p.names` these files and `p.others` all other files, and the format is that
+    of the first file's suffix, `text` for an unknown one. Raises DataError if there is no file of
     recordings.
     """
     stated = p.description.files
@@ -205,10 +205,10 @@ def read_tables(p: Proposal) -> list[Table]:
 
     Tables with other column names than most files have are left out. For text files the keys of
     `[text]` are set in `p` first, and files of another form move from `p.names` to `p.others`.
-    Damaged files are left out, also those with a line that has a wrong number of cells, but such a
-    line of the only file is left out alone. If no file can be opened, the list is empty, or
-    DataError is raised for text files. Raises DataError, too, if all files are damaged, if no text
-    file is a text, or if it is not certain which line of all of them is the header.
+    Damaged files are left out, also those with a line that has a wrong number of cells; if there is
+    only one file, such a line is left out instead. The list is empty if files that are no text
+    cannot be opened. Raises DataError if all files are damaged, or if no text file can be opened,
+    is a text and has a header that is certain.
     """
     contents = contents_of(p)
     if p.description.format == "text":
@@ -256,13 +256,13 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 def propose_tables(p: Proposal, files: Tables) -> None:
     """Find the layout, then what each column is for, and set the keys that say so in `p`.
 
-    `files` has the table of each file that is looked at. At most the first 50,000 rows of each are
-    used; `p.is_cut` is set if a file has more. `p.tables` becomes the tables of the parts, and
-    `p.names` is emptied unless each file is one part. If the layout or `part.column` is `?`,
-    nothing more is proposed: `p.tables` and `p.names` stay, and a note on `channels` says why.
-    Raises DataError if there is no table, no part, or only a table of results, or if a stated
-    column, format of times or source of labels is wrong, and SettingError for a malformed
-    `windows.trigger`.
+    A stated layout stays. `files` has the table of each file that is looked at. At most the first
+    50,000 rows of each are used; `p.is_cut` is set if a file has more. `p.tables` becomes the
+    tables of the parts, and `p.names` is emptied unless each file is one part. If the layout or
+    `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names` stay, and a note on
+    `channels` says why. Raises DataError if there is no table, no part, or only a table of results,
+    or if a stated column, format of times or source of labels is wrong, and SettingError for a
+    malformed `windows.trigger`.
     """
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")

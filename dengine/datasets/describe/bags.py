@@ -29,12 +29,13 @@ def propose_bag(p: Proposal) -> None:
 
     It looks at the first 50,000 messages of the first file. The clock is the time in the messages'
     headers if all topics have it, apart from those with a field `data`, else the time of the log;
-    the rate follows from it. `traces.samples` is set to `?` unless it is stated; so is
-    `windows.trigger` unless it or `windows.listing` is stated, and `label.topic` unless anything of
-    the label is stated. The notes on the last two list the topics and their words. The words of a
-    stated topic of labels are sorted into good and bad. Fields that are no channels become
-    `ignored`. Raises DataError if the file is no bag or is damaged before its first message, or if
-    the package that reads bags is missing; a later damage only ends the reading.
+    the rate follows from it (`propose_rate`). `traces.samples` is set to `?` unless it is stated;
+    so is `windows.trigger` unless it or `windows.listing` is stated, and `label.topic` unless
+    anything of the label is stated. The notes on the last two list the topics and their words. The
+    words of a stated topic of labels are sorted into good and bad. Fields that are no channels
+    become `ignored`. Raises DataError if the file is no bag or is damaged before its first message,
+    or if the package that reads bags is missing, or if a setting in `[time]` is wrong; a later
+    damage only ends the reading.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()

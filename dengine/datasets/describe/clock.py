@@ -113,8 +113,8 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
     why it is `?`, or which size proves the unit. If several forms of dates fit, so that day and
-    month can be confused, the form is `?`, unless another column tells the time of day and all
-    recordings have one date.
+    month can be confused, the form is `?`; but if another column tells the time of day and all
+    recordings have one date, it is the first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """

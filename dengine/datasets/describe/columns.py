@@ -99,8 +99,9 @@ class Column:
     def forms(self) -> list[str]:
         """All forms of dates and times, like `%d.%m.%Y`, that fit the cells of the column.
 
-        None if a cell is no date or time. The first 20 cells and the last cell of each recording
-        are looked at. If an ISO date fits, with or without a time of day, it is the only form.
+        The list is empty if a cell is no date or time. The first 20 cells and the last cell of each
+        recording are looked at. If an ISO date fits, with or without a time of day, it is the only
+        form.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]

@@ -183,9 +183,11 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels; if the user stated a source, only that.
 
-    They come in this order: pairs of columns of listings among `p.others`, regular expressions for
-    the paths (if a file or a column is a part), columns without another use, and lines above the
-    header. A file that cannot be read as a listing is skipped.
+    They come in this order: pairs of columns of listings among `p.others`, of which one may be the
+    key, since its words differ in more than half of the rows, and the other may hold labels;
+    regular expressions for the paths (if a file or a column is a part); columns without another use
+    that may have the label in all rows, the last or the first; and lines above the header. A file
+    that cannot be read as a listing is skipped.
 
     paths : the path of each recording.
     """

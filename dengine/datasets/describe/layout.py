@@ -29,8 +29,8 @@ def layout_of(p: Proposal, files: Tables) -> str:
 
     `files` has the table of each file that is looked at. These rules come one after another.
     Several JSON or .ts files, of which the first has one row, are `files`. Lists in the first row
-    of the first table, or 20 or more numbered columns, make it `wide`, or `npz` for an .npz file.
-    It is `long` if a column may tell the parts apart (`may_tell_parts`), or if the stated
+    of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
+    file. It is `long` if a column may tell the parts apart (`may_tell_parts`), or if the stated
     `part.column` has several words; `part.column` is then set in `p` to the only such column with a
     name like that of a part's number, or to `?` with a note. Several tables are `files`. A single
     one gives `?`, with a note on what to state, or DataError if it is a table of results: one row

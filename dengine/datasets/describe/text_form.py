@@ -199,7 +199,7 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     that is the encoding, with a note that it is guessed. The marks in numbers are set by
     `propose_marks`.
 
-    looks : how the files, which are of one form, are written, and their first lines.
+    looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """
     usual = looks[0]
     form = usual.form
@@ -227,7 +227,7 @@ def _column_names(usual: Look) -> Sequence[str]:
     row: if its first column has 2 to 12 different words, all whole numbers, and fewer of them than
     the second, it is named `class`, before `x*`.
 
-    usual : how a typical file is written, and its first lines.
+    usual : how a typical file is written, and the cells of its samples.
     """
     width = usual.width
     line = COMMENT.sub("", usual.line.lstrip())

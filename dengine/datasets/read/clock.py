@@ -87,11 +87,12 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
 def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextForm) -> Times:
     """Return the times of one column in seconds since its first row, and the time of that row.
 
-    `unit` is the unit of its cells, or the form of its dates or times of day. If times of day fall
-    from one row to the next by more than half a day, midnight has passed, unless a column of the
-    clock has the date. If a counter falls by more than half of `clock.wrap`, it began again at 0.
-    `form` says how numbers are written. Raises UnreadableError if the column `name` is missing or
-    empty, or a cell is no such time, and DataError if `unit` is no unit of time.
+    `unit` is the unit of its cells, or the form of its dates or times of day; a column of datetimes
+    needs neither. If times of day fall from one row to the next by more than half a day, midnight
+    has passed, unless a column of the clock has the date. If a counter falls by more than half of
+    `clock.wrap`, it began again at 0. `form` says how numbers are written. Raises UnreadableError
+    if the column `name` is missing or empty, or a cell is no such time, and DataError if `unit` is
+    no unit of time.
     """
     cells = table.column(name)
     if not len(cells):
@@ -120,7 +121,7 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     1970 (UTC), or since midnight if the cells have no date. `unit` is the form of the cells, "iso"
     or like "%d.%m.%Y"; a comma is read as a point. Dates without a time zone are in `clock.zone`,
     or UTC if that is empty. Raises UnreadableError if there is no column `name`, or one of its
-    cells does not have the form.
+    cells does not have the form, or is no single time because clocks are changed.
     """
     import pandas as pd
 

@@ -41,7 +41,7 @@ def recording_of(
     """Return the recording of a part; None if the part was not checked.
 
     The times and samples of a part that was not checked must be readable, too, but may be of any
-    length.
+    length. If `[part]` states nothing, a part that `[windows]` cuts has its key as part number.
 
     Parameters
     ----------
@@ -224,10 +224,11 @@ def files_of(
 ) -> tuple[str, Path, Sequence[tuple[Path | Table, str]]]:
     """Return the name of a data set, its folder, and a list of (file or table, name) to read.
 
-    All files of a bag are read here, into one table; a fault of each damaged one is appended to
-    `faults`. A DataFrame gives one table, called "table", and the current folder. Raises DataError
-    if there is no file or the bag cannot be read (see `read_bag`), and SettingError if
-    `windows.trigger` of a bag is malformed.
+    The data set has the name of the folder, or of the file without its suffix. All files of a bag
+    are read here, into one table; a fault of each damaged one is appended to `faults`. A DataFrame
+    gives one table, called "table", and the current folder. Raises DataError if there is no file or
+    the bag cannot be read (see `read_bag`), and SettingError if `windows.trigger` of a bag is
+    malformed.
     """
     if not isinstance(source, Path):
         return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
@@ -264,7 +265,8 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
     `ordered` is False if the label changes exactly once from one recording to the next. `fit` is
     "strict" if the recordings were resampled at the stated rate of their clock, since live traces
     then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
-    "pad-all". Raises DataError if `make_dataset` refuses the traces.
+    "pad-all". `part` is None if no recording has a part number. Raises DataError if `make_dataset`
+    refuses the traces.
     """
     labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])

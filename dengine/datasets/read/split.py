@@ -193,7 +193,7 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
 
     The channel's name may have a `*` for any text. The columns of times and of `[rows]` are in each
     table, too, and are no parts. Rows below the last cell of the part that is not empty are left
-    out.
+    out. Damage of the file is damage of each part.
     """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}

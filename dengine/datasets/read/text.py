@@ -135,8 +135,10 @@ def _header_line(content: bytes, header: int | str) -> int:
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: those of `text.names`, otherwise the cells of the header.
 
-    A last name `x*` becomes `x0`, `x1`, ..., as many as the first row of samples has cells left.
-    Raises UnreadableError if there are neither names nor a header.
+    A last name `x*` of `text.names` becomes `x0`, `x1`, ..., as many as the first row of samples
+    has cells left. In the header a comment mark is skipped, an empty cell is called by its number,
+    like `column1`, and a name that repeats gets a number, like `X.2`. Raises UnreadableError if
+    there are neither names nor a header.
 
     top : the lines from the first to the first row of samples. header : the number of the header's
     line, 0 for none. form : the section `[text]`.

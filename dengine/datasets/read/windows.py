@@ -29,8 +29,8 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     has no samples, overlaps an earlier one, or goes beyond the recording. If the labels are a topic
     of a bag, that column has at most one cell: the first label between the start of the part and
     the start of the next. Raises DataError if `time.column` is not stated, if a trigger cuts and
-    the rate is not stated, if no part is found, or if times, signals, labels or the listing cannot
-    be read, and SettingError for a malformed trigger.
+    the rate is not stated, if no part is found, if the recording has damage, or if times, signals,
+    labels or the listing cannot be read, and SettingError for a malformed trigger.
     """
     name = table.source
     if not description.time.column:
@@ -81,10 +81,12 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
     """Yield the key, the rows and the fault ("" for none) of each window, by increasing start.
 
     The listing, a file in the folder `base`, has the key (the part's number), start and end of each
-    window. `times`, shape (rows,), are the recording's, in seconds. If they are dates and all times
-    of the listing are below 1e8 s, those count from the recording's first sample. A window has a
-    fault if it overlaps an earlier one, has no samples, or goes beyond the recording; one without
-    samples gets the first row. Raises DataError if the listing cannot be read.
+    window. `times`, shape (rows,), are the recording's, in seconds. If they begin at 1e8 s or
+    later, like dates, and all times of the listing are smaller, those count from the recording's
+    first sample. The rows are those from the start to before the end. A window has a fault if it
+    overlaps an earlier one, has no samples, or goes beyond the recording by more than 1.5 steps of
+    the stated rate; one without samples gets the first row. Raises DataError if the listing cannot
+    be read.
     """
     about = description.windows
     form = description.text
