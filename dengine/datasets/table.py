@@ -118,9 +118,9 @@ class Table:
     def numbers(self, name: str, form: TextForm) -> Floats:
         """Return a column as numbers, float64 (rows,); a missing number is NaN.
 
-        `form` is the section `[text]`: its marks in numbers, and the words that stand for a missing
-        one. Raises UnreadableError if there is no such column, and for any other cell: one that is
-        no number of this form, is infinite, or is too large for float32.
+        `form` is the section `[text]`, with the decimal mark, the mark of thousands and the words
+        for a missing number. Raises UnreadableError if there is no such column, and for any other
+        cell: one that is no number of this form, is infinite, or is too large for float32.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
@@ -208,9 +208,10 @@ def as_word(cell: Any) -> str:
 
 @lru_cache
 def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
-    """Return the regular expression of a number with these marks, a sign and an exponent.
+    """Return the regular expression of a number; a sign and an exponent are allowed.
 
-    `thousands` stands between groups of three digits, if a number has any; "" allows no groups.
+    `decimal` is its decimal mark, and `thousands` the mark that may stand between groups of three
+    digits; "" allows no groups.
     """
     mark, point = re.escape(thousands), re.escape(decimal)
     groups = rf"[1-9]\d{{0,2}}(?:{mark}\d{{3}})+|" if mark else ""
@@ -221,8 +222,8 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
     """Return the number in a cell; NaN for a word of `form.missing`, infinity for any other text.
 
-    A float is returned as it is; None is read as the word `null`. `form` has the marks in numbers,
-    and `pattern` is the regular expression of a number with these marks.
+    A float is returned as it is; None is read as the word `null`. `form` has the decimal mark and
+    the mark of thousands, and `pattern` is the regular expression of a number with these.
     """
     if isinstance(cell, float):
         return cell

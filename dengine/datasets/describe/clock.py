@@ -144,11 +144,11 @@ def _unit_in(name: str) -> str:
 def _unit_by_size(column: Column) -> tuple[str, str]:
     """Return the unit of time that the numbers in a column prove, and a note on it.
 
-    Its size proves a unit in which the first number is a time in the years 2000 to 2050, counted
-    from 1970 or another usual day, and the steps have a rate of 1 Hz to 1 MHz. Steps of at most
-    0.019 are taken for seconds. Otherwise the unit is `?`, and the note lists the possible units.
-    It is `?`, too, if the column has no numbers that rise; the note then asks for the form of its
-    cells.
+    A unit is proved if with it the first number is a time in the years 2000 to 2050, counted from
+    1970 or from another day that clocks use, and the numbers come at a rate of 1 Hz to 1 MHz. If
+    none is, and the median step is at most 0.019, the unit is s. Otherwise it is `?`, and the note
+    lists the possible units. It is `?`, too, if the column has no numbers that rise; the note then
+    asks for the form of its cells.
     """
     rising = column.steps[column.steps > 0]
     if not len(rising):

@@ -45,8 +45,8 @@ def propose_roles(p: Proposal) -> None:
     The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
     of the traces, ignored columns and files. A key is `?` if no rule proves a value. If it is open
-    which rows are samples, `traces.samples` is `?` and no rate is set; a clock that is open gives
-    no rate either. Raises DataError if a stated column of times or channel does not exist, a stated
+    which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?` gives no
+    rate either. Raises DataError if a stated column of times or channel does not exist, a stated
     `time.format` is none, or a stated source of labels has no words, and SettingError for a
     malformed `windows.trigger`.
     """

@@ -165,7 +165,7 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
-    """Set `[text]` in `p` to the text form of most files, and set aside files of another form.
+    """Set `[text]` in `p` to the text form of most files, and leave out files of another form.
 
     Those have another delimiter, number of columns or header, and move from `p.names` to
     `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
@@ -196,8 +196,8 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 
     If the header stands at different lines, or the user stated a text for it, `text.header` becomes
     its text, and `text.units` and `text.data` are counted from it. If a file is read as cp1252,
-    that is the encoding, with a note that it is guessed. The marks in numbers are set by
-    `propose_marks`.
+    that is the encoding, with a note that it is guessed. `propose_marks` sets the decimal mark and
+    the mark of thousands.
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """
@@ -242,15 +242,15 @@ def _column_names(usual: Look) -> Sequence[str]:
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
-    """Set in `p` the decimal mark and the mark between groups of digits that read most numbers.
+    """Set in `p` the decimal mark and the mark of thousands with which most numbers can be read.
 
     `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if point
     and comma read as many numbers, or if more than 5 % of the numbers cannot be read at all; but
-    not if no number has a point or comma. The mark between groups is `?`, with a note, if it is a
+    not if no number has a point or comma. The mark of thousands is `?`, with a note, if it is a
     point or comma, fewer than 5 % of the numbers need it, and no number has both a point and a
     comma: `7,286` among `7.1` and `8.2` may be a damaged number. Stated keys stay.
 
-    cells : texts that are numbers with some marks.
+    cells : the different texts in the samples that are numbers with any of these marks.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
     possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"
