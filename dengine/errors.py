@@ -62,10 +62,11 @@ def listed(names: Iterable[Any]) -> str:
 def as_options(text: str) -> str:
     """Return a message in which Python's arguments are written as options of the command line.
 
-    `TraceSpec(rate_hz=500)` and `rate_hz=500` become `--rate-hz 500`, and a name alone in
-    parentheses, `(samples)`, becomes `(--samples)`. Only the names in `OPTIONS` are rewritten; a
-    value in quotes loses them unless a shell needs them. Other text in single quotes, which
-    messages use for data, and all other text stay.
+    `rate_hz=500` becomes `--rate-hz 500`, and a name alone in parentheses, `(samples)`, becomes
+    `(--samples)`. Only the names channel, channels, fit, samples, rate_hz, unit and trigger are
+    rewritten, and not after a colon. `TraceSpec(...)` around arguments is dropped, with a
+    `DataEngine(trace=...)` around it. A value in quotes loses them unless a shell needs them. All
+    other text stays, also text in single quotes, which messages use for data.
     """
 
     def to_option(match: re.Match[str]) -> str:
@@ -159,7 +160,7 @@ def expect(
     wanted : str
         What was expected.
     actual : object
-        What came; shown by `shortened`.
+        What came. The message has its `repr`, cut to 60 characters.
     do : str
         What the user can do about it.
     error : type
@@ -182,8 +183,8 @@ def instead(
         Class of the new error. An exception of this class passes unchanged.
     message : str
         Beginning of the new message. The text of the caught exception follows, on one line and cut
-        to 300 characters. Of an OSError only `strerror` follows, which lacks the file's name, so
-        `message` must name the file.
+        to 300 characters; if it is empty, the name of its class. Of an OSError only `strerror`
+        follows, which lacks the file's name, so `message` must name the file.
     *caught : type
         Exceptions to catch. All others pass unchanged.
     do : str

@@ -44,9 +44,9 @@ MIN_KEY_BYTES = 16
 
 
 def read_key(path: FilePath, error: type[DengineError]) -> bytes:
-    """Return the secret in a key's file, without line breaks at its end.
+    """Return the secret key in a file, which signs exports, without line breaks at its end.
 
-    Raises `error` if the file cannot be read, or the secret has fewer than 16 bytes.
+    Raises `error` if the file cannot be read, or the key has fewer than 16 bytes.
     """
     with instead(
         error,
@@ -64,7 +64,7 @@ def read_key(path: FilePath, error: type[DengineError]) -> bytes:
 def check_size(size: float, source: object) -> None:
     """Raise DataError if arrays would need too much memory.
 
-    The limit is 8 GB (`MAX_BYTES`), or half of the machine's memory if that is less.
+    The limit is 8 GB, or half of the machine's memory if that is known and less.
 
     Parameters
     ----------
@@ -104,13 +104,14 @@ def read_errors(
     kind : str
         What it should be, for the error: "a Parquet file".
     package : str
-        Package that reads such files. If it is not installed, this call itself raises DataError.
+        Python package that reads such files. If it is not installed, this call itself raises
+        DataError, before there is a context manager. "": no package is needed.
     extra : str
-        Extra of dengine that installs the package, for that error.
+        Extra of dengine that installs the package, for that error: `pip install "dengine[extra]"`.
     also : tuple of type
-        Exceptions to catch in addition to those in `UNREADABLE`.
+        Further exceptions to catch.
     do : str
-        What the user can do about it.
+        What the user can do about a bad file, the end of the message.
     """
     if package and find_spec(package) is None:
         do = f'pip install "dengine[{extra}]"'
@@ -216,7 +217,7 @@ def check_output(path: FilePath, force: bool = False) -> None:
     ----------
     path : path
         File to write. A database, folder, link, pipe or device is always refused, and so is an
-        existing file that cannot be read.
+        existing file that cannot be read, or a path that the system refuses.
     force : bool, default False
         Whether another file that exists may be replaced.
     """
@@ -254,8 +255,8 @@ def output_file(
 ) -> Iterator[Path]:
     """Context manager that gives the path of an empty file to write.
 
-    If the block ends well, the file is synced and renamed to `path`; if it raises, the file is
-    deleted and `path` stays as it was.
+    If the block ends well, the file is forced to disk (fsync) and renamed to `path`; if it raises,
+    the file is deleted and `path` stays as it was.
 
     Parameters
     ----------
@@ -264,8 +265,8 @@ def output_file(
     force : bool, default False
         Whether a file that exists may be replaced; see `check_output`.
     make_folder : bool, default False
-        Whether the folder of `path` is made, with its parents, if it does not exist. It stays even
-        if the block raises.
+        Whether the folder of `path` is made, with its parents, if it does not exist. The folder
+        stays even if the block raises.
 
     Yields
     ------
@@ -319,12 +320,12 @@ def new_folder(path: FilePath) -> Iterator[Path]:
 
 
 def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:
-    """Add the SHA-256 of files to `manifest.json` in their folder, and return its path.
+    """Add the SHA-256 of files to `manifest.json` in `folder`, and return the path of the manifest.
 
-    Entries of other files stay, and the manifest is created if there is none. Write it last, so
-    that it lists only complete files. A `manifest.json` that is no manifest raises OutputError, or
-    is replaced with `force`. Raises OutputError if it cannot be written, too; an OSError of reading
-    `files` passes unchanged.
+    `files` are listed by their names. Entries of other files stay, and the manifest is created if
+    there is none. Call it after the files are complete. A `manifest.json` that is no manifest is
+    replaced with `force`; without it OutputError is raised. OutputError is also raised if the
+    manifest cannot be written; an OSError of reading `files` passes unchanged.
     """
     target = folder / MANIFEST
     sums: dict[str, str] = {}
@@ -337,7 +338,7 @@ def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> 
 
 
 def _write_errors(target: Path, *also: type[Exception]) -> AbstractContextManager[None]:
-    """Return a context manager that raises OutputError in place of OSError and of `also`.
+    """Return a context manager that raises OutputError in place of OSError or a class in `also`.
 
     The message says that `target` cannot be written, and advises to choose another folder or file.
     """

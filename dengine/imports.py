@@ -8,12 +8,15 @@ from .errors import SettingError, instead, shortened
 
 
 def import_class(path: str) -> type:
-    """Import the module in `module:Class`, which runs its code, and return the class.
+    """Import the class that `path`, a text `module:Class`, names, and return it.
+
+    The module is imported, which runs its code.
 
     Raises
     ------
     SettingError
-        If the module cannot be imported, whatever it raises, or has no class of that name.
+        If the module cannot be imported, whatever exception it raises, or has no class of that
+        name.
     """
     module, _, name = path.partition(":")
     with instead(

@@ -83,11 +83,12 @@ class ForceLimits:
 
     @classmethod
     def parse(cls, text: str) -> ForceLimits:
-        """Return the limits that a text like START:END:LOW:HIGH describes; `str` writes this text.
+        """Return the limits that a text START:END:LOW:HIGH describes; `str` writes this text.
 
-        An empty LOW or HIGH means no limit. `:channel=1`, `:along=2` and `:reject` may follow. A
-        channel in digits is an index, any other text is a name. Raises SettingError for a text of
-        another form, and for values that `ForceLimits` refuses.
+        The four numbers are `start`, `end`, `low` and `high` of the class. An empty LOW or HIGH
+        means no limit. `:channel=1`, `:along=2` and `:reject` may follow, and set the fields of
+        these names. A channel in digits is an index, any other text is a name. Raises SettingError
+        for a text of another form, and for values that `ForceLimits` refuses.
         """
         fields = text.split(":")
         options: dict[str, Any] = {}

@@ -80,7 +80,7 @@ class ReducerDefault:
 
 
 def _check_retrain_every(value: Any) -> None:
-    """Raise SettingError for a `retrain_every` that is no integer in range."""
+    """Raise SettingError for a `retrain_every` that is no integer from 1 to 1,000,000,000."""
     expect(
         is_whole(value, 1, 10**9),
         "retrain_every to be an integer of at least 1",
@@ -184,15 +184,16 @@ class Recipe:
         Parameters
         ----------
         recipe : str, path, Recipe or estimator
-            A name in `RECIPES`, the path of a TOML file, a Recipe, which is returned unchanged, or
-            a reducer of your own, `module:Class` (not imported here) or a scikit-learn transformer,
-            which gets the default settings. A text is first taken as a name, then as a path, then
-            as `module:Class`.
+            A name in `RECIPES`, the recipes of dengine; the path of a TOML file; a Recipe, which is
+            returned unchanged; or a reducer of your own, which gets the default settings:
+            `module:Class`, which is not imported here, or a scikit-learn transformer. A text is
+            first taken as a name, then as a path, then as `module:Class`.
 
         Raises
         ------
         SettingError
-            For anything else, and for a file that is no recipe.
+            For anything else, and for a file that cannot be read, has more than 1 MB or is no
+            recipe.
         """
         if isinstance(recipe, Recipe):
             return recipe
@@ -217,9 +218,9 @@ class Recipe:
         """Parse the text that `to_toml` writes, and return the recipe.
 
         Settings that are missing get their defaults, and "none" is read as None. The policy's
-        "windows", the name in earlier versions, is read as "force_limits". No class is imported, so
-        an unknown reducer is not noticed here. Raises SettingError, which names `where`, for text
-        that is not TOML, an unknown key or a value out of range.
+        "windows", the name in earlier versions, is read as "force_limits". No class of a reducer is
+        imported, so an unknown reducer is not noticed here. Raises SettingError for text that is
+        not TOML, an unknown key or a value out of range. `where` is the recipe's name in errors.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
@@ -244,12 +245,12 @@ class Recipe:
     def from_store(
         cls, settings: Mapping[str, str], where: str = "the recipe in the store"
     ) -> Recipe:
-        """Parse ``settings["recipe"]`` of a store's settings, and return the recipe.
+        """Parse the recipe in the settings of a store, ``settings["recipe"]``, and return it.
 
-        No class that the recipe names is imported. The defaults of `radius` and `retrain_every`
-        stand in the reducer's class. If either setting is missing and the reducer is no name in
-        `RECIPES`, StoreError is raised, because the store is damaged. Raises SettingError for a
-        text that is no recipe.
+        `settings` has texts by name. No class of a reducer is imported. The defaults of `radius`
+        and `retrain_every` stand in that class, so a store must have both, unless the reducer is a
+        name in `RECIPES`: else StoreError is raised, because the store is damaged. Raises
+        SettingError for a text that is no recipe. `where` is the recipe's name in errors.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
@@ -266,8 +267,9 @@ class Recipe:
         If `radius` or `retrain_every` is None, the reducer's class is imported, and its default is
         written. Of a reducer given by name the recipe's `params` are written, and no defaults. A
         reducer object is written as `module:Class` and its parameters that are not None. If a
-        parameter is no plain value, like the steps of a pipeline, or the class cannot be imported
-        by name, the object is written as "object Class", and the user must hand it in again.
+        parameter is no text, number or boolean, like the steps of a pipeline, or the class cannot
+        be imported by name, the object is written as "object Class", and the user must hand it in
+        again. Raises SettingError if the class of a named reducer must be imported, and cannot be.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
@@ -289,9 +291,9 @@ class Recipe:
     def make_reducer(self, seed: int) -> Any:
         """Return the reducer: the object itself if one was given, or a new one, made by name.
 
-        A named reducer's class is imported. It gets the seed as `random_state`, and `folds`, if it
-        has these parameters; the recipe's `params` take precedence over both. Raises SettingError
-        if there is no such reducer, or if it does not take these `params`.
+        The class of a named reducer is imported. If it has parameters `random_state` and `folds`,
+        they get the seed and the recipe's `folds`; the recipe's `params` take precedence over both.
+        Raises SettingError if there is no such reducer, or if it does not take these `params`.
         """
         if not isinstance(self.reducer, str):
             return self.reducer
@@ -303,9 +305,9 @@ class Recipe:
 
 
 def _check_keys(table: Table, record_type: Any, where: str) -> None:
-    """Raise SettingError if a table has a key that is no field of the dataclass `record_type`.
+    """Raise SettingError if a table of TOML has a key that is no field of a dataclass.
 
-    The message begins with `where`.
+    `record_type` is the dataclass. The message begins with `where` and lists the fields.
     """
     names = sorted(f.name for f in fields(record_type))
     unknown = sorted(set(table) - set(names))
@@ -316,9 +318,9 @@ def _check_keys(table: Table, record_type: Any, where: str) -> None:
 
 
 def _read_text(path: Path) -> str | None:
-    """Return the text of a recipe's file; None if it does not exist or is no regular file.
+    """Return the text of a recipe's file; None if there is no regular file at `path`.
 
-    Raises SettingError if it is larger than 1 MB, is not UTF-8 or cannot be read.
+    Raises SettingError if the file is larger than 1 MB, is not UTF-8 or cannot be read.
     """
     problem = f"{path} is not UTF-8 text"
     with (  # an OSError among them is a name that is too long
@@ -335,12 +337,12 @@ def _read_text(path: Path) -> str | None:
 
 
 def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
-    """Return a reducer as TOML can describe it: a name, and parameters with plain values.
+    """Return a reducer in a form for TOML: a name, and parameters that are plain values.
 
-    A name is returned unchanged, with `params`. Of an object the result is its `module:Class` and
-    its own parameters, without those that are None. It is "object Class" and no parameters if a
-    parameter is no plain value, or is None though its default is not, or if the class is local or
-    defined in `__main__`.
+    Plain values are booleans, numbers and texts. A name is returned unchanged, with `params`. For
+    an estimator the result is the `module:Class` of its class and its `get_params(deep=False)`,
+    without those that are None. It is "object Class" and no parameters if a parameter is no plain
+    value, or is None though its default is not, or if the class is local or stands in `__main__`.
     """
     if isinstance(reducer, str):
         return reducer, params
@@ -360,8 +362,8 @@ def _name_and_params(reducer: Any, params: Params) -> tuple[str, Params]:
 def describe_estimator(estimator: Any) -> str:
     """Return an estimator as text: its class and all parameters, also nested ones, sorted by name.
 
-    Of a value that is not plain only the class is named, so that the text is the same in every
-    process.
+    If a value is no boolean, number, text or None, only its class is named, so that the text is the
+    same in every process.
     """
     params = estimator.get_params(deep=True)
     values = (

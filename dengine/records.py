@@ -192,8 +192,8 @@ class TraceSpec:
     def completed(self, other: "TraceSpec | None") -> "TraceSpec":
         """Return a copy whose unknown rate, units and columns are taken from another `TraceSpec`.
 
-        What this `TraceSpec` states is kept. It is returned unchanged if `other` is None or has
-        another number of samples or channels.
+        What this `TraceSpec` states is kept, also each single unit. It is returned unchanged if
+        `other` is None or has another number of samples or channels.
         """
         if other is None or (self.samples, self.channels) != (other.samples, other.channels):
             return self
@@ -208,8 +208,8 @@ class TraceSpec:
 def stored_trace_spec(settings: Mapping[str, str]) -> TraceSpec | None:
     """Parse the `TraceSpec` among the settings of a store, which are texts by name.
 
-    Returns None if there is none, like before the first trace. Raises StoreError if its text is
-    damaged.
+    Returns None if there is none, like before the first trace. Raises StoreError if its text
+    describes no `TraceSpec`.
     """
     if "trace" not in settings:
         return None
@@ -383,10 +383,10 @@ def as_success(value: Any, owner: str = "") -> bool:
 
 
 def as_outcome(value: Any, owner: str = "") -> Outcome:
-    """Convert an `Outcome`, or its text such as "stopped", to an `Outcome`.
+    """Convert an `Outcome`, or its text such as "stopped", to an `Outcome`, and return it.
 
-    Raises ReportError for any other value, also for True and None; its message says that the value
-    is `owner`'s, if that is given.
+    Raises ReportError for any other value, also for True and None. Its message says whose value it
+    is if `owner` is given, like "decision 1a2b".
     """
     whose = f" of {owner}," if owner else ""
     with instead(
@@ -400,10 +400,10 @@ def as_outcome(value: Any, owner: str = "") -> Outcome:
 
 
 def source_of(action: Action, audit: bool, success: bool) -> Source:
-    """Return the source of a label, derived from its decision and from the label itself.
+    """Return the source of a label, from the action of its decision and the label itself.
 
-    INSPECTION after a reject; AUDIT or VERIFICATION after a verification, by `audit`; CONFIRMED or
-    STOP after an accept, by `success`.
+    INSPECTION after a reject. After a verification it is AUDIT if the part was audited (`audit`),
+    else VERIFICATION; after an accept CONFIRMED if the part is good (`success`), else STOP.
     """
     if action is Action.REJECT:
         return Source.INSPECTION

@@ -46,7 +46,7 @@ def toy_traces(
     failures: float = 0.2,
     noise: float = 0.5,
 ) -> tuple[Floats, Ints]:
-    """Make traces of two shapes with noise, and their labels.
+    """Make traces of two curve shapes with noise, and their labels.
 
     The force of a success rises late, when the part reaches the bottom of the hole. The force of a
     failure rises early, at the edge of the hole.
@@ -54,8 +54,9 @@ def toy_traces(
     Parameters
     ----------
     n, samples, channels : int
-        Number and shape of the traces.
+        Number of traces, samples per channel, channels.
     seed : int
+        Of the random numbers; equal arguments give equal traces.
     failures : float
         Probability of a failure.
     noise : float
@@ -84,11 +85,11 @@ QUERIES = toy_traces(20, seed=5)[0]
 def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     """Assert that `embed`, `transform` and `embed_references` of a trained clone fit together.
 
-    `reducer` must be a scikit-learn estimator. `embed` must return finite float32 of shape
-    (n, K, d), equal for two clones with the same training, with K of 2 or more if labels are used.
-    `transform` must return shape (n, d). `embed_references` must return, for trace i with fold k,
-    the point `embed(X)[i, k]`. The caller's traces must not be written to. `reducer` may be
-    unfitted and stays unchanged.
+    `reducer` must be a scikit-learn estimator. `embed` must return the points of n traces in K
+    embedding spaces of d dimensions: finite float32 of shape (n, K, d), equal for two clones with
+    the same training, with K of 2 or more if labels are used. `transform` must return shape (n, d).
+    `embed_references(X, fold)` must return, for trace i with fold k, the point `embed(X)[i, k]`.
+    None of them may write to the given traces. `reducer` may be unfitted and stays unchanged.
     """
     is_estimator = isinstance(reducer, BaseEstimator)
     assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -115,9 +116,9 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
 def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
     """Assert honest counting: the labels of fold k do not influence embedding space k.
 
-    For each k a clone is trained, twice in a row, with the labels of fold k flipped and shuffled.
-    It must map new traces to the same points of space k, bit for bit, as a clone that was trained
-    with the true labels. `reducer` may be unfitted and stays unchanged.
+    For each k a clone is trained on test traces, twice in a row, with the labels of fold k inverted
+    and shuffled. It must map new traces to the same points of space k, bit for bit, as a clone that
+    was trained with the true labels. `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
     trained = _train_clone(reducer, times=2)
@@ -135,9 +136,10 @@ def labels_of_a_fold_move_nothing_in_its_space(reducer: Any) -> None:
 def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
     """Assert that a reducer whose `fit` needs labels has `uses_labels = True`.
 
-    A transformer that is no `Reducer` must have the tag `target_tags.required` instead. Otherwise
-    an engine would pass no labels, and every retrain would fail. A clone is trained on test traces,
-    so `reducer` stays unchanged. An error that is not due to missing labels is raised as it is.
+    A transformer that is no `Reducer` must have scikit-learn's tag `target_tags.required` instead.
+    Otherwise an engine would pass no labels, and every retrain would fail. A clone is trained on
+    test traces, so `reducer` stays unchanged. If this fails although the reducer declares labels,
+    or fails with labels as well, the error of the training passes unchanged.
     """
     X, y = toy_traces()
     try:
@@ -153,10 +155,10 @@ def labels_come_only_where_it_says_that_it_uses_them(reducer: Any) -> None:
 
 
 def fit_starts_afresh(reducer: Any) -> None:
-    """Assert that `fit` on A and then on B gives the same `transform` as `fit` on B alone does.
+    """Assert that `fit` forgets what an earlier `fit` learned.
 
-    Two clones are fitted to test traces, so `reducer` may be unfitted and stays unchanged. The
-    points must be equal bit for bit.
+    One clone is fitted to test traces A and then B, another to B alone. `transform` of A must give
+    the same points with both, bit for bit. `reducer` may be unfitted and stays unchanged.
     """
     A, labels_a = toy_traces(seed=1)
     B, labels_b = toy_traces(seed=2)
@@ -169,8 +171,9 @@ def fit_starts_afresh(reducer: Any) -> None:
 def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
     """Assert that a trace is mapped to the same point alone, as in a cell, and in a batch.
 
-    The two points may differ by a ten-thousandth of the embedding's root mean square radius. A
-    clone is trained on test traces, so `reducer` may be unfitted and stays unchanged.
+    In each embedding space the two points may be 1e-4 of the root mean square distance of the
+    points from their mean apart. A clone is trained on test traces, so `reducer` may be unfitted
+    and stays unchanged.
     """
     trained = _train_clone(reducer)
     together = trained.embed(QUERIES)
@@ -185,8 +188,9 @@ def a_trace_alone_lies_where_it_lies_in_a_batch(reducer: Any) -> None:
 def any_length_and_several_channels_work(reducer: Any) -> None:
     """Assert that traces of other lengths, and of three channels, can be trained on and embedded.
 
-    `train` must return a point for each trace, and all points must be finite. For each shape a
-    clone is trained on test traces, so `reducer` may be unfitted and stays unchanged.
+    The shapes (channels x samples) are 1 x 152, 1 x 800 and 3 x 90. `train` must return a point for
+    each trace, and these and the points of `embed` must be finite. For each shape a clone is
+    trained on test traces, so `reducer` may be unfitted and stays unchanged.
     """
     for channels, samples in SHAPES:
         X, y = toy_traces(70, samples, channels)
@@ -217,11 +221,11 @@ def a_trace_with_a_nan_is_refused(reducer: Any) -> None:
 
 
 def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
-    """Assert that its `module()` compiles to TorchScript and embeds as `embed` does, within 1e-4.
+    """Assert that the reducer's `module()` compiles to TorchScript and embeds like `embed`.
 
-    The check passes if `module()` returns None. If the module does not compile, TorchScript's own
-    error is raised. A clone is trained on test traces, so `reducer` may be unfitted and stays
-    unchanged.
+    `module()` returns a PyTorch module, or None, and then the check passes. The points may differ
+    by 1e-4, absolute plus relative. If the module does not compile or run, TorchScript's own error
+    is raised. A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged.
     """
     trained = _train_clone(reducer)
     module = trained.module()
@@ -234,8 +238,9 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
 def a_version_answers_as_it_was_trained(reducer: Any) -> None:
     """Assert what an engine requires of a version: restored or compiled, it embeds as when trained.
 
-    Two models are trained on test traces, the second with opposite labels. The compiled module of
-    the second is then a copy of the first's with other tensors, like after a retrain of an engine.
+    Two models with clones of `reducer` are trained on test traces, the second with opposite labels,
+    like after a retrain of an engine. Their points must be finite; a reducer that is restored from
+    the trained one's state, and the model's compiled module, must give the points of the training.
     `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
@@ -246,10 +251,11 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
 
 
 def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
-    """Assert that its state holds plain arrays, and that a clone restored from it embeds the same.
+    """Assert that a trained clone can be restored from its state, and embeds the same, bit for bit.
 
-    The check passes if `get_state()` returns None. A clone is trained on test traces, so `reducer`
-    may be unfitted and stays unchanged.
+    `get_state()` must return NumPy arrays without Python objects, by name, from which `set_state`
+    of another clone restores it. If it returns None, the check passes. The clone is trained on test
+    traces; `reducer` may be unfitted and stays unchanged.
     """
     trained = _train_clone(reducer)
     state = trained.get_state()
@@ -265,7 +271,8 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     """Assert that an engine that is closed and opened again decides the same, bit for bit.
 
     It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
-    Its first retrain must be accepted. `reducer` may be unfitted and stays unchanged.
+    Its first retrain must be accepted. Its decisions on 20 further traces are compared, without ids
+    and reasons. `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
@@ -296,7 +303,9 @@ REDUCER_CHECKS: tuple[Callable[[Any], None], ...] = (
 
 
 def check_reducer(reducer: Any) -> None:
-    """Check every clause of the contract on clones of a reducer.
+    """Run the checks in `REDUCER_CHECKS`, the contract of a reducer, one after another.
+
+    They work on clones of the reducer.
 
     Parameters
     ----------
@@ -306,9 +315,8 @@ def check_reducer(reducer: Any) -> None:
     Raises
     ------
     AssertionError
-        For the first clause that is broken; the message names it. It is raised as well if
-        TorchScript compiles the reducer's module and cannot run it. Any other error passes
-        unchanged.
+        For the first check that fails; the message names it. It is raised as well if TorchScript
+        compiles the reducer's module and cannot run it. Any other error passes unchanged.
     """
     for check in REDUCER_CHECKS:
         try:
@@ -323,12 +331,12 @@ def check_reducer(reducer: Any) -> None:
 
 
 def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Reducer:
-    """Return a clone of a reducer, trained `times` times in a row on the toy traces.
+    """Return a clone of a reducer, trained `times` times in a row on the 100 `toy_traces()`.
 
     It is trained like in an engine: the fold of a trace follows from its content. There are as many
-    folds as embedding spaces; there are 2 if `as_reducer` cross-fits the reducer. Each training
-    takes at most 8 optimiser steps. `reducer` stays unchanged. `labels`, shape (100,), replace
-    those of the toy traces; None keeps them.
+    folds as embedding spaces. A transformer with labels that has no spaces of its own is
+    cross-fitted in 2 folds. Each training takes at most 8 optimiser steps. `reducer` stays
+    unchanged. `labels`, shape (100,), replace those of the traces; None keeps them.
     """
     X, y = toy_traces()
     trained = as_reducer(clone(reducer), FOLDS)
@@ -342,7 +350,8 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
 def _decide_all(engine: DataEngine, X: NDArray[np.float32]) -> list[tuple[Any, ...]]:
     """Let an engine decide on each trace of X; return what was decided, without ids and reasons.
 
-    Each tuple holds action, lower, upper, n_success, n_failure, embedding and model_version.
+    X has the shape (n, C, T). For each trace there is a tuple of the decision's action, lower,
+    upper, n_success, n_failure, embedding and model_version. The engine records the decisions.
     """
     names = ("action", "lower", "upper", "n_success", "n_failure", "embedding", "model_version")
     decisions = [engine.decide(x) for x in X]

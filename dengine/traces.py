@@ -37,7 +37,7 @@ def as_trace(trace: Any, trace_spec: TraceSpec | None) -> TraceArray:
         Of any real dtype.
     trace_spec : TraceSpec or None
         What the trace must look like. Another length is fitted as `trace_spec.fit` says. None: any
-        shape with no more channels than samples.
+        shape with no more channels than samples, and with at least one sample.
 
     Returns
     -------
@@ -125,9 +125,9 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
     samples : int
         The length to return; the caller has checked with `can_fit_length` that it is possible.
     fit : int
-        Position in `FITS` of "cut", "pad" or "resample". The first two keep each sample's time from
-        the start: both drop the end of a longer trace, and "pad" repeats the last sample of a
-        shorter one. "resample" interpolates the whole trace linearly.
+        1 "cut", 2 "pad" or 3 "resample", the position in `FITS`. The first two keep each sample's
+        time from the start: both drop the end of a longer trace, and "pad" repeats the last sample
+        of a shorter one. "resample" interpolates the whole trace linearly.
 
     Returns
     -------
@@ -144,10 +144,10 @@ def fit_length(x: Tensor, samples: int, fit: int) -> Tensor:
 
 
 def can_fit_length(length: int, samples: int, fit: int) -> bool:
-    """Return whether a trace of `length` samples can be fitted to `samples` without making up data.
+    """Return whether a trace of `length` samples may be fitted to a length of `samples`.
 
-    `fit` is a position in `FITS`: "strict" allows only the same length, "cut" the same or a greater
-    length, "pad" and "resample" allow half to twice the length.
+    `fit` is a position in `FITS`: 0 "strict" allows only the same length, 1 "cut" the same or a
+    greater length, 2 "pad" and 3 "resample" allow half to twice `samples`.
     """
     if fit == 0:
         return length == samples
@@ -181,8 +181,9 @@ def _as_real(values: ArrayLike) -> TraceArray:
 def _match_spec(x: TraceArray, trace_spec: TraceSpec) -> TraceArray:
     """Return traces (..., C, T) fitted to the number of samples of a `TraceSpec`.
 
-    Traces of that length are returned as they are; others are fitted as `trace_spec.fit` says.
-    Raises TraceError for a length that cannot be fitted so, and for another number of channels.
+    Traces of that length are returned as they are; of others a fitted copy is returned, as
+    `trace_spec.fit` says. Raises TraceError for a length that cannot be fitted so, and for another
+    number of channels.
     """
     channels, samples = x.shape[-2:]
     if channels != trace_spec.channels:
@@ -217,9 +218,10 @@ def clip_extremes(traces: TraceArray) -> TraceArray:
     Returns
     -------
     array of float32, shape (n, C, T)
-        The same array if nothing was clipped. Each channel has its own limit: the least power of
-        four that is at least 64 times the peak which nine in ten traces do not exceed, but at most
-        1e15, so that float32 can sum squares. If that peak is 0, the limit is 1e15.
+        The same array if nothing was clipped, else a copy. Each channel has its own limit for the
+        absolute value of a sample. A trace's greatest absolute value is its peak; the limit is the
+        least power of four that is at least 64 times the peak which nine in ten traces do not
+        exceed, but at most 1e15, so that float32 can sum squares. If that peak is 0, it is 1e15.
     """
     if not len(traces):
         return traces
@@ -290,11 +292,12 @@ class TraceGate(nn.Module):
         Returns
         -------
         reason : int
-            Position in `REASONS` of the first fault found: not finite, constant (all samples of all
-            channels are equal), saturated (a sample at or beyond ±`limit`) or too large (beyond
-            1e18); 0 if there is none.
+            Position in `REASONS`, the tuple of all `Reason`, of the first fault found: not finite,
+            constant (all samples of all channels are equal), saturated (a sample at or beyond
+            ±`limit`) or too large (beyond 1e18); 0 if there is none.
         content_hash : int
-            As `folds.content_hash`; also of a faulty trace.
+            Hash of the samples, 64 bits, by which equal traces are known; it is equal to that of
+            `folds.content_hash`. A faulty trace has one, too: NaN and infinities count as 0.
         """
         lowest, highest = torch.aminmax(x)
         low = float(lowest.item())  # NaN if there is one anywhere in the trace
@@ -320,7 +323,8 @@ def check_rate(force_limits: Sequence[ForceLimits], trace_spec: TraceSpec | None
     """Raise SettingError if a force limit is in seconds and the rate of the traces is unknown.
 
     If `trace_spec` is None, the rate is unknown, too: the `TraceSpec` will be inferred from the
-    first trace, which does not tell its rate. A limit along a channel needs no rate.
+    first trace, which does not tell its rate. A limit `along` a channel, in place of time, needs no
+    rate.
     """
     in_seconds = [limits for limits in force_limits if limits.along is None]
     if in_seconds and (trace_spec is None or trace_spec.rate_hz is None):
@@ -388,9 +392,10 @@ class ForceLimitsGate(nn.Module):
         """Check a trace (C, T) of float32.
 
         Returns WITHIN_LIMITS (-1) if it keeps all limits, or if there are none; else the
-        `ActionCode`: REJECT if it leaves a limit with `reject`, otherwise VERIFY. A trace that has
-        no sample in the stretch of a limit leaves it. A value that is NaN leaves no limit; a sample
-        whose position (the value of the channel `along`) is NaN lies in no stretch.
+        `ActionCode`: 2 (REJECT) if it leaves a limit with `reject`, otherwise 0 (VERIFY). A limit
+        holds in a stretch, from `start` to `end` of the time, or of the channel `along`; a trace
+        that has no sample in the stretch leaves the limit. A value that is NaN leaves no limit; a
+        sample whose value in the channel `along` is NaN lies in no stretch.
         """
         if self.limits.size(0) == 0:
             return self.within
@@ -422,7 +427,7 @@ def infer_trace_spec(x: TraceArray) -> tuple[TraceSpec, bool]:
     Raises
     ------
     TraceError
-        For a trace of fewer than `MIN_SAMPLES` samples.
+        For a trace of fewer than 10 samples per channel.
     """
     trace_spec = TraceSpec(samples=x.shape[1], channels=x.shape[0])
     if trace_spec.samples < MIN_SAMPLES:

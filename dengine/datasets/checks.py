@@ -22,8 +22,8 @@ def check_description(description: Description) -> None:
 
     No key may have the value `?`, except in `[ignored]` and `[[check]]`. The number of samples of a
     trace must be stated. There must be a channel, and all channels must have the same `limit`, the
-    range of the sensor. Recordings that are ordered by time need a column of times. The settings in
-    `[time]` must pass `check_clock`, and those in `[text]` `check_text`.
+    range of the sensor. With `order` "time" there must be a column of times. The settings in
+    `[time]` must pass `check_clock`, and those in `[text]` must pass `check_text`.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
@@ -44,8 +44,8 @@ def check_description(description: Description) -> None:
 def check_clock(clock: Clock) -> None:
     """Raise DataError unless times can be read with the settings in `[time]`.
 
-    A time zone, if stated, must have a known name, and a rate must be between 1 Hz and 1 MHz. There
-    must be as many formats as columns.
+    A time zone, if stated, must have a known name, and a rate, if stated, must be between 1 Hz and
+    1 MHz. If there are columns of times, there must be as many formats.
     """
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")
@@ -64,8 +64,8 @@ def check_text(text: TextForm) -> None:
     """Raise DataError unless text files can be read with the settings in `[text]`.
 
     Python must know the encoding. The delimiter and the decimal mark must be one character each.
-    The marks in numbers must differ, and be no other part of a number. The samples must begin in
-    line 1 or later.
+    The decimal mark and the mark of thousands, which may be "", must differ, and be no digit, sign
+    or e. The samples must begin in line 1 or later.
     """
     with instead(DataError, "Expected an encoding in text.encoding", LookupError, ValueError):
         "".encode(text.encoding)  # also refuses codecs that are of no text
@@ -86,10 +86,10 @@ def check_text(text: TextForm) -> None:
 def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], list[Fault]]:
     """Return the recordings without repeated traces, and a fault for each recording left out.
 
-    The traces (C, T) all have one shape. Two traces are equal if they have the same `content_hash`,
-    which rounds samples to 1/65,536 of their unit, and counts lost samples as 0. Of equal traces
-    with one label the first is kept; if their labels differ, none is kept. A trace whose finite
-    samples are all the same is always kept: a dead sensor gives it for any part.
+    All traces must have the same shape (C, T). Two traces are equal if they have the same
+    `content_hash`, which rounds samples down to 1/65,536 of their unit, and counts lost samples as
+    0. Of equal traces with one label the first is kept; if their labels differ, none is kept. A
+    trace whose finite samples are all the same is always kept: a dead sensor gives it for any part.
     """
     traces = [recording.trace for recording in recordings]
     hashes = content_hash(np.stack(traces)).tolist() if traces else []
@@ -111,7 +111,10 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
 
 
 def lost_note(recordings: Sequence[Recording]) -> str:
-    """Return a note on lost samples, which are NaN or infinite; "" if no recording has any."""
+    """Return a sentence on lost samples, which are NaN or infinite; "" if no recording has any.
+
+    It says how many samples are lost, and in which recordings.
+    """
     n_lost = {item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings}
     lost = [source for source, n in n_lost.items() if n]
     where = f"in {len(lost)} of {len(recordings)} recordings: {listed(lost)}"
@@ -119,7 +122,7 @@ def lost_note(recordings: Sequence[Recording]) -> str:
 
 
 def tolerance_note(data: Dataset, lower_bound: float) -> str:
-    """Return a note if the tolerance of a policy is too wide for these parts; "" if it is not.
+    """Return a warning if the tolerance of a policy is too wide for these parts; "" if it is not.
 
     The tolerance, 1 - `lower_bound`, is the share of accepted parts that may be bad. It is too wide
     if the share of bad parts in the data set is not above it: accepting every part would meet it.

@@ -35,7 +35,7 @@ def unit_text(units: Sequence[str]) -> str:
 def expect_all(wanted: Mapping[str, Any]) -> None:
     """Raise DataError for the first of several conditions that is not met.
 
-    wanted : conditions, each by the words for it that the message says were expected.
+    wanted : whether each condition is met, by what the message says was expected.
     """
     for what, is_met in wanted.items():
         if not is_met:
@@ -155,8 +155,8 @@ class Dataset:
 
         Its columns are `label`, `part` and `cause` if known, and one for each sample of each
         channel: `FZ_0`, `FZ_1`, ... Without channel names they are `x_0`, `x_1`, ... or, if there
-        are several channels, `x0_0`, `x0_1`, ... Its metadata has the channels, the rate, the unit,
-        the limit and the fit, so that `load_dataset` reads what
+        are several channels, `x0_0`, `x0_1`, ... Its metadata (`attrs`) has the fields `channels`,
+        `rate_hz`, `unit`, `limit` and `fit`, so that `load_dataset` reads what
         `data.to_frame().to_parquet("data.parquet")` writes, without a description. All other fields
         are lost.
         """
@@ -173,10 +173,11 @@ class Dataset:
         return frame
 
     def select(self, channels: Names) -> "Dataset":
-        """Return a data set of some channels, at least one, in this order.
+        """Return a data set of the channels with these names, in this order.
 
-        Of one channel, X has the shape (n, T). Raises DataError for unknown names, for none, and if
-        the channels have no names.
+        For one channel, X has the shape (n, T). `channels` and `unit` become those of the selected
+        channels; all other fields stay. Raises DataError for an unknown name, for no name, and if
+        the channels of the data set have no names.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = set() < {*channels} <= {*self.channels}
@@ -191,7 +192,7 @@ class Dataset:
         )
 
     def cut(self, samples: int) -> "Dataset":
-        """Return a data set with only the first `samples` samples of each trace, to decide earlier.
+        """Return a data set with only the first `samples` samples of each trace.
 
         If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result. Raises
         DataError if `samples` is below 1, if the traces are shorter, or if `fit` is "resample" and
@@ -223,7 +224,9 @@ def make_dataset(
     y : array, shape (n,)
         1 for success, 0 for failure.
     rate_hz, channels, part, cause
-        As in `Dataset`. Part numbers may be integers, and become texts. `cause` is kept as it is.
+        As in `Dataset`: the rate of the samples, the names of the channels, and for each trace the
+        number of its part and why the part failed. Part numbers may be integers, and become texts.
+        `cause` is not converted.
     **about
         Other fields of `Dataset`, which are not checked.
 

@@ -300,11 +300,12 @@ class Description:
 
     @classmethod
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
-        """Return the description that nested dicts state, as a TOML file has them.
+        """Return the description that nested dicts state, like those of a TOML file.
 
-        The value of every key may be `?`, but no section; a channel `?` is left out. Raises
-        DataError for an unknown key (the message names the most similar key), for a value of the
-        wrong type, and for a description of a newer version.
+        The value of every key may be `?`, but no section; a channel named `?` is left out. Of a
+        channel, a text in place of a dict is its unit. Raises DataError for an unknown key (the
+        message names the most similar key), for a value of the wrong type, and for a description
+        of a newer version.
 
         where : what the description is called in errors.
         """
@@ -335,7 +336,8 @@ class Description:
     def load(cls, path: FilePath) -> "Description":
         """Read a description from a TOML file.
 
-        Raises DataError if the file cannot be read or has more than 1 MB, and as `from_toml` does.
+        Raises DataError if the file cannot be read, has more than 1 MB or is no TOML, for an
+        unknown key or a value of the wrong type, and for a description of a newer version.
         """
         with instead(
             DataError, f"Expected a description in {path}", OSError, ValueError, TypeError
@@ -362,7 +364,11 @@ class Description:
         return {**_plain(self), "channels": tables}
 
     def to_toml(self) -> str:
-        """Return the text of the TOML file, with `notes` as comments above their keys."""
+        """Return the text of the TOML file, with `notes` as comments above their keys.
+
+        It has the version, the keys that do not have their default values, and the channels, for
+        which `?` stands if there are none.
+        """
         values = {"version": self.version, **self.to_dict()}
         lines = self._lines("", {k: v for k, v in values.items() if k not in SECTIONS})
         for name in SECTIONS:
@@ -374,12 +380,13 @@ class Description:
         return "\n".join(lines) + "\n"
 
     def _lines(self, prefix: str, table: Stated) -> list[str]:
-        """Return the lines of one table of the TOML file; the note on a key stands above it.
+        """Return the lines of one section of the TOML file; the note on a key stands above it.
 
-        Notes on keys that the table does not have come first.
+        Notes on keys that the section does not have come first. Empty notes are left out; a
+        character that does not print becomes a blank.
 
-        prefix : the section with a dot, like `label.`, with which the keys of its notes begin; ""
-        for keys outside of all sections.
+        prefix : the name of the section with a dot, like `label.`, with which the keys of its notes
+        begin; "" for the keys outside of all sections. table : the values of the section by key.
         """
         notes = {
             key.removeprefix(prefix): "".join(c if c.isprintable() else " " for c in note)
@@ -399,10 +406,11 @@ class Description:
 
     @property
     def open_keys(self) -> Words:
-        """The keys whose value is still `?`, like `label.column`; also `channels` if there is none.
+        """The keys whose value is or contains `?`, like `label.column`.
 
-        A `?` in `[ignored]` or `[[check]]` is not counted. In `[[check]]` it is a word that no
-        recording has, and recordings with other words become faults.
+        `channels` is one of them if there is no channel. A `?` in `[ignored]` or `[[check]]` is not
+        counted. In `[[check]]` it is a word that no recording has, and recordings with other words
+        become faults.
         """
         values = self.to_dict()
         values.pop("ignored", None)
@@ -412,9 +420,10 @@ class Description:
     def with_values(self, stated: Stated) -> "Description":
         """Return a description in which the given keys, like `label.column`, have these values.
 
-        Stating one source of labels, or of parts, clears the other sources in its section, but not
-        the words for good and bad. Stating a channel replaces the channel `?`. The notes stay.
-        Raises DataError like `from_dict`.
+        Of the keys `column`, `path`, `line`, `topic` and `listing` in `[label]`, stating one clears
+        the others, and likewise those in `[part]`; words for good and bad stay. Stating a channel
+        replaces the channel `?`. The notes stay. Raises DataError for an unknown key, for a value
+        of the wrong type, and if what stands before the dot in a key is no section.
         """
         values = self.to_dict()
         for section, sources in SOURCES.items():
@@ -435,8 +444,8 @@ class Description:
     def with_channels(self, columns: Sequence[str]) -> "Description":
         """Return the description with exactly these columns as channels, in this order.
 
-        Each must be in `[channels]`, or in `[ignored]`, which gives its unit. Raises DataError for
-        any other column.
+        Each must be in `[channels]`, whose settings stay, or in `[ignored]`, which gives its unit.
+        Raises DataError for any other column.
         """
         channels = {column: Channel(unit) for column, unit in self.ignored.items()}
         channels |= self.channels
@@ -476,10 +485,11 @@ KINDS: dict[Any, str] = {
 
 
 def _made(kind: Any, value: Any, where: str) -> Any:
-    """Return a value of a TOML file as the dataclass, tuple or other type that its key has.
+    """Return a value of a TOML file, converted to `kind`, the annotated type of its key.
 
-    A single value becomes a tuple if several are expected. Raises DataError for an unknown key or
-    choice, and for a value of another type.
+    A table becomes a dataclass or a dict, and a list a tuple; so does a single value if several are
+    expected. `?` may stand in place of a text, number, boolean or choice. Raises DataError for an
+    unknown key or choice, and for a value of another type; `where` is its name in the message.
     """
     origin = get_origin(kind)
     args = get_args(kind)
@@ -503,10 +513,11 @@ def _made(kind: Any, value: Any, where: str) -> Any:
 
 
 def _as_kind(kind: Any, value: Any, where: str) -> Any:
-    """Return a value in the type of its key; `?` is returned as it is.
+    """Return a value of a TOML file in the type of its key, `kind`; `?` is returned as it is.
 
-    A number becomes a text if a text is expected. Raises DataError for a value of another type and
-    for a number that is not finite.
+    `kind` is a type in `KINDS`: text, whole number, number, boolean. A number or boolean becomes a
+    text if a text is expected. Raises DataError for a value of another type and for a number that
+    is not finite; `where` is the name of the key in the message.
     """
     if value == UNKNOWN:
         return value
@@ -527,7 +538,11 @@ def expect_one_of(names: Iterable[str], name: str, where: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value in TOML's types; a dataclass becomes a dict without its default values."""
+    """Return a value of a description in TOML's types.
+
+    Texts, numbers and booleans stay, a tuple becomes a list, and a mapping a dict. A dataclass
+    becomes a dict without the fields that have their default values, and without `notes`.
+    """
     if isinstance(value, str | int | float):
         return value
     if isinstance(value, tuple):
@@ -554,9 +569,10 @@ def _toml_key(name: str) -> str:
 
 
 def _toml_value(value: Any) -> str:
-    """Return a value as TOML writes it.
+    """Return a value of a description as TOML writes it.
 
-    A list of one item is written as that item, and a table that has only a unit as that unit.
+    A dict is written in one line, `{ unit = "N", factor = 2.0 }`; but if it has only a unit, as
+    this text. A list of one item is written as that item.
     """
     if isinstance(value, Mapping) and {*value} == {"unit"}:
         return _toml_value(value["unit"])

@@ -53,9 +53,11 @@ RATE_TOLERANCE = 0.02  # relative error of rates that are measured from timestam
 def in_form_of(store: "StoreLike", description: Description) -> Description:
     """Return a description with the trace length of a store, for recordings to be imported into it.
 
-    It also gets the store's `fit` unless that is "strict". Traces of another length would have
-    other hashes, so known ones would be imported again. The description is returned as it is if the
-    store is new, cannot be opened, or has no `TraceSpec` yet. A store object stays open.
+    `traces.samples` becomes the number of samples in the store's `TraceSpec`, and `traces.lengths`
+    its `fit` unless that is "strict". Traces of another length would have other hashes, so those
+    that the store has would be imported again. The description is returned as it is if the store is
+    new, cannot be opened, or has no readable `TraceSpec`. `store` is a path or URL, or an open
+    store, which stays open.
     """
     try:
         with opening(store, must_exist=True) as opened:
@@ -71,11 +73,12 @@ def in_form_of(store: "StoreLike", description: Description) -> Description:
 
 
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
-    """Raise TraceError if a data set does not agree with the `TraceSpec` of a store.
+    """Raise TraceError if a data set does not agree with `trace_spec`, that of a store.
 
     If both rates are known, they must be the same within 2 %; if both have channel names, these
-    must be the same in the same order. Traces that were read by a description (`lengths` is set)
-    must have the store's number of samples, and be resampled if and only if the store's traces are.
+    must be the same in the same order. Traces that were read by a description (`data.lengths` is
+    set) must have the store's number of samples, and the store and the data set must both have the
+    `fit` "resample", or neither.
     """
     spec = data.spec
     fits = {spec.fit, trace_spec.fit}
@@ -148,13 +151,16 @@ def import_labelled(
         For the engine of a new store; by default recipe conv and seed 0. A used store has its own
         recipe and seed; other values raise SettingError.
     on_traces : callable, optional
-        Called after each chunk with its number of traces, known ones included.
+        Called after each chunk with its number of traces, also those that the store had already.
     allow_import : bool
-        Whether classes of the user that a used store names may be imported.
+        Whether classes of the user that a used store names may be imported; if not, such a store
+        raises ImportRefusedError, a SettingError.
 
     Returns
     -------
     ImportReport
+        How many labels were stored, or quarantined with a faulty trace, and how many the store had
+        already or contradicts.
 
     Raises
     ------
@@ -199,11 +205,12 @@ def import_parts(
 ) -> ImportReport:
     """Store parts with their decisions and labels, in chunks of 500.
 
-    Each chunk is one transaction; chunks before an error stay. If the store has a label for a
-    decision, nothing is changed: the new label is counted as repeated or contradicted. A trace with
-    a fault is stored but never trains, and its decision gets the fault as its reason. With
-    `stops="some"` each label also stores the number of accepted parts without a report since the
-    label before; the label of a trace with a fault stores 0, and the next label counts these parts.
+    Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
+    has a label for a decision, also a forgotten one, nothing is changed: the new label is counted
+    as repeated or contradicted. A trace with a fault is stored but never used in training, and its
+    decision gets the fault as its reason. With `stops="some"` each label also stores the number of
+    accepted parts without a report since the label before; the label of a trace with a fault stores
+    0, and the next label counts these parts.
 
     Parameters
     ----------
@@ -212,7 +219,7 @@ def import_parts(
         The decision, the trace and the label of each part; None if there is no report. A part
         whose label came later may stand in the sequence a second time, with the label.
     trace_spec : TraceSpec
-        Of the traces.
+        Shape of the traces, and the range of the sensor, by which faults are found.
     policy : Policy
         The policy under which the decisions were made. Each stored decision gets its propensity
         from it; `Decision.propensity` is not read.
@@ -222,7 +229,8 @@ def import_parts(
     Returns
     -------
     ImportReport
-        It counts labels, not parts; `resumed` is True.
+        It counts labels, not parts: those that were stored, quarantined with a faulty trace, known
+        already and contradicted. `resumed` is True.
     """
     gate = TraceGate(trace_spec)
     counts: dict[str, Any] = dict.fromkeys(
@@ -261,10 +269,11 @@ def import_parts(
 
 
 def _count_unreported(store: "SqlStore", policy: Policy) -> int:
-    """Return the number of unreported accepted parts that no label has counted yet.
+    """Return the number of unreported accepted parts since the last label that counted them.
 
-    It starts when the policy last changed. With `stops="all"` it is 0, since the next decision
-    confirms an accepted part.
+    Each label stores how many accepted parts before it had no report. Only parts since the last
+    change of the policy count. With `stops="all"` the number is 0, since the next decision confirms
+    an accepted part.
     """
     if policy.stops != "some":
         return 0
@@ -275,10 +284,12 @@ def _count_unreported(store: "SqlStore", policy: Policy) -> int:
 def _as_stored(
     decision: Decision, trace: TraceArray, gate: TraceGate, policy: Policy, time: float
 ) -> StoredDecision:
-    """Return the record of a decision, with the propensity that the policy gives it.
+    """Return a record of a decision and a copy of its trace (C, T), without storing it.
 
-    If the trace has a fault, the fault becomes the reason of the decision, and the trace never
-    trains.
+    Its propensity, the probability of a check, is the policy's audit rate (1 in shadow mode) if the
+    model was certain, else 1. If `gate` finds a fault in the trace, this becomes the reason of the
+    decision, and the record is marked as quarantined. `time` is that of the decision, seconds since
+    1970.
     """
     fault, content = gate(torch.from_numpy(trace))
     is_certain = decision.predicted is not Action.VERIFY
@@ -289,10 +300,12 @@ def _as_stored(
 
 
 def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision]:
-    """Yield for each trace of shape (C, T) a decision to verify it, made without a model.
+    """Yield a VERIFY decision, made without a model, for each of the traces (n, C, T).
 
-    The decision's id comes from the content of the trace; equal traces get different ids by a
-    counter.
+    The id of a decision is made of the hash of the trace's content and a counter of equal traces,
+    so that the same data set gives the same ids. The parts' numbers are those of `data`. Raises
+    TraceError for a part's number of more than 200 characters, or with characters that do not
+    print.
     """
     n_equal = Counter[int]()
     parts = [None] * len(data) if data.part is None else data.part.tolist()

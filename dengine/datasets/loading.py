@@ -107,6 +107,7 @@ def description_of(
     Parameters
     ----------
     source : path or DataFrame
+        The recordings.
     description : Description, mapping or path, optional
         None: the description that was saved in the folder or beside the file.
     stated : mapping, optional
@@ -150,10 +151,10 @@ def count_files(source: str, description: Description | None) -> int:
 
 
 def missing_text(path: Path, proposal: Description) -> str:
-    """Return the error message for recordings without a description.
+    """Return the error message for recordings at `path` without a description.
 
-    It lists the open keys of a proposal, whose value is `?`, and has the commands that show and
-    save it.
+    It lists the open keys of the proposed description, whose value is `?`, with the notes on them,
+    and has the commands that show and save the proposal.
     """
     notes = {key: proposal.notes.get(key, "") for key in proposal.open_keys}
     questions = "".join(f"\n  {key}: {note}" for key, note in notes.items())
@@ -168,10 +169,12 @@ def missing_text(path: Path, proposal: Description) -> str:
 def own_reader(source: Any) -> Callable[[], Dataset] | None:
     """Return a function that reads a source in a format of dengine; None if it needs a description.
 
-    None is also returned for a folder. A file beside which a description was saved needs it,
-    whatever it holds. Raises DataError for a source of an unknown type, for a path that does not
-    exist, for a file that cannot be opened, for a damaged .npz or Parquet file, and for a Parquet
-    file without pyarrow.
+    The formats: a `Dataset`, a pair (X, y), the name of a bundled set, a table of
+    `Dataset.to_frame` or its Parquet file, an .npz file with X and y, and the SQLite file of a
+    store. A folder needs a description, and so does a file beside which one was saved, whatever it
+    holds. Raises DataError for a source of an unknown type, for a path that does not exist, for a
+    file that cannot be opened, for a damaged .npz or Parquet file, and for a Parquet file without
+    pyarrow.
     """
     if isinstance(source, Dataset):
         return lambda: source
@@ -191,9 +194,9 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
 
 
 def _is_own_archive(path: Path) -> bool:
-    """Return whether a file is an .npz archive with an array X, and labels y of 1 and 0.
+    """Return whether a file is an .npz archive with an array X, and numbers y that are all 1 or 0.
 
-    Raises DataError for an .npz file that is damaged.
+    A file of another suffix is not opened. Raises DataError for an .npz file that is damaged.
     """
     if path.suffix.lower() != ".npz":
         return False
@@ -205,7 +208,8 @@ def _is_own_archive(path: Path) -> bool:
 def _is_own_table(path: Path) -> bool:
     """Return whether a file is a Parquet file of a table that `Dataset.to_frame` made.
 
-    Raises DataError if a .parquet file is damaged or pyarrow is not installed.
+    A file of another suffix is not opened. Raises DataError if a .parquet file is damaged or
+    pyarrow is not installed.
     """
     if path.suffix.lower() != ".parquet":
         return False
@@ -224,7 +228,7 @@ def _read_own_table(path: Path) -> Dataset:
 
 
 def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
-    """Return the data set of a table that `Dataset.to_frame` made.
+    """Return the data set of a DataFrame that `Dataset.to_frame` made; `name` becomes its name.
 
     Raises DataError if `make_dataset` refuses its arrays.
     """
@@ -236,9 +240,10 @@ def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
 
 
 def _read_npz(path: Path) -> Dataset:
-    """Return the data set of an archive with X and labels y of 1 and 0.
+    """Return the data set of an .npz archive with X and labels y of 1 and 0.
 
-    X is multiplied by the number `scale` if there is one. Raises DataError if the arrays do not fit
+    Of the other arrays scale, rate_hz, unit, cause, channels and part are read if they are there. X
+    is multiplied by `scale`. Raises DataError if the archive is damaged, or the arrays do not fit
     together.
     """
     arrays, _ = read_archive(path, OWN_ARRAYS)
@@ -251,7 +256,9 @@ def _read_npz(path: Path) -> Dataset:
 def _from_arrays(arrays: Stated, name: str) -> Dataset:
     """Return the data set of arrays that are named like the fields of a `Dataset`.
 
-    Raises DataError if `make_dataset` refuses them.
+    X and y must be there; rate_hz, unit, channels, limit, fit, cause and part are used if they are
+    there, and any other array is ignored. `name` becomes the name of the data set. Raises DataError
+    if `make_dataset` refuses the arrays.
     """
     units, channels = (
         tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")
@@ -277,7 +284,7 @@ def _read_store(path: Path) -> Dataset:
     The labels are those of the store's cell and of the other cells of its product. Quarantined
     traces and forgotten labels are left out. So is a trace that is not as it was stored, and an
     event is written to the store. If several traces are of one part, `part` is the hash by which
-    the store counts them as one part; otherwise it is None.
+    the store counts them as one part; otherwise it is None. The store is closed.
 
     Raises DataError if the store has no labelled traces, or if its rows contradict its ledger, the
     chain of hashes over them. Raises StoreError if the store cannot be opened or read, and if its

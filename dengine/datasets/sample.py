@@ -17,16 +17,16 @@ BROKEN = 44  # the file that is cut off in its last line; the last, if there are
 def write_sample(folder: FilePath, n: int = 200) -> None:
     """Write n insertions of the bundled set as CSV files, such as `insertion_0001_True.csv`.
 
-    Each file has 960 to 1000 rows at 500 Hz, with the force in FZ_Base, the height in TCP_Z, and
-    the label in its name: True is good. The last line of one file is cut off. The same call always
-    writes the same files.
+    Each file has 960 to 1000 rows at 500 Hz, with the time in Timestamp, the force in FZ_Base, the
+    height in TCP_Z, and the label in its name: True is good. File 44, or the last one of fewer, is
+    cut off in its last line. The same call always writes the same files.
 
     Parameters
     ----------
     folder : path
         A new or an empty folder.
     n : int, default 200
-        Number of files, at most the 1503 insertions of the set.
+        Number of files. The set has 1503 insertions; a greater n writes 1503 files.
 
     Raises
     ------
@@ -45,9 +45,10 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
 
 
 def record(force: NDArray[np.float32], rng: np.random.Generator) -> pd.DataFrame:
-    """Return the first 960 to 1000 samples of a force (T,) as the cell records them.
+    """Return the first 960 to 1000 samples of an insertion as a table that a cell would record.
 
-    The times begin at 0 s. The random numbers come from `rng`.
+    A DataFrame with the columns Timestamp, in seconds from 0 at 500 Hz, FZ_Base, which is `force`,
+    shape (T,), and TCP_Z, the height, which is only noise. `rng` gives the number and the noise.
     """
     n = int(rng.integers(960, 1001))
     height = rng.normal(0.0, 2e-5, n)  # the noise of a robot that stands still

@@ -75,7 +75,10 @@ class Table:
     path: str = ""
 
     def column(self, name: str) -> Cells:
-        """Return a column; raise UnreadableError if there is none of this name."""
+        """Return the cells of a column, an array of shape (rows,), or (1,) if one holds for all.
+
+        Raises UnreadableError if there is no column of this name.
+        """
         if name not in self.columns:
             columns = listed(self.columns) or "none"
             raise UnreadableError(f"Expected a column {name}, got {columns}", self.header, name)
@@ -88,9 +91,10 @@ class Table:
         return self
 
     def take(self, rows: Any) -> "Table":
-        """Return a table of some rows, given by a slice or an array of positions or booleans.
+        """Return a table of the rows that a slice or an array of positions or booleans selects.
 
-        A column of one cell holds for all rows and stays; so does `damage`.
+        Their line numbers are selected, too. A column of one cell holds for all rows and stays; so
+        do `damage` and all else.
         """
         lines = self.lines
         if len(lines) > 1:
@@ -99,7 +103,7 @@ class Table:
         return replace(self, columns=columns, lines=lines)
 
     def words(self, name: str) -> Cells:
-        """Return a column as texts, shape (rows,), without blanks around them.
+        """Return the cells of a column as texts, shape (rows,), without blanks around them.
 
         Whole numbers have no decimal point: 1.0 is "1". NaN and None are "". Raises UnreadableError
         if there is no such column, or its cells are lists.
@@ -114,9 +118,9 @@ class Table:
     def numbers(self, name: str, form: TextForm) -> Floats:
         """Return a column as numbers, float64 (rows,); a missing number is NaN.
 
-        `form` says how numbers are written, and which words stand for a missing one. Raises
-        UnreadableError if there is no such column, and for any other cell: one that is no number
-        of this form, is infinite, or is too large for float32.
+        `form` is the section `[text]`, with the decimal mark, the mark of thousands and the words
+        for a missing number. Raises UnreadableError if there is no such column, and for any other
+        cell: one that is no number of this form, is infinite, or is too large for float32.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
@@ -131,7 +135,8 @@ class Table:
     def refuse(self, is_bad: Cells, wanted: str, name: str) -> None:
         """Raise UnreadableError for the first row in which `is_bad` is True; if none is, return.
 
-        wanted : what was expected, for the message. name : the column.
+        is_bad : bool, shape (rows,). wanted : what was expected, for the message. name : the column
+        whose cell the message shows.
         """
         if is_bad.any():
             row = int(is_bad.argmax())
@@ -145,10 +150,10 @@ class Table:
         return int(self.lines[row]) if row < len(self.lines) else 0
 
     def one_word(self, name: str, at: str = "same") -> str:
-        """Return the one word that a column has for a recording, as a label or a part number.
+        """Return the one word, like a label or part number, that a column has for a recording.
 
-        Raises UnreadableError if there is no such column or no row, or if the rows differ under
-        "same".
+        The table holds the rows of the recording. Raises UnreadableError if there is no such column
+        or no row, or if the words of the rows differ and `at` is "same".
 
         at : "same" if all rows must have this word, "first" or "last" for the row that has it.
         """
@@ -191,7 +196,10 @@ class Recording:
 
 
 def as_word(cell: Any) -> str:
-    """Return a cell as a text: "" for NaN and None, no decimal point for whole numbers."""
+    """Return a cell as a text without blanks around it.
+
+    NaN and None are "", and a whole number has no decimal point: 1.0 is "1".
+    """
     if cell is None or cell != cell:
         return ""
     is_whole = isinstance(cell, float) and cell.is_integer()
@@ -200,7 +208,11 @@ def as_word(cell: Any) -> str:
 
 @lru_cache
 def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
-    """Return the regular expression of a number with this decimal mark and this mark of groups."""
+    """Return the regular expression of a number; a sign and an exponent are allowed.
+
+    `decimal` is its decimal mark, and `thousands` the mark that may stand between groups of three
+    digits; "" allows no groups.
+    """
     mark, point = re.escape(thousands), re.escape(decimal)
     groups = rf"[1-9]\d{{0,2}}(?:{mark}\d{{3}})+|" if mark else ""
     digits = rf"(?:(?:{groups}\d+)(?:{point}\d*)?|{point}\d+)"
@@ -210,7 +222,8 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
     """Return the number in a cell; NaN for a word of `form.missing`, infinity for any other text.
 
-    A float is returned as it is; None is read as the word `null`.
+    A float is returned as it is; None is read as the word `null`. `form` has the decimal mark and
+    the mark of thousands, and `pattern` is the regular expression of a number with these.
     """
     if isinstance(cell, float):
         return cell

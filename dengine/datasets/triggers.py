@@ -95,11 +95,11 @@ EXAMPLES = (
 def as_trigger(value: Any) -> Trigger:
     """Return a trigger as it is, or make one from a text, KIND[=NUMBER][@SIGNAL].
 
-    "bit=0": digital output 0 is on. "register@NAME": the signal NAME is not zero. "contact=5": the
-    force FZ_Base is 5 N or more, in either direction. "motion=0.002": the tool moves faster than
-    2 mm a second. Only bit and contact need a number. A bit is 0 to 31, a force and a speed are
-    above 0. Without @SIGNAL each kind reads a signal of its own. Raises SettingError for any other
-    value.
+    "bit=0": digital output 0 is on. "register@NAME": the signal NAME is not zero;
+    "register=1@NAME": it is 1. "contact=5": the force FZ_Base is 5 N or more, in either direction.
+    "motion=0.002": the tool moves faster than 2 mm a second. Only bit and contact need a number. A
+    bit is 0 to 31, a force and a speed are above 0. Without @SIGNAL each kind reads a default
+    signal. Raises SettingError for any other value.
     """
     if isinstance(value, Trigger):
         return value
@@ -167,11 +167,13 @@ class StartFinder:
     def feed(self, time: float, active: bool) -> Start | None:
         """Take the next sample; return where an insertion begins if the sample shows it, else None.
 
-        It begins if the trigger is on at this sample and was off for `quiet_s` before. A trigger
-        that is on at the first sample gives no start until it was off.
+        It begins if the trigger is on at this sample (`active`) and was off for `quiet_s`, less
+        half a step, before. A trigger that is on at the first sample gives no start until it was
+        off. `time` is in seconds and increases.
 
-        If samples are missing just before this one, the insertion may have begun in the gap, and
-        `Start.seen` is False; `Start.time` is then the first time in the gap.
+        If the sample before came 1.5 steps (`step`, the seconds between samples) ago or more,
+        samples are missing; the insertion may have begun in this gap, and `seen` of the result is
+        False. Its `time` is then the first time in the gap, else the time of this sample.
         """
         if not active:
             self._off_since = time if self._off_since is None else self._off_since
@@ -188,15 +190,16 @@ class StartFinder:
 def place(
     times: Sequence[float], values: Floats, start: float, samples: int, step: float
 ) -> Placed:
-    """Put samples into a trace, each at the place nearest to its time.
+    """Put samples into a trace, each at the place (index of the trace) nearest to its time.
 
     Parameters
     ----------
     times : sequence of n floats
-        Seconds, increasing.
+        Times of the samples in seconds, increasing.
     values : array of float64, shape (n, C)
+        The samples of the channels at these times.
     start : float
-        Time of the first place.
+        Time of the first place, in seconds.
     samples : int
         Number of places in the trace.
     step : float
@@ -205,8 +208,10 @@ def place(
     Returns
     -------
     Placed
-        Samples before the first or after the last place are left out. If several have the same
-        place, the first is taken.
+        The trace (C, samples) of float32, NaN at a place for which no sample came; these places,
+        increasing; and how many samples were left out because an earlier one had their place.
+        Samples before the first or after the last place are left out, too. A value that is too
+        large for float32 becomes an infinity.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
     at = np.rint((np.asarray(times) - start) / step).astype(np.int64)

@@ -37,9 +37,10 @@ def is_unit(text: str) -> bool:
 
 
 def conversion(unit: str, wanted: str) -> float:
-    """Return the factor from one unit to another; 1 if they are the same or either is "".
+    """Return the factor from a unit to the unit `wanted`; 1 if they are the same or either is "".
 
-    Raises DataError if they are of different quantities, or one is unknown.
+    Brackets around a unit are ignored. Raises DataError if the units are of different quantities,
+    like force and length, or if they differ and one is unknown.
     """
     unit, wanted = bare(unit), bare(wanted)
     if not unit or not wanted:

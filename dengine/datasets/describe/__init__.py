@@ -65,7 +65,8 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         A folder, a file or a table of recordings.
     stated : mapping, optional
         Keys whose values are known, like `{"label.column": "verdict"}`, or sections with such keys.
-        They are kept, but for the value `?`, and the proposals for the other keys follow from them.
+        They are kept, except for the value `?`, and the proposals for the other keys follow from
+        them.
 
     Returns
     -------
@@ -103,11 +104,13 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
 def choose_files(p: Proposal, root: Path) -> bool:
     """Set in `p` which files are the recordings, and their format; return whether that is clear.
 
-    If the user stated `files`, they are these. Otherwise they are the files with the only suffix
-    that several files have; the suffix of a bag, `.mcap`, counts even for one file. If no suffix
-    qualifies, all suffixes do. If several suffixes qualify, `files` is set to `?` with a note that
-    lists the suffixes, the format is not set, and the result is False. The format is that of the
-    first file's suffix, `text` for an unknown one. Raises DataError if there is no file of
+    If the user stated `files`, they are these. Otherwise they are the files in `root` with the only
+    suffix that several files have; the suffix of a bag, `.mcap`, counts even for one file. If no
+    suffix qualifies, all suffixes do. If several suffixes qualify, or each part has several files
+    with the names of signals in them (`signal_endings`), `files` is set to `?` with a note that
+    lists the choices, a note on `channels` says so, and the result is False. Otherwise `p.base`
+    becomes the folder, `p.names` these files and `p.others` all other files, and the format is that
+    of the first file's suffix, `text` for an unknown one. Raises DataError if there is no file of
     recordings.
     """
     stated = p.description.files
@@ -146,8 +149,8 @@ def signal_endings(names: Names) -> Names:
     """Return the endings of file names, if they tell signals apart: `Kraft.csv` of `1_Kraft.csv`.
 
     An ending is the last word with its suffix, and what stands before it is the part. There must be
-    two parts and two endings or more, and each part must have a file with each ending. If an ending
-    has a digit, or is a verdict like `ok`, the result is empty.
+    two parts and two endings or more, and each part must have a file with each ending. If not, or
+    if an ending has a digit or is a word for good or bad like `ok`, the result is empty.
     """
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     endings = sorted({name[-1] for name in words})
@@ -188,7 +191,7 @@ def globs(names: Names) -> list[str]:
 
 
 def contents_of(p: Proposal) -> dict[str, bytes]:
-    """Return the contents of at most 60 files, evenly spread over all, by name.
+    """Return the contents of at most 60 of the files `p.names`, evenly spread over all, by name.
 
     No further file is read once 2 MB were read. Files that cannot be read are left out.
     """
@@ -201,12 +204,14 @@ def contents_of(p: Proposal) -> dict[str, bytes]:
 
 
 def read_tables(p: Proposal) -> list[Table]:
-    """Return one table for each file that is looked at, if it has the most frequent columns.
+    """Return the tables of some of the files `p.names`, at most 60, with the same column names.
 
-    For text files the keys of `[text]` are set in `p` first, and files of another form move from
-    `p.names` to `p.others`. Damaged files are left out, also those with a line that has a wrong
-    number of cells. Raises DataError if all are damaged, if no text file is a text, or if it is not
-    certain which line or which names are the header.
+    Tables with other column names than most files have are left out. For text files the keys of
+    `[text]` are set in `p` first, and files of another form move from `p.names` to `p.others`.
+    Damaged files are left out, also those with a line that has a wrong number of cells; if there is
+    only one file, such a line is left out instead. The list is empty if files that are no text
+    cannot be opened. Raises DataError if all files are damaged, or if no text file can be opened,
+    is a text and has a header that is certain.
     """
     contents = contents_of(p)
     if p.description.format == "text":
@@ -224,13 +229,13 @@ def read_tables(p: Proposal) -> list[Table]:
 
 
 def table_in(p: Proposal, content: bytes, name: str) -> Table:
-    """Return the table of a file; a text file gives all cells as texts.
+    """Return the table of a file with this content; a text file gives all cells as texts.
 
     An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
-    is stated, if it is the only file and its arrays hold curves. Of a text or jsonl file of more
-    than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if the file is
-    damaged, or if a line of a text file has a wrong number of cells; but such
-    lines of the only file are left out.
+    is stated, if it is the only file and an array has lists of several items. Of a text or jsonl
+    file of more than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if
+    the file is damaged, or if a line of a text file has a wrong number of cells; but such lines of
+    the only file are left out.
     """
     kind = p.description.format
     if kind == "npz":
@@ -252,13 +257,15 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 
 
 def propose_tables(p: Proposal, files: Tables) -> None:
-    """Find the layout, then the role of each column, and set their keys in `p`.
+    """Find the layout, then what each column is for, and set the keys that say so in `p`.
 
-    At most the first 50,000 rows of each file are used; `p.is_cut` is set if a file has more.
-    `p.tables` becomes the tables of the parts, and `p.names` is emptied unless each file is one
-    part. If the layout or `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names`
-    stay, and a note on `channels` says why. Raises DataError if there is no table, no part, or only
-    a table of results, and the errors of `propose_roles`.
+    A stated layout stays. `files` has the table of each file that is looked at. At most the first
+    50,000 rows of each are used; `p.is_cut` is set if a file has more. `p.tables` becomes the
+    tables of the parts, and `p.names` is emptied unless each file is one part. If the layout or
+    `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names` stay, and a note on
+    `channels` says why. Raises DataError if there is no table, no part, or only a table of results,
+    or if a stated column, format of times or source of labels is wrong, and SettingError for a
+    malformed `windows.trigger`.
     """
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")

@@ -74,9 +74,9 @@ class Column:
 
     @cached_property
     def numbers(self) -> list[Floats]:
-        """The numbers of each recording that has only numbers as `form` writes them.
+        """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        Empty if more than 10 % of the recordings have other cells.
+        Recordings with other cells are left out; if they are more than 10 %, the list is empty.
         """
         numbers = list[Floats]()
         for table in self.tables:
@@ -97,10 +97,11 @@ class Column:
 
     @cached_property
     def forms(self) -> list[str]:
-        """All forms of dates and times that fit its cells; none if a cell is no date or time.
+        """All forms of dates and times, like `%d.%m.%Y`, that fit the cells of the column.
 
-        The first 20 cells and the last cell of each recording are looked at. If an ISO date fits,
-        with or without a time of day, it is the only form.
+        The list is empty if a cell is no date or time. The first 20 cells and the last cell of each
+        recording are looked at. If an ISO date fits, with or without a time of day, it is the only
+        form.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]

@@ -64,13 +64,13 @@ Words = Mapping[str, str]  # by recording
 
 
 def with_meanings(source: LabelSource, words: Names) -> LabelSource:
-    """Return a source in which the words that it has are sorted into good, bad and unchecked.
+    """Return a source of labels in which `words` are sorted into `good`, `bad` and `unchecked`.
 
-    Each of these lists that the user stated stays; the others get the words of known meaning, in
-    any case of letters. If a word stays without a meaning, `good` and `bad` become `?` if they
+    A list that the source has already stays; the others get the words of known meaning, like "ok",
+    in any case of letters. If a word stays without a meaning, `good` and `bad` become `?` if they
     would be empty. The same holds for a path if either is empty: `pass_1.csv` alone proves nothing.
-    A column with only true, yes or 1, their opposites, and words for unchecked has known meanings
-    only if its name is one for good, like `success`; for one named `failed` they stay unknown.
+    A column, line or topic with only true, yes or 1, their opposites, and words for unchecked has
+    known meanings only if its name is one for good, like `success`; for `failed` they stay unknown.
     """
     words = sorted({*words})
     name = source.column or source.line or source.topic
@@ -88,7 +88,7 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
 
 
 def is_plain(source: LabelSource) -> bool:
-    """Return whether a source has words for good or bad, and none of these is `?`."""
+    """Return whether a source of labels has words for good or bad, and none of these is `?`."""
     words = source.good + source.bad
     return bool(words) and UNKNOWN not in words
 
@@ -110,10 +110,11 @@ def in_paths(paths: Names) -> list[str]:
 
 
 def is_named_like_verdict(source: LabelSource) -> bool:
-    """Return whether the column or line of a source is named like a verdict, for example `result`.
+    """Return whether a source of labels has the name of a verdict, like `result`.
 
-    A path counts if its pattern lists words, like `(ok|nok)`, but not if it takes any word. A
-    source without column, line and path counts.
+    This is the name of its column, or the beginning of its line. A path counts if its regular
+    expression lists words, like `(ok|nok)`, but not if it takes any word. A source without column,
+    line and path counts.
     """
     name = source.column or source.line
     return "([^" not in source.path and (not name or NAME.fullmatch(name) is not None)
@@ -122,9 +123,10 @@ def is_named_like_verdict(source: LabelSource) -> bool:
 def may_be_labels(source: LabelSource, words: Names) -> bool:
     """Return whether a source may hold labels, because it has few different words.
 
-    There must be 2 to 12, and on average at least two recordings for each. If the source is named
-    like a verdict, 12 words are allowed for any number of recordings, and one word is enough if it
-    is known as good or bad. `words` has the word of each recording, or of each row of a listing.
+    `words` has the word of each recording, or of each row of a listing. There must be 2 to 12
+    different ones, and on average at least two recordings for each. If the source is named like a
+    verdict, 12 words are allowed for any number of recordings, and one word is enough if it is
+    known as good or bad.
     """
     words = [*words]
     n = len({*words})
@@ -136,10 +138,10 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
 
 
 def row_of(column: Column) -> Literal["", "same", "last", "first"]:
-    """Return which row of a recording has the label, if this column holds it; "" for none.
+    """Return which row of a recording has the label, if this column holds it; "" if it cannot.
 
     "same": each recording has one word in all rows. "last" and "first": this row has the label, and
-    all others have the same word or a word for unchecked.
+    all others have the same word or one that means that the part is not checked, like "pending".
     """
     if column.fixed:
         return "same"
@@ -157,18 +159,19 @@ def is_verdict(column: Column) -> bool:
 
 
 def lines_of(p: Proposal) -> list[str]:
-    """Return how lines above the header begin, up to the first `; : = , tab` or two blanks.
+    """Return how the lines above the header begin, up to the first `; : = , tab` or two blanks.
 
-    Only the first table is looked at.
+    Only the first of `p.tables` is looked at. Each beginning comes once; empty ones are left out.
     """
     lines = [re.split(r"[;:=\t,]|  ", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
     return [*filter(None, dict.fromkeys(line.strip(" \"'") for line in lines))]
 
 
 def part_words(source: PartSource, tables: Tables) -> Words:
-    """Return the part number of each recording that has one, by its source.
+    """Return the part number of each recording that has one, by the recording's `Table.source`.
 
-    The number is "" if `[part]` states nothing.
+    `source` says where the number stands; it is "" if that states nothing. `tables` has the table
+    of each recording. Recordings without a number are left out.
     """
     words = dict[str, str]()
     for table in tables:
@@ -180,9 +183,13 @@ def part_words(source: PartSource, tables: Tables) -> Words:
 def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels; if the user stated a source, only that.
 
-    They come in this order: listings among the other files, the paths (if a file or a column is a
-    part), columns without a role, and lines above the header. A file that cannot be read as a
-    listing is skipped.
+    They come in this order: pairs of columns of listings among `p.others`, of which one may be the
+    key, since its words differ in more than half of the rows, and the other may hold labels;
+    regular expressions for the paths (if a file or a column is a part); columns without another use
+    that may have the label in all rows, the last or the first; and lines above the header. A file
+    that cannot be read as a listing is skipped.
+
+    paths : the path of each recording.
     """
     label = p.description.label
     if any(getattr(label, kind) for kind in KINDS):
@@ -205,11 +212,12 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
 
 
 def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> Words:
-    """Return the word of each recording that has one in a source.
+    """Return the word of each recording that has one in a source, by its `Table.source`.
 
-    If a listing has several rows for a recording, it is the word of the first. For the stated
-    source, DataError is raised if no recording has a word, its listing cannot be read, or its
-    `path` is no regular expression with one group. Any other source then gives an empty mapping.
+    `tables` has the table of each recording, and `parts` their part numbers. If a listing has
+    several rows for a recording, it is the word of the first. For the stated source, DataError is
+    raised if no recording has a word, its listing cannot be read, or its `path` is no regular
+    expression with one group. Any other source then gives an empty mapping.
     """
     words = dict[str, str]()
     is_stated = source == p.description.label
@@ -227,7 +235,10 @@ def words_of(p: Proposal, source: LabelSource, tables: Tables, parts: Words) -> 
 
 
 def title_of(source: LabelSource, words: Words) -> str:
-    """Return the settings that state a source, like `label.column=result`, with the word counts."""
+    """Return a text with the keys that state a source, like `label.column=result`.
+
+    In brackets follows how often each word comes. `words` has the word of each recording.
+    """
     values = {kind: getattr(source, kind) for kind in (*KINDS, "at")}
     stated = [
         f"label.{kind}={value}" for kind, value in values.items() if value not in ("", "same")
@@ -236,14 +247,14 @@ def title_of(source: LabelSource, words: Words) -> str:
 
 
 def count_sources(p: Proposal) -> dict[LabelSource, Words]:
-    """Return the possible sources of labels, each with the word of every recording that has one.
+    """Return the possible sources of labels, each with the words that it has, by recording.
 
-    If the user stated a source, only that one is returned. Otherwise it is each source that
-    `may_be_labels` and has words for more than half of the recordings; the same words in a further
-    place count only if it is named like a verdict. For listings and paths all recordings count,
-    since their names are enough; for columns and lines only those whose tables were read. The
-    meanings of the words are set as in `with_meanings`. Raises DataError if the stated source has
-    no words.
+    If the user stated a source, only that one is returned. Otherwise these are the sources that
+    have few different words (`may_be_labels`), and words for more than half of the recordings. A
+    source with the same words as an earlier one counts only if it is named like a verdict. For
+    listings and paths all recordings count, since their names are enough; for columns and lines
+    only those whose tables were read. The words are sorted into good, bad and unchecked as
+    `with_meanings` does. Raises DataError if the stated source has no words.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
@@ -263,7 +274,8 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
 def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
     """Return, by recording, 1 for a word for good, -1 for bad and 0 for unchecked.
 
-    The dict is empty if a word has no known meaning, or if no word is for good or bad.
+    The source has the lists of these words, and `words` the word of each recording. The dict is
+    empty if a word is in no list, or if none is for good or bad.
     """
     is_known = {*source.good, *source.bad, *source.unchecked}.issuperset(words.values())
     sides = {name: (word in source.good) - (word in source.bad) for name, word in words.items()}
@@ -273,12 +285,13 @@ def sides_of(source: LabelSource, words: Words) -> dict[str, int]:
 def propose_label(p: Proposal) -> None:
     """Set `[label]` and `[[check]]` in `p`: the source of the labels, and those that must agree.
 
-    A source is certain if it is named like a verdict, all its words have a known meaning, no other
-    source contradicts it, and it has words for good and bad or there is no other source. If no
-    source is certain, `label.column` is `?`, with a note that lists all; but if only one is named
-    like a verdict, it becomes the label, with `?` for its words. Other sources that would be
-    certain and have a word for each of its recordings become checks, unless checks are stated.
-    Raises DataError if a stated source has no words.
+    A source is known if it is named like a verdict or stated, and all its words have a known
+    meaning. The first known source becomes the label, unless another source contradicts it, or it
+    has words for good or for bad only while a source that is not known may hold labels, too. If
+    none is known, but only one is named like a verdict, that becomes the label, with `?` for words
+    whose meaning is open. Otherwise `label.column` is `?`, with a note that lists all sources.
+    Further known sources that have a word for each recording of the label become checks, unless
+    checks are stated; notes count the words. Raises DataError if a stated source has no words.
     """
     counted = count_sources(p)
     sides = {source: sides_of(source, words) for source, words in counted.items()}
@@ -303,9 +316,10 @@ def propose_label(p: Proposal) -> None:
 def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) -> None:
     """Note in `p.notes` which words stand in the source of the label, and how often.
 
-    The words are the texts that stand for a label, like "ok". `words` has one for each recording;
-    `others` describes the other possible sources, which the same note lists. If the meaning of a
-    word is unknown, the notes on `label.good` and `label.bad` ask for it.
+    `label` is this source. The words are the texts that stand for a label, like "ok"; `words` has
+    one for each recording. `others` describes the other possible sources, which the same note, on
+    `label.column` or the like, lists. If `label.good` or `label.bad` is `?`, notes on both ask
+    which of the words they are.
     """
     counts = counts_of(words.values())
     if UNKNOWN in label.good + label.bad:
@@ -315,11 +329,12 @@ def _note_words(p: Proposal, label: LabelSource, words: Words, others: Names) ->
 
 
 def _disagreement(sides: Sequence[Mapping[str, int]]) -> str:
-    """Return a sentence if a source contradicts the first source, with the number of recordings.
+    """Return a sentence if a source of labels contradicts the first one; "" if none does.
 
-    Only the first source that contradicts it is reported; "" if none does.
+    It has the number of recordings that are good by one and bad by the other. Only the first source
+    that contradicts is reported.
 
-    sides : of each source, 1 for good, -1 for bad and 0 for unchecked, by recording.
+    sides : for each source 1 for good, -1 for bad and 0 for unchecked, by recording.
     """
     for other in sides[1:]:
         if n := sum(side * other.get(name, 0) < 0 for name, side in sides[0].items()):

@@ -25,14 +25,16 @@ MOST_PARTS = 240
 
 
 def layout_of(p: Proposal, files: Tables) -> str:
-    """Return how the files hold parts, as `Description.layout` names it; `?` if it cannot be told.
+    """Return how the files hold parts, as `Description.layout` names it; `?` if it is not certain.
 
-    These rules come one after another. Several files with one object each are `files`. Lists or
-    numbered columns in the first table make it `wide`, or `npz`. It is `long` if a column may tell
-    the parts apart, or if the stated `part.column` has several words; `part.column` is then set in
-    `p` to the only such column with a name like a part's, or to `?` with a note. Several tables are
-    `files`. A single one gives `?`, with a note on what to state, or DataError if it is a table of
-    results: one row for each part, with its label, and no samples.
+    `files` has the table of each file that is looked at. These rules come one after another.
+    Several JSON or .ts files, of which the first has one row, are `files`. Lists in the first row
+    of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
+    file. It is `long` if a column may tell the parts apart (`may_tell_parts`), or if the stated
+    `part.column` has several words; `part.column` is then set in `p` to the only such column with a
+    name like that of a part's number, or to `?` with a note. Several tables are `files`. A single
+    one gives `?`, with a note on what to state, or DataError if it is a table of results: one row
+    for each part, with its label, and no samples.
     """
     kind = p.description.format
     first = files[0]
@@ -83,10 +85,12 @@ def words_in(column: Column) -> int:
 
 
 def may_tell_parts(column: Column) -> bool:
-    """Return whether a column may tell the parts of rows apart: by long runs, one for each word.
+    """Return whether a column may tell which part a row belongs to.
 
-    If the column is named like a part, a word may have one run in each table. Any other column of
-    times gives False.
+    A run is one word in successive rows. The runs must have 8 rows or more on average, and each
+    word one run; if the column is named like a part's number (`part`, `serial`, `id`, ...), one run
+    in each table. False if a cell is empty, if no table has more than one word, and for any other
+    column that holds times or is named like them.
     """
     if not has_long_runs(column):
         return False
@@ -97,7 +101,7 @@ def may_tell_parts(column: Column) -> bool:
 
 
 def numbered_columns(table: Table) -> list[str]:
-    """Return a pattern like `x*` for each name, as in `x0`, `x1`, that 20 columns or more share.
+    """Return a pattern like `x*` for each name that 20 columns or more share, like `x0`, `x1`.
 
     The number may be a fraction, and a bracket or a unit in brackets may stand behind it.
     """
@@ -114,8 +118,9 @@ def has_lists(table: Table) -> bool:
 def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table of results: a row for each part, with its label, but no samples.
 
-    A column shows this if it has known words for good and for bad, maybe among others, and a word
-    stands in fewer than 8 rows between two others.
+    `columns` are those of a single table. One shows this if it has known words for good and for
+    bad, maybe among other words, and a word stands in fewer than 8 successive rows between two
+    others.
     """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
@@ -130,12 +135,12 @@ def _refuse_results(columns: Iterable[Column]) -> None:
 
 
 def parts_of(p: Proposal, files: Tables) -> list[Table]:
-    """Return the tables of the parts that are looked at: the first 240 parts without damage.
+    """Return the tables of the first 240 parts without damage, by the layout in `p.description`.
 
-    The layout of a description says how files hold parts; in `long` one file holds several parts,
-    one below the other. If a file was read only in part, the last of several parts of each file is
-    left out in this layout, since it may be cut. In `columns` a column that is named like a clock
-    is no part. Raises DataError if the files do not split as the layout says.
+    `files` has the table of each file that is looked at. In the layout `long` a file holds several
+    parts, one below the other; if a file was read only in part, the last of several parts of each
+    file is left out, since it may be cut. In `columns` a column that is named like a clock is no
+    part. Raises DataError if the files do not split as the layout says.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])

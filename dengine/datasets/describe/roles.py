@@ -42,11 +42,13 @@ FORCES = (
 def propose_roles(p: Proposal) -> None:
     """Find what each column is for, and set the keys that say so in `p`; stated keys stay.
 
-    In this order: columns that tell which rows are samples, clock, part, label, channels. A key is
-    `?` if no rule proves a value. If it is open which rows are samples, `traces.samples` is `?` and
-    no rate is set; a clock that is open gives no rate either. Raises DataError if a stated column
-    of times or channel does not exist, a stated `time.format` is none, or a stated source of labels
-    has no words, and SettingError for a malformed `windows.trigger`.
+    The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
+    clock, part, label, channels, and what follows from these: words for lost samples, rate, length
+    of the traces, ignored columns and files. A key is `?` if no rule proves a value. If it is open
+    which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?` gives no
+    rate either. Raises DataError if a stated column of times or channel does not exist, a stated
+    `time.format` is none, or a stated source of labels has no words, and SettingError for a
+    malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):
@@ -69,7 +71,7 @@ def propose_roles(p: Proposal) -> None:
 
 
 def samples_only(p: Proposal, table: Table) -> Table:
-    """Return the rows of a table that are samples, by the columns of `[rows]` with known words.
+    """Return a table of the rows that are samples, by the columns of `[rows]` that have no `?`.
 
     If one of these columns is missing, or has a word without a meaning, all rows are returned.
     """
@@ -92,10 +94,11 @@ def set_rows(p: Proposal, rows: Mapping[str, RowWords]) -> None:
 def qualify_rows(p: Proposal) -> None:
     """Find the columns that tell which rows are samples, and set them as `[rows]` in `p`.
 
-    Such a column has few words, and they change within a recording. If it has several, its `keep`
-    is `?`, with a note that counts them; if it has one, that word is kept. If the user stated some
-    words of a column, its other words are added to `keep`, or to `drop` if `keep` is stated: by
-    `*` if they are more than 12, and not if `*` is stated.
+    Such a column has few words, and they change within a recording (`qualifies`). If it has
+    several, its `keep` is `?`, with a note that counts them; if it has one, that becomes its
+    `keep`, with a note. If the user stated some words of a column, its other words are added to
+    `keep`, or to `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is
+    stated. Rows that are then known to be no samples are left out of `p.columns`.
     """
     rows = dict(p.description.rows)
     unused = p.unused
@@ -120,10 +123,11 @@ def qualify_rows(p: Proposal) -> None:
 def qualifies(column: Column) -> bool:
     """Return whether the words of a column may tell which rows are samples.
 
-    It must have at most 12 words, and a cell for each of several rows of a recording. A column that
-    is named like a status (`Status`, `valid`) may have numbers, and also just one word. Any other
-    must have texts that change within a recording, and no name like a clock. A column of labels
-    with a known word is none.
+    It must have at most 12 different words, they must change within a recording, and each recording
+    must have several rows, with a cell in each. A column that is named like a status (`Status`,
+    `valid`) may have numbers, and also just one word in all. Any other must have texts, and no name
+    like a clock. A column that is named like a verdict and has a known word for good or bad holds
+    labels instead, and gives False.
     """
     name = column.name
     words = column.counts
@@ -143,8 +147,9 @@ def qualifies(column: Column) -> bool:
 def propose_part(p: Proposal) -> None:
     """Set `[part]` in `p` to the column or the line above the header that has the part's number.
 
-    Its name must be like a part's, and it must have different words for more than half of the
-    recordings. If several qualify, only a note lists them. A stated source stays.
+    Its name must be like that of a part's number, and the different words in it must be more than
+    half as many as the recordings. If several qualify, only a note on `part.column` lists them. If
+    none does, nothing is set. A stated `[part]` stays.
     """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in filter(PART_LINE.search, lines_of(p))]
@@ -162,9 +167,11 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 
     The rules are tried in order, and the first that any column fits decides: a name like a force
     along z, a name like a force, a unit of force or torque, a name like `F` or `value`, any column.
-    If several columns fit it, or there is no column, the channels stay open, with a note.
+    A name decides only if the unit is that of a force or torque, or unknown. If several columns fit
+    the rule, none is there, or `_doubt_on` has a reason against it, the channels stay empty, with a
+    note. Otherwise a note lists the other columns.
 
-    units : the columns that may be channels, with their units.
+    units : the columns that may be channels, with their units, "" for unknown.
     """
     if p.description.channels:
         return
@@ -186,9 +193,10 @@ def propose_channels(p: Proposal, units: Mapping[str, str]) -> None:
 def _doubt_on(p: Proposal, name: str) -> str:
     """Return the first reason why a column may not be a channel; "" if there is none.
 
-    The reasons: its name is like that of a set value or a limit; texts that do not mean a lost
-    sample are in more than 1 % of its cells; in columns like `x0`, `x1`, a step between two numbers
-    differs from the first step by more than half of it.
+    The reasons: the column is named like a set value or a limit; a text that does not mean a lost
+    sample is in more than 1 % of its cells; `name` is like `x*` and stands for the columns `x0`,
+    `x1`, ..., and a step between two of their numbers differs from the first step by more than half
+    of it.
     """
     if SET_VALUE.search(name):
         return f"{name} may be a set value"
@@ -209,11 +217,12 @@ def _strange_in(column: Column) -> Counter[str]:
 
 
 def _units(p: Proposal) -> dict[str, str]:
-    """Return the unused columns that may be channels, with their units; "" for no unit.
+    """Return the columns that may be channels, with their units; "" for no unit.
 
-    Such a column has at least three different numbers. At most 90 % of its cells are no numbers, or
-    10 % if a text that is not one for a lost sample is in more than 1 % of them. Times, counters of
-    rows and columns that are constant in each recording are left out.
+    Such a column has no other use in the description so far, and at least three different numbers.
+    At most 90 % of its cells are no numbers, or 10 % if a text that does not mean a lost sample is
+    in more than 1 % of them. Times, counters of rows and columns that are constant in each
+    recording are left out.
     """
     units = dict[str, str]()
     for column in p.unused:
@@ -231,10 +240,11 @@ def _units(p: Proposal) -> dict[str, str]:
 def find_lost(p: Proposal) -> None:
     """Set `text.missing` in `p` to the words that stand for lost samples (cells without a value).
 
-    They are those already there, and the words of `LOST`, in any case of letters, that a channel
-    has; "" is an empty cell. If more than 10 % of the cells of a channel are empty, "" is not added
-    for it if there is a clock: these rows belong to another signal. `[rows]` then drops them, with
-    a note, unless it has words of this channel already. A stated `text.missing` stays.
+    They are those already there, and those of the words nan, null, none, n/a, na, -, --, ---, #n/a
+    and "", an empty cell, that a channel has, in any case of letters. If more than 10 % of the
+    cells of a channel are empty, "" is not added for it if there is a clock: these rows belong to
+    another signal. `[rows]` then drops them, unless it has words of this channel already, and a
+    note says so. A stated `text.missing` stays.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
@@ -254,8 +264,9 @@ def find_lost(p: Proposal) -> None:
 def propose_lengths(p: Proposal) -> None:
     """Set `traces.samples` in `p` to the median length of the recordings.
 
-    It is 0 without a channel. If some have other lengths and `traces.lengths` is `strict`, but not
-    stated, a note counts them; if these are more than 10 %, `traces.lengths` becomes `pad`.
+    Recordings without rows are ignored, and without a channel it is 0. If some have another length,
+    and `traces.lengths` is `strict` without being stated, a note counts them; if they are more than
+    10 %, `traces.lengths` becomes `pad`.
     """
     words = [p.columns[name].words for name in p.description.channels if name in p.columns]
     lengths = [n for n in map(len, words[0] if words else ()) if n]
@@ -272,10 +283,11 @@ def propose_lengths(p: Proposal) -> None:
 
 
 def list_others(p: Proposal) -> None:
-    """Set in `p` the columns without a role as `ignored`, and the other files as `exclude`.
+    """Set in `p` the columns without any use as `ignored`, and the files `p.others` as `exclude`.
 
-    Listings are not excluded, and `exclude` gets a note. If it is `?`, because other files may be
-    recordings, it stays.
+    `ignored` has the unit of each column. Listings are not excluded, and a note on `exclude` lists
+    the files. If there is none, or if `exclude` is `?` because other files may be recordings, it
+    stays.
     """
     listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)

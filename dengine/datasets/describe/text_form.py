@@ -54,9 +54,12 @@ class Look:
 
 
 def look(content: bytes, stated: Stated) -> Look:
-    """Return how a text file is written, by its first 2 MB.
+    """Return how a text file is written, and the cells of its samples, from its first 2 MB.
 
-    Raises DataError if it is empty or no text, or if the line of its header is not certain.
+    The result has the text form, the number of columns, the line of the header ("" for none) and
+    the cells of each row of samples. If no delimiter separates numbers, there is a single column.
+    `content` has the bytes of the file. Raises DataError if it is empty or no text, or if the line
+    of its header is not certain.
 
     stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
     """
@@ -81,8 +84,10 @@ def look(content: bytes, stated: Stated) -> Look:
 def decode(content: bytes, stated: str) -> tuple[str, str]:
     """Return the encoding of a text, and the first 2 MB decoded; ("", "") if that fails.
 
-    The stated encoding is used if there is one. Otherwise it is UTF-16 if the text begins with a
-    byte order mark of it, else UTF-8, or cp1252 if UTF-8 fails.
+    The `stated` encoding is used unless it is "". Otherwise it is UTF-16 if the text begins with
+    its byte order mark, else UTF-8, or cp1252 if UTF-8 fails. A byte order mark is left out, and a
+    character that is cut off at the end. Raises LookupError for a stated encoding that Python does
+    not know.
     """
     is_wide = content[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     encodings = ["utf-16"] if is_wide else ["utf-8", LATIN]
@@ -96,9 +101,10 @@ def decode(content: bytes, stated: str) -> tuple[str, str]:
 def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]:
     """Return a score of how well a delimiter splits lines into numbers, and the cells per line.
 
-    The score is the share of lines with the usual number of cells, times the share of numbers among
-    their cells, and is lower for blanks; 0 if the usual line has one cell. The first third of the
-    lines is left out, since it may be text above the samples.
+    The score is the share of lines with the most frequent number of cells, times the share of
+    numbers among their cells that are not empty; it is divided by 1.15 if the delimiter is a blank,
+    since cells may have blanks in them. It is 0 if the lines have fewer than 2 cells. Empty lines
+    and the first third of the lines, which may be text above the samples, are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
@@ -116,12 +122,15 @@ def _count_numbers(cells: Sequence[str]) -> int:
 
 
 def _first_row(rows: Rows, width: int) -> int:
-    """Return the first row of samples, from 0; 0 if there is none.
+    """Return the index of the first row of samples, from 0; 0 if there is none.
 
-    It is the first of four successive rows that each have about as many numbers as is usual; or one
-    directly above it, if it begins like the row below, but for the digits: `0.0,,` above `0.1,5,`
-    has lost a sample, but `time,force,` is no row of samples. If it has 20 numbers or more, each
-    larger than the one before, and the next row has not, these are names of columns.
+    `rows` has the cells of each line, of which `width` is the usual number. It is the first of four
+    successive rows that each have at least 60 % of the usual number of numbers, and at least one.
+    Rows directly above it belong to the samples, too, if they have `width` cells and their first
+    cell has another number at most: `0.0,,` above `0.1,5,` has lost a sample, but `time,force,` is
+    no row of samples.
+    But if it has 20 numbers or more, each larger than the one before, and the next row has not,
+    these are names of columns, and the next row is the first.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
@@ -142,10 +151,11 @@ def is_numbering(cells: Sequence[str]) -> bool:
 def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
     """Return the lines, from 1, of the header and of the units above the samples; 0 for none.
 
-    The header is the last line with at least `width` cells. But if more than half of its words are
-    units, and an earlier line is as wide, it is the line of the units, and the earlier one is the
-    header. If the header has a unit among its names, or a name twice, and the line before it has no
-    empty cell, that may be the header. Raises DataError then, unless the header is stated.
+    The header is the last line with at least `width` cells, the number of columns. But if more than
+    half of its words are units, and an earlier line is as wide, it is the line of the units, and
+    the earlier one is the header. If the header has a unit among its names, or a name twice, and
+    the wide line before it has no empty cell, that may be the header. DataError is raised then,
+    unless the user stated the header in `stated`.
 
     rows : the cells of the lines above the samples.
     """
@@ -165,12 +175,12 @@ def _head_lines(rows: Rows, width: int, stated: Stated) -> tuple[int, int]:
 
 
 def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
-    """Set `[text]` in `p` for the form that most files have, and set aside files of another form.
+    """Set `[text]` in `p` to the text form of most files, and leave out files of another form.
 
     Those have another delimiter, number of columns or header, and move from `p.names` to
-    `p.others`. If two or more of them have samples, at least 8 rows, `exclude` is set to `?`, with
-    a note that asks whether they are recordings. Raises DataError if no file is a text whose header
-    is certain.
+    `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
+    with a note that asks whether they are recordings. A file that is no text, or whose header is
+    not certain, is ignored; if all are such, DataError is raised.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -194,10 +204,12 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
 def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     """Set the keys of `[text]` in `p`, as the first of these files is written.
 
-    If the header stands at different lines, `text.header` becomes its text. A note warns if the
-    encoding is guessed. The marks in numbers are set by `propose_marks`.
+    If the header stands at different lines, or the user stated a text for it, `text.header` becomes
+    its text, and `text.units` and `text.data` are counted from it. If a file is read as cp1252,
+    that is the encoding, with a note that it is guessed. `propose_marks` sets the decimal mark and
+    the mark of thousands.
 
-    looks : the first lines of files of one form.
+    looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """
     usual = looks[0]
     form = usual.form
@@ -219,13 +231,14 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
 def _column_names(usual: Look) -> Sequence[str]:
     """Return the names for `text.names`; empty if the header names each column.
 
-    Empty cells behind the last column are left out; if only the samples have them, they get a name.
-    Without a header, or if it has more words than
-    there are columns, the names are `c0`, `c1`, ...; for 20 columns or more it is `x*`, which names
-    all of them. Such a matrix has a part in each row; if its first column has few different whole
-    numbers, it is named `class`.
+    If the header has only empty cells beyond the last column, the names are those of the header; if
+    it has fewer cells than there are columns, the last ones are named `column3`, `column4`, ...
+    Without a header, or if it has more words than there are columns, the names are `c0`, `c1`, ...;
+    for 20 columns or more it is `x*`, which names all of them. Such a table may have a part in each
+    row: if its first column has 2 to 12 different words, all whole numbers, and fewer of them than
+    the second, it is named `class`, before `x*`.
 
-    usual : the first lines of a typical file.
+    usual : how a typical file is written, and the cells of its samples.
     """
     width = usual.width
     line = COMMENT.sub("", usual.line.lstrip())
@@ -241,14 +254,15 @@ def _column_names(usual: Look) -> Sequence[str]:
 
 
 def propose_marks(p: Proposal, cells: Collection[str]) -> None:
-    """Set in `p` the decimal mark and the mark between groups of digits that read most numbers.
+    """Set in `p` the decimal mark and the mark of thousands with which most numbers can be read.
 
-    `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if both
-    marks read as many numbers, or if more than 5 % of the numbers cannot be read at all. The mark
-    between groups is `?`, with a note, if fewer than 5 % of the numbers need it and no number has
-    both a point and a comma: `7,286` among `7.1` and `8.2` may be a damaged number.
+    `1.043,5` can only be read with a decimal comma. The decimal mark is `?`, with a note, if point
+    and comma read as many numbers, or if more than 5 % of the numbers cannot be read at all; but
+    not if no number has a point or comma. The mark of thousands is `?`, with a note, if it is a
+    point or comma, fewer than 5 % of the numbers need it, and no number has both a point and a
+    comma: `7,286` among `7.1` and `8.2` may be a damaged number. Stated keys stay.
 
-    cells : texts that are numbers with some marks.
+    cells : the different texts in the samples that are numbers with any of these marks.
     """
     counts = Counter(cell.translate(SAME_DIGITS) for cell in cells)
     possible = p.description.text.decimal if "text.decimal" in p.stated else ".,"

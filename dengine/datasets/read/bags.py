@@ -30,11 +30,12 @@ Events = dict[str, list[tuple[int, Any]]]  # by topic: nanoseconds of the log, d
 
 
 def read_messages(path: Path, topics: Collection[str] | None) -> Iterator[Message]:
-    """Yield (topic, time in ns, message) for each message of some topics, as the file has them.
+    """Yield (topic, time in ns, message) for each message of some topics, in the file's order.
 
-    `topics` None means all topics. Raises DataError if the file is not a .mcap file, or if a
-    package that reads such files is not installed. If the file is damaged, was not closed or cannot
-    be read, the whole messages are yielded first; then UnreadableError is raised.
+    The time is that of the bag's log. `topics` None means all topics. Raises DataError if the file
+    is not a .mcap file, or if a package that reads such files is not installed. If the file is
+    damaged, was not closed or cannot be read, the whole messages are yielded first; then
+    UnreadableError is raised.
     """
     if path.suffix.lower() != SUFFIX:
         raise DataError(
@@ -68,10 +69,11 @@ def read_bag(
 ) -> Table:
     """Return a table with a row for each message that has the channels, in the order of its time.
 
-    Other topics that the description names are columns too. If a topic is a label, each of its
-    messages stands in the last row before it, other rows have None; of several messages after one
-    row, the first stands there. Any other topic has its newest message in each row, None before the
-    first.
+    Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
+    message's header, 0 without one; both are in nanoseconds. Other topics that the description
+    names are columns, too. If a topic is a label, each of its messages stands in the last row
+    before it, other rows have None; of several messages after one row, the first stands there. Any
+    other topic has its newest message in each row, None before the first.
 
     Parameters
     ----------
@@ -80,6 +82,7 @@ def read_bag(
     title : str
         The bag's name in error messages.
     description : Description
+        Of the bag.
     faults : list
         Gets a fault for each file that is damaged, or has a message without a field that is read;
         its messages before that are read.
@@ -115,13 +118,15 @@ def _rows_of(
     events: Events,
     faults: list[Fault],
 ) -> list[Any]:
-    """Return a row (time, header time, *values) of each message with the channels, times in ns.
+    """Return a row (log time, header time, *values) of each message with the channels.
 
-    The header time is 0 without a header. `topics` holds the topic of the channels. Messages of
-    topics that are keys of `events` are appended there as (time, data); others are not read. A file
-    that is damaged, or has a message that lacks a field, adds a fault, and what came before stays.
-    Raises DataError if no message has the channels, or if a trigger cuts the bag and there is a
-    fault before its last file.
+    Times are in nanoseconds; the header time is 0 without a header. The values are the fields that
+    are the channels. `files` has the path and the name in errors of each file, and `topics` the
+    topic of the channels. Messages of topics that are keys of `events` are appended there as (log
+    time, data); others are not read. For a file that is damaged, or has a message that lacks a
+    field, a fault is appended to `faults`, and what came before stays. Raises DataError if no
+    message has the channels, or if a trigger cuts the bag and there is a fault before its last
+    file.
     """
     fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
@@ -147,10 +152,14 @@ def _rows_of(
 
 
 def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) -> Cells:
-    """Return the column of a topic: its message for each row, as `read_bag` describes it.
+    """Return the column of a topic, which has a message or None for each row of the channels.
 
-    messages : (time in ns, data) of the topic; they are sorted in place. logs : the times of the
-    rows.
+    In each row stands the newest message so far, None before the first. But if `is_verdict`, the
+    messages are labels, and each stands only in the last row before it; of several messages
+    between two rows the first stands there.
+
+    messages : (time in ns, data) of each message; they are sorted in place. logs : the times of the
+    rows in ns, increasing.
     """
     messages.sort(key=itemgetter(0))
     times = [time for time, _ in messages]

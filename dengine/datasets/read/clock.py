@@ -34,7 +34,7 @@ def has_day(unit: str) -> bool:
 def scale_of(unit: str) -> float:
     """Return how many seconds a unit of time has: 0.001 for `ms`, 1e-6 for `0.001 ms`.
 
-    Raises DataError for any other text.
+    The units are s, sec, ms, us, µs, ns, min, h and d. Raises DataError for any other text.
     """
     match = re.fullmatch(r"(\d*\.?\d*)\s*([^\d.]+)", unit.strip())
     if not match or match[2].strip() not in UNITS:
@@ -51,11 +51,12 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     Parameters
     ----------
     table : Table
+        The rows of a recording.
     clock : Clock
-        The times in its columns are added up; a column of one cell holds for all rows. Without
-        columns there is one time, 0.
+        The section `[time]`. The times in its columns are added up; a column of one cell holds for
+        all rows. Without columns there is one time, 0.
     form : TextForm
-        How numbers are written.
+        The section `[text]`: how numbers are written.
 
     Returns
     -------
@@ -86,9 +87,12 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
 def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextForm) -> Times:
     """Return the times of one column in seconds since its first row, and the time of that row.
 
-    If times of day fall by more than half a day, midnight has passed, unless a column has the date.
-    If a counter falls by more than half of `clock.wrap`, it began again at 0. Raises the errors of
-    `times_of`.
+    `unit` is the unit of its cells, or the form of its dates or times of day; a column of datetimes
+    needs neither. If times of day fall from one row to the next by more than half a day, midnight
+    has passed, unless a column of the clock has the date. If a counter falls by more than half of
+    `clock.wrap`, it began again at 0. `form` says how numbers are written. Raises UnreadableError
+    if the column `name` is missing or empty, or a cell is no such time, and DataError if `unit` is
+    no unit of time.
     """
     cells = table.column(name)
     if not len(cells):
@@ -111,11 +115,13 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
 
 
 def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
-    """Return the times in a column of dates or times of day, as `column_times` does.
+    """Return the times in a column of dates or times of day, and the time of its first row.
 
-    The time of the first row is in seconds since 1970 (UTC), or since midnight if the cells have no
-    date. Dates without a time zone are in `clock.zone`, or UTC if that is empty. Raises
-    UnreadableError if a cell does not have the form.
+    The times are in seconds since the first row, and the time of the first row is in seconds since
+    1970 (UTC), or since midnight if the cells have no date. `unit` is the form of the cells, "iso"
+    or like "%d.%m.%Y"; a comma is read as a point. Dates without a time zone are in `clock.zone`,
+    or UTC if that is empty. Raises UnreadableError if there is no column `name`, or one of its
+    cells does not have the form, or is no single time because clocks are changed.
     """
     import pandas as pd
 
@@ -140,9 +146,10 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
-    No step may be longer than `clock.gap` steps of the rate; if the rate is 0, than `clock.gap`
-    mean steps. With `clock.gap` 0 steps may have any length, and some may be 0; otherwise equal
-    times are refused. A single time passes.
+    `seconds`, shape (rows,), has the times of the rows of `table`. No step from one to the next may
+    be longer than `clock.gap` steps of the stated rate, `clock.rate_hz`, or `clock.gap` mean steps
+    if none is stated. With `clock.gap` 0 steps may have any length, and some may be 0; otherwise
+    equal times are refused. A single time passes.
     """
     steps = np.diff(seconds)
     rate = clock.rate_hz

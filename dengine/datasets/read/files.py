@@ -31,7 +31,7 @@ def natural_key(text: str) -> Key:
 
 
 def as_source(source: Any) -> Any:
-    """Return a path as a `Path`, and anything with `columns`, like a DataFrame, as it is.
+    """Return a path as a `Path`, and an object with `columns`, like a DataFrame, as it is.
 
     Raises DataError for anything else, for a path at which there is nothing, and for one that the
     system refuses.
@@ -50,7 +50,7 @@ def as_source(source: Any) -> Any:
 
 
 def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
-    """Return the files below a folder that patterns match, as seen from there.
+    """Return the files below a folder that any pattern matches, as paths relative to the folder.
 
     Raises DataError for a malformed pattern.
     """
@@ -62,9 +62,9 @@ def match_files(root: Path, patterns: Sequence[str]) -> set[str]:
 def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
     """Return the path of each file that a description names, with its path relative to the folder.
 
-    They are sorted by file name, run_2 before run_10. Listings, the description file and the files
-    in `exclude` are left out. If `root` is a file, only that is returned. Raises DataError if there
-    is no file, or for a malformed pattern.
+    They are sorted by file name, run_2 before run_10. Listings, the description file and files that
+    match a pattern in `exclude` are left out. If `root` is a file, only that is returned, with its
+    name. Raises DataError if there is no file, or for a malformed pattern.
     """
     if root.is_file():
         return [(root, root.name)]
@@ -100,9 +100,10 @@ def read_file(path: Path) -> bytes:
 
 @contextmanager
 def caught(faults: list[Fault], source: str) -> Iterator[None]:
-    """Turn a DataError that is raised in the `with` block into a fault, and go on behind the block.
+    """Context manager that turns a DataError in its block into a fault, and suppresses it.
 
-    The fault, with `source` as the file or part, is appended to `faults`.
+    The fault is appended to `faults`. It has `source` as the file or part, and the line and column
+    of the error, if it has them.
     """
     try:
         yield

@@ -26,10 +26,11 @@ Columns = dict[str, Cells]
 def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -> Table:
     """Return the table of a JSON file, with a row for each object.
 
-    The file may hold one object, a list of objects, or (with `has_lines`) these in each line. Keys
-    of nested objects are joined by dots. A cell may be a list; it is None if the object lacks the
-    key. Raises UnreadableError if the file is not in its encoding, or the text is no JSON, or holds
-    anything but objects, or nothing.
+    `content` may hold one object, a list of objects, or (with `has_lines`) these in each line, with
+    empty lines between them. Keys of nested objects are joined by dots. A cell may be a list; it is
+    None if the object lacks the key. `source` is the file's name in errors; of `form` the encoding
+    is used. Raises UnreadableError if the file is not in this encoding, or the text is no JSON, or
+    holds anything but objects, or nothing.
     """
     text = to_utf8(content, form.encoding).decode()
     rows: list[Mapping[str, Any]] = []
@@ -54,9 +55,9 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
 
 
 def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested objects as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
+    """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
 
-    prefix : stands before each name.
+    prefix : text that is put before each key. value : the mapping.
     """
     items: dict[str, Any] = {}
     for name, item in value.items():
@@ -66,13 +67,15 @@ def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def columns_of(prefix: str, value: Any) -> Columns:
-    """Return a value of JSON or NumPy as columns; a scalar becomes a column with one cell.
+    """Return a value of JSON or NumPy as columns by name; a scalar becomes a column with one cell.
 
-    An object has a column for each key, and a list of objects for each key of the first of them. An
-    array (C, n), or (n, C) with C < n, has a column for each channel. Raises UnreadableError if the
-    items of a list are not all alike.
+    A list of scalars becomes one column, a mapping has a column for each key, and a list of
+    mappings for each key of the first of them. An array (C, n), or (n, C) with C < n, has a column
+    for each of its C channels. Nested values are treated in the same way. Raises UnreadableError if
+    the items of a list are not all alike.
 
-    prefix : the name of the value; a dot and the key, or the channel from 0, are appended.
+    prefix : the name of the value; a dot and the key, or the channel from 0, are appended. Without
+    a name, "", a column is called by the key alone.
     """
     if isinstance(value, np.ndarray) and value.dtype == object:
         value = value.tolist()
@@ -87,10 +90,12 @@ def columns_of(prefix: str, value: Any) -> Columns:
 
 
 def _turned(items: Any) -> Mapping[Any, Any]:
-    """Return a list of objects as a list for each key, or a list of lists as one for each channel.
+    """Return a list of mappings as a list for each key, or a list of lists as one for each channel.
 
-    The dict is empty if the first item is neither. Keys that the first object lacks are left out.
-    Raises one of `DAMAGES` if an item lacks a key of the first, or is of another form or length.
+    The shorter axis of a list of lists is the channels, which are numbered from 0. The result is
+    empty if the first item is neither, or there is none. Keys that the first mapping lacks are left
+    out. Raises LookupError, TypeError or ValueError if an item lacks a key of the first, is of
+    another kind or has another length.
     """
     first = items[0] if len(items) else None
     if isinstance(first, Mapping):
@@ -114,7 +119,10 @@ def as_cells(values: Any) -> Cells:
 
 
 def read_frame(frame: Any, source: str) -> Table:
-    """Return the table of a DataFrame, whose index is a column if it has a name."""
+    """Return the table of a DataFrame, whose index is a column if it has a name.
+
+    `source` is the table's name in errors. Rows are numbered from 1.
+    """
     frame = frame.reset_index() if frame.index.name is not None else frame
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}
     return Table(source, columns, range(1, len(frame) + 1))
@@ -123,7 +131,8 @@ def read_frame(frame: Any, source: str) -> Table:
 def read_parquet(content: bytes, source: str) -> Table:
     """Return the table of a Parquet file.
 
-    Raises DataError if it is not a Parquet file, or if pyarrow is not installed.
+    `content` has its bytes, and `source` is its name in errors. Raises DataError if it is not a
+    Parquet file, or if pyarrow is not installed.
     """
     with read_errors(source, "a Parquet file", "pyarrow", "files"):
         import pandas as pd
@@ -134,10 +143,12 @@ def read_parquet(content: bytes, source: str) -> Table:
 def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     """Return the table of a NumPy archive, which holds one part, or all parts if `has_all`.
 
-    Of one part, each array becomes columns as in `columns_of`, after axes of length 1 were dropped.
-    Of all parts, row i has item i of each array, and there are as many rows as the largest array
-    has items. Raises DataError if the archive is damaged, and UnreadableError if it has no array,
-    or the items of an array are not all alike.
+    Of one part, axes of length 1 are dropped; then an array (n,) becomes a column, and an array
+    (C, n), or (n, C) with C < n, a column for each channel. Of all parts, each array is a column
+    whose cell i is its item i, and there are as many rows as the array with most numbers has items.
+    `content` has the bytes of the archive, and `source` is its name in errors. Raises DataError if
+    it is damaged, and UnreadableError if it has no array, or the items of an array are not all
+    alike.
     """
     arrays, _ = read_archive(content, name=source)
     if not arrays:
@@ -154,8 +165,9 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
-    `class`. Raises UnreadableError if the file is not in its encoding, or has no series below a
-    line `@data`.
+    `class`. `content` has the bytes of the file, `source` is its name in errors, and of `form` the
+    encoding is used. Raises UnreadableError if the file is not in this encoding, or has no series
+    below a line `@data`.
 
     References
     ----------

@@ -30,8 +30,8 @@ def without_suffix(path: str) -> str:
 def path_word(path: str, pattern: str) -> str:
     """Return what the group of a regular expression matches in a path without the file's suffix.
 
-    Raises UnreadableError if it does not match, and DataError if `pattern` is no regular expression
-    with exactly one group.
+    The first match in the path counts. Raises UnreadableError if `pattern` or its group does not
+    match, and DataError if it is no regular expression with exactly one group.
     """
     wanted = f"Expected a regular expression with one group, got {pattern}"
     with instead(DataError, wanted, re.error):
@@ -45,10 +45,13 @@ def path_word(path: str, pattern: str) -> str:
 
 
 def line_word(lines: Sequence[str], beginning: str) -> str:
-    """Return the cell that follows a text with which a line above the header begins.
+    """Return what follows `beginning` in a line that begins with it, up to `;`, tab or comma.
 
-    The first such line is used, but one with no more letters in its first cell comes before it.
-    Comment marks before the text are skipped. Raises UnreadableError if no line begins with it.
+    If several lines begin with it, the first is used in which it fills the whole first cell, or
+    else the first. Comment marks and quotes before the text are skipped; blanks, quotes, colons and
+    `=` around the result are removed. Raises UnreadableError if no line begins with the text.
+
+    lines : the lines above the header of a file.
     """
     texts = [line.lstrip(f"#%*{MARKS}") for line in lines]
     texts = [text[len(beginning) :] for text in texts if text.startswith(beginning)]
@@ -60,12 +63,13 @@ def line_word(lines: Sequence[str], beginning: str) -> str:
 def words_of(
     source: PartSource | LabelSource, table: Table, columns: Sequence[str], at: str = "same"
 ) -> list[str]:
-    """Return what a source of the label or the part number says for a recording.
+    """Return the words that a source of labels or of part numbers has for a recording.
 
-    A path or a line gives one word; otherwise each of `columns` gives one, "" for an empty cell.
-    Raises UnreadableError if a column, the line or a match is missing, or if a word changes within
-    the recording (see `LabelSource.at`), and DataError if the path is no regular expression with
-    one group.
+    If the source states a path or a line above the header, that gives one word; otherwise each of
+    `columns` of the recording's table gives one, "" for an empty cell: that of all rows if `at` is
+    "same", or of the "first" or "last" row. Raises UnreadableError if a column, the line or a match
+    is missing, or if rows differ under "same", and DataError if the path is no regular expression
+    with one group.
     """
     if source.path:
         return [path_word(table.path, source.path)]
@@ -75,10 +79,11 @@ def words_of(
 
 
 def part_of(source: PartSource, table: Table) -> str:
-    """Return the part number of a recording; "" if `[part]` states nothing.
+    """Return the part number of a recording by `[part]`, `source`; "" if that states nothing.
 
-    The words of several columns are joined by blanks. Raises UnreadableError if the stated place is
-    missing or empty.
+    The words of several columns are joined by blanks. Raises UnreadableError if the stated column,
+    line or match is missing or empty, or if the number changes within the recording, and DataError
+    if the stated path is no regular expression with one group.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -89,9 +94,10 @@ def part_of(source: PartSource, table: Table) -> str:
 def listing_table(path: Path, form: TextForm) -> Table:
     """Return the table of a listing, which is a Parquet file or a text file.
 
-    The delimiter of a text is the one of `, ; tab |` that is most frequent in its first line; its
-    cells stay texts. Raises UnreadableError if it cannot be read or a row has another number of
-    cells, and DataError for a damaged Parquet file.
+    The first line of a text has the names of the columns; the delimiter is the one of `, ; tab |`
+    that is most frequent in it. Cells stay texts. Of `form` only the encoding is used. Raises
+    UnreadableError if the file cannot be read or a row has another number of cells, and DataError
+    for a damaged Parquet file.
     """
     content = read_file(path)
     if path.suffix == ".parquet":
@@ -103,7 +109,10 @@ def listing_table(path: Path, form: TextForm) -> Table:
 
 @contextmanager
 def in_listing(name: str) -> Iterator[None]:
-    """Turn an UnreadableError in the `with` block into a DataError that names the listing."""
+    """Context manager that raises DataError in place of an UnreadableError in its block.
+
+    The message names the listing, `name`, and the line.
+    """
     try:
         yield
     except UnreadableError as error:
@@ -125,10 +134,11 @@ class LabelReader:
     def words(self, table: Table, part: str) -> Sequence[str]:
         """Return the words that stand for the label of a recording, like "ok".
 
-        If the source is a listing, a file that lists the labels of all recordings, they are the
-        words of all rows with the key of the recording. The key is the first of these that is
-        listed: the number of the part, the path, the file name, the path without suffix, the file
-        name without suffix. It is added to `used`. Any other source gives one word.
+        `table` is the table of the recording, and `part` its part number. If the source is a
+        listing, they are the words of all its rows with the key of the recording. The key is the
+        first of these that is listed: the number of the part, the path, the file name, the path
+        without suffix, the file name without suffix. It is added to `used`, the set of keys found
+        so far. Any other source gives one word.
 
         Raises
         ------
@@ -156,8 +166,11 @@ class LabelReader:
     def label(self, table: Table, part: str) -> int | None:
         """Return the label of a recording: 1 good, 0 bad, None not checked.
 
-        In a listing the key is added to `used`. Raises UnreadableError if there is no label, if
-        rows of the listing contradict each other, or if a word has no stated meaning.
+        `table` is the table of the recording, and `part` its part number. If the source is a
+        listing, the key that was found in it is added to `used`, the set of keys found so far.
+        Raises UnreadableError if there is no label, if rows of the listing contradict each other,
+        or if a word has no stated meaning, and DataError if `source.path` is no regular expression
+        with one group.
         """
         source = self.source
         words = self.words(table, part)
@@ -172,10 +185,10 @@ class LabelReader:
         return labels.pop()
 
     def meaning(self, word: str, line: int = 0) -> int | None:
-        """Return what a word means: 1 good, 0 bad, None not checked.
+        """Return what a word of the source means: 1 good, 0 bad, None not checked.
 
         A word that is stated as several of these has the first of these meanings. Raises
-        UnreadableError for a word whose meaning is not stated.
+        UnreadableError for a word whose meaning is not stated; `line` is its line in the file.
         """
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
@@ -189,7 +202,7 @@ class LabelReader:
         return meanings[word]
 
     def unused_note(self) -> str:
-        """Return a note on the rows of the listing whose recording was not read, or ""."""
+        """Return a sentence on the rows of the listing whose recording was not read; "" if none."""
         unused = sorted(self.listing.keys() - self.used, key=natural_key)
         n = f"{len(unused)} of {len(self.listing)} rows of {self.source.listing}"
         return f"{n} name no recording that was read: {listed(unused)}." if unused else ""
@@ -208,8 +221,9 @@ def as_key(word: str) -> str:
 def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     """Return the reader of a source of labels, after reading its listing, if it has one.
 
-    Raises DataError if the listing, in the folder `base`, cannot be read, or if `key` and `column`
-    are not both stated and in it.
+    The listing stands in the folder `base`, and is a text in the encoding of `form` or a Parquet
+    file. Raises DataError if it cannot be read, or if `source.key` and `source.column`, the columns
+    of keys and words in it, are not both stated and there.
     """
     reader = LabelReader(source)
     if source.listing:

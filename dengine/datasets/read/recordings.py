@@ -38,9 +38,10 @@ WORDS = {1: "good", 0: "bad", None: "not checked"}
 def recording_of(
     table: Table, description: Description, labels: Sequence[LabelReader]
 ) -> Recording | None:
-    """Return the recording of a part; None if the part was not checked, whatever its length is.
+    """Return the recording of a part; None if the part was not checked.
 
-    The times and samples of a part that was not checked must be readable, too.
+    The times and samples of a part that was not checked must be readable, too, but may be of any
+    length. If `[part]` states nothing, a part that `[windows]` cuts has its key as part number.
 
     Parameters
     ----------
@@ -53,7 +54,7 @@ def recording_of(
     Raises
     ------
     UnreadableError
-        If the table does not follow the description.
+        If the table does not follow the description, or is damaged.
     DataError
         If a regular expression or a format of times in the description is invalid.
     """
@@ -90,12 +91,13 @@ def recording_of(
 
 @instead(UnreadableError, "Expected columns of one length", IndexError, ValueError)
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
-    """Return the rows of a table that are samples, and which of these are lost, (rows,) bool.
+    """Return a table of the rows that are samples, and which of these are lost, bool (kept rows,).
 
-    Raises UnreadableError for a word whose meaning is not stated, or a column that is missing or of
-    another length.
+    Without `rows` all are kept. Raises UnreadableError for a word whose meaning is not stated, or a
+    column that is missing or of another length.
 
-    rows : for each column, which of its words keep a row, drop it, or mark its samples as lost.
+    rows : for each column, the words that keep a row, drop it, or mark its samples as lost; `*` is
+    any other word.
     """
     n = max(map(len, table.columns.values()), default=0)
     is_lost: Cells = np.zeros(n, dtype=bool)
@@ -115,10 +117,10 @@ def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]
 def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> Floats:
     """Return the samples of a channel, converted to its unit and times its factor, shape (n,).
 
-    They are in the unit that the file states, or else in the unit in the column's name, or else in
-    the channel's unit. Raises UnreadableError if the unit that the file states is of another
-    quantity, if the column is missing, or if a cell is no number; a unit of another quantity in the
-    name is ignored.
+    The cells of `column` are in the unit that the file states for it, or else in the unit in its
+    name, or else in the channel's unit. `form` says how numbers are written. A lost sample is NaN.
+    Raises UnreadableError if the unit that the file states is of another quantity, if the column is
+    missing, or if a cell is no number; a unit of another quantity in the name is ignored.
     """
     values = table.numbers(column, form)
     factor = 1.0
@@ -134,10 +136,12 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 
 
 def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | None:
-    """Return the label of a part, 1 or 0; None if it was not checked.
+    """Return the label of a part, 1 good or 0 bad; None if it was not checked.
 
-    Raises UnreadableError if a source has no label for it, or if the sources do not agree, also if
-    only one of them says that it was not checked.
+    `labels` has a reader for the source of labels, and for each source that must agree with it;
+    `table` and `part` are the table and the number of the part. Raises UnreadableError if a source
+    has no label for it, or if the sources do not agree, also if only one of them says that it was
+    not checked, and DataError if the path of a source is no regular expression with one group.
     """
     label, *others = [reader.label(table, part) for reader in labels]
     for i, other in enumerate(others, 1):
@@ -166,7 +170,10 @@ def read_recordings(
     Returns
     -------
     Dataset
-        What does not follow the description is one of its `faults`.
+        Its traces are in the order that `order` of the description states. A recording that does
+        not follow the description or repeats another is one of its `faults`; one whose part was not
+        checked counts in `unlabelled`. `notes` says if samples are lost, rows of a listing name no
+        recording, or there are fewer recordings than when the description was made.
 
     Raises
     ------
@@ -217,8 +224,11 @@ def files_of(
 ) -> tuple[str, Path, Sequence[tuple[Path | Table, str]]]:
     """Return the name of a data set, its folder, and a list of (file or table, name) to read.
 
-    All files of a bag are read here, into one table; damaged files add to `faults`. A DataFrame
-    gives one table. Raises DataError if there is no file, and the errors of `read_bag`.
+    The data set has the name of the folder, or of the file without its suffix. All files of a bag
+    are read here, into one table; a fault of each damaged one is appended to `faults`. A DataFrame
+    gives one table, called "table", and the current folder. Raises DataError if there is no file or
+    the bag cannot be read (see `read_bag`), and SettingError if `windows.trigger` of a bag is
+    malformed.
     """
     if not isinstance(source, Path):
         return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
@@ -234,11 +244,12 @@ def files_of(
 def parts_of(
     file: Path | Table, name: str, description: Description, base: Path
 ) -> Iterator[Table]:
-    """Yield the tables of the parts in a file or a table.
+    """Yield the tables of the parts in a file, or in a table that was read already.
 
-    Each table that `split` yields is one part, or is cut into parts if `[windows]` is stated.
-    Raises UnreadableError if the file cannot be read, DataError if it cannot be split or cut, and
-    SettingError if `windows.trigger` is malformed.
+    Each table that `split` yields is one part, or, if `[windows]` is stated, a long recording that
+    is cut into parts. `name` is the file's name in errors, and `base` the folder of the listing in
+    `[windows]`. Raises UnreadableError if the file cannot be read, DataError if it cannot be split
+    or cut, and SettingError if `windows.trigger` is malformed.
     """
     table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
     for part in split(table, description):
@@ -251,9 +262,11 @@ def parts_of(
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
     """Return the data set of recordings, in the given order.
 
-    `ordered` is False if the label changes exactly once. `fit` is "strict" if the recordings were
-    resampled at the rate of their clock, since live traces then come at this rate. Raises DataError
-    if `make_dataset` refuses the traces.
+    `ordered` is False if the label changes exactly once from one recording to the next. `fit` is
+    "strict" if the recordings were resampled at the stated rate of their clock, since live traces
+    then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
+    "pad-all". `part` is None if no recording has a part number. Raises DataError if `make_dataset`
+    refuses the traces.
     """
     labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
@@ -281,12 +294,13 @@ def dataset_of(recordings: Sequence[Recording], description: Description) -> Dat
 def fitted(
     samples: Floats, seconds: Floats | None, description: Description
 ) -> NDArray[np.float32]:
-    """Return the trace (C, T) of samples (C, n), brought to its length as `[traces]` says.
+    """Return the trace (C, T) of samples (C, n), brought to T samples as `[traces]` says.
 
-    With `resample`, a clock and a stated rate, it is interpolated at that rate from the first time
-    on. A longer recording loses its end; one that ends up to one step early is accepted. With a
-    clock but without a rate the whole recording is interpolated evenly. Otherwise it is fitted like
-    a live trace; `pad-all` repeats the last sample, however short the recording is.
+    `seconds`, shape (n,), has the times since the first sample; None without a clock. With
+    `resample`, times and a stated rate, the samples are interpolated at that rate from the first
+    time on. A longer recording loses its end; one that ends up to one step early is accepted. With
+    times but without a rate the whole recording is interpolated evenly. Otherwise it is fitted like
+    a live trace (`fit_length`); `pad-all` repeats the last sample, however short the recording is.
 
     Raises
     ------

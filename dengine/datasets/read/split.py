@@ -22,8 +22,9 @@ OBJECTS = ("json", "jsonl", "ts")
 def table_of(content: bytes, name: str, description: Description) -> Table:
     """Return the table of a file in the format of the description.
 
-    Raises UnreadableError or DataError if the file does not have this format; for a text file also
-    SettingError if `windows.trigger` is malformed.
+    `content` has the bytes of the file, and `name` is its name in errors. Raises UnreadableError or
+    DataError if the file does not have this format; for a text file also SettingError if
+    `windows.trigger` is malformed.
     """
     kind, form = description.format, description.text
     if kind == "ts":
@@ -38,9 +39,11 @@ def table_of(content: bytes, name: str, description: Description) -> Table:
 
 
 def column_kind(description: Description) -> Kind:
-    """Return a function from the name of a column to its kind: NUMBER, WORD, or "" if not needed.
+    """Return a function from a column's name to its kind: "number", "word", or "" if not needed.
 
-    A column is needed if the description names it. Raises SettingError if `windows.trigger` is
+    Words are dates, part numbers, labels, the column of `order` and those in `[rows]`. Numbers are
+    other columns of channels, of times, and of the signals of the trigger. A column that the
+    description does not name so is not needed. Raises SettingError if `windows.trigger` is
     malformed.
     """
     clock = zip(description.time.column, description.time.format, strict=False)
@@ -61,7 +64,7 @@ def column_kind(description: Description) -> Kind:
 
 
 def signals_of(description: Description) -> Sequence[str]:
-    """Return the signals of the trigger that cuts a long recording; none without a trigger.
+    """Return the columns that the trigger reads, which cuts a long recording; none without one.
 
     Raises SettingError for a malformed trigger.
     """
@@ -85,12 +88,12 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     `long`: the rows with the same words in `part.column` are a part; they must stand together,
     unless `time.sort` is set. `columns`: each column that matches the first channel is a part.
     `wide`, `npz`, and the formats json, jsonl and ts: each row is a part; its samples are the list
-    in a cell, or the cells of the numbered columns that match the channel, in the order of their
-    numbers. Otherwise the file is one part.
+    in a cell, or the cells of the columns that match the channel with a number for its `*`, in the
+    order of these numbers. Otherwise the file is one part.
 
     In numbered columns and in the layout `columns`, empty cells at the end are no samples. A part
     has `damage` if one of its rows is damaged, or if rows of other parts stand between its own.
-    Raises DataError if `long` is stated without `part.column`.
+    Raises DataError if `part.column` of the layout `long` is not stated or not in the table.
     """
     if description.layout == "long":
         yield from _split_rows(table, description)
@@ -103,7 +106,7 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
-    """Yield the rows of each part, which have the same words in `part.column`.
+    """Yield the table of each part, whose rows have the same words in `part.column`.
 
     A part has damage if a row with a wrong number of cells stands within or beside it, or if rows
     of other parts stand between its own and `time.sort` is not set. Raises DataError if
@@ -134,7 +137,13 @@ def _split_rows(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _split_wide(table: Table, description: Description) -> Iterator[Table]:
-    """Yield each row as a part, with samples from numbered columns or from lists in its cells."""
+    """Yield the table of each row, which is a part.
+
+    A channel like `x*` gets its samples from the columns in which a number stands for the `*`, in
+    the order of these numbers, without empty cells at the end. A list in any other cell becomes a
+    column. A part has damage if its row had a wrong number of cells, or if the items of a list in
+    it are not all alike.
+    """
     groups = {
         key: [match[0] for match in match_numbered(key, table.columns)]
         for key in description.channels
@@ -153,8 +162,9 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
 def _row_of(table: Table, i: int) -> Table:
     """Return row i as the table of a part; a list in a cell becomes a column.
 
-    Columns that do not have a cell for each row hold for all parts, whole. The part has damage if
-    the row had a wrong number of cells, or if the items in a cell are not all alike.
+    A column that does not have a cell for each row is taken as a whole. The part has damage if the
+    row had a wrong number of cells, or if the items of a list in a cell are not all alike; then it
+    has no columns.
     """
     n = len(table.lines)
     line = table.lines[i]
@@ -179,10 +189,11 @@ def match_numbered(key: str, columns: Iterable[str]) -> list[re.Match[str]]:
 
 
 def _split_columns(table: Table, description: Description) -> Iterator[Table]:
-    """Yield each column that matches the first channel as a part.
+    """Yield for each column that matches the first channel a table, which is a part.
 
-    The columns of times and of `[rows]` stay beside it; a channel cannot be one of them. Rows below
-    the last cell of the part that is not empty are left out.
+    The channel's name may have a `*` for any text. The columns of times and of `[rows]` are in each
+    table, too, and are no parts. Rows below the last cell of the part that is not empty are left
+    out. Damage of the file is damage of each part.
     """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}
@@ -199,11 +210,12 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
 def _with_samples(
     table: Table, samples: frames.Columns, origin: Mapping[str, Sequence[str]]
 ) -> Table:
-    """Return a table with the samples of channels, which stood in other columns of the file.
+    """Return a table to which columns with the samples of channels are added.
 
-    Cells at the end of a channel that are empty or NaN are left out.
+    Cells at the end of a channel that are empty or NaN are left out. The unit of a channel becomes
+    that of its first column in the file.
 
-    origin : for each channel the column of each sample.
+    samples : the cells by channel. origin : by channel the column of the file for each sample.
     """
     units = {key: table.units.get(names[0], "") for key, names in origin.items() if names}
     columns = {**table.columns, **{key: without_empty_end(cells) for key, cells in samples.items()}}
@@ -211,7 +223,7 @@ def _with_samples(
 
 
 def without_empty_end(cells: Cells) -> Cells:
-    """Return the cells without those at the end that are empty or NaN."""
+    """Return the cells of a column, shape (n,), without those at the end that are empty or NaN."""
     n = len(cells)
     while n and as_word(cells[n - 1]) in ("", "NaN", "nan"):
         n -= 1

@@ -31,23 +31,26 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
     Parameters
     ----------
     content : bytes
+        Content of the file.
     source : str
-        Name of the file.
+        Name of the file, for errors.
     form : TextForm
+        How the file is written: the section `[text]`.
     kind_of : callable
-        Returns the kind of a column by its name. NUMBER: numbers if the file is plain, otherwise
-        texts. WORD: texts. "": the column is not needed, and is empty if the file is plain.
+        Returns the kind of a column by its name; by default "word". "number": the column has
+        numbers if the file is plain, otherwise texts. "word": it has texts. "": it is not needed,
+        and is empty if the file is plain. A file is plain if pandas can read it without doubt.
 
     Returns
     -------
     Table
-        A line with a wrong number of cells is in its `damage`.
+        A line with a wrong number of cells is in its `damage`, and its row has empty cells.
 
     Raises
     ------
     UnreadableError
-        If the file has no rows of samples, has another encoding, or lacks the header, or if all
-        rows have a wrong number of cells.
+        If the file has no rows of samples, has another encoding, or has neither the stated header
+        nor stated names, or if all rows have a wrong number of cells.
     """
     content = to_utf8(content, form.encoding)
     header = _header_line(content, form.header)
@@ -72,10 +75,10 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
 
 
 def to_utf8(content: bytes, encoding: str) -> bytes:
-    """Return a text in UTF-8 with plain line feeds and without a byte order mark.
+    """Return the bytes of a text in UTF-8, with plain line feeds and without a byte order mark.
 
-    Raises UnreadableError, with the line, if a byte does not fit the encoding or is zero, and
-    LookupError for an encoding that Python does not know.
+    `encoding` is the encoding of `content`. Raises UnreadableError, with the line, if a byte does
+    not fit the encoding or is zero, and LookupError for an encoding that Python does not know.
     """
     is_utf8 = codecs.lookup(encoding).name == "utf-8"
     try:
@@ -115,11 +118,11 @@ def header_names(cells: Sequence[str]) -> list[str]:
 
 
 def _header_line(content: bytes, header: int | str) -> int:
-    """Return the line of the header, from 1; 0 for none.
+    """Return the number of the header's line, from 1; 0 for none.
 
-    Raises UnreadableError if no line begins with a stated text.
+    Raises UnreadableError if `header` is a text and no line begins with it.
 
-    header : this line, or the text with which it begins.
+    content : the file in UTF-8. header : the number, or the text with which the line begins.
     """
     if isinstance(header, int):
         return header
@@ -132,10 +135,13 @@ def _header_line(content: bytes, header: int | str) -> int:
 def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
     """Return the names of the columns: those of `text.names`, otherwise the cells of the header.
 
-    A last name `x*` becomes `x0`, `x1`, ..., as many as the first row of samples has cells left.
-    Raises UnreadableError if there are neither names nor a header.
+    A last name `x*` of `text.names` becomes `x0`, `x1`, ..., as many as the first row of samples
+    has cells left. In the header a comment mark is skipped, an empty cell is called by its number,
+    like `column1`, and a name that repeats gets a number, like `X.2`. Raises UnreadableError if
+    there are neither names nor a header.
 
-    top : the lines from the first to the first row of samples.
+    top : the lines from the first to the first row of samples. header : the number of the header's
+    line, 0 for none. form : the section `[text]`.
     """
     names = [*form.names]
     if names and names[-1].endswith(REST):
@@ -153,10 +159,13 @@ def _names(top: Sequence[str], header: int, form: TextForm) -> list[str]:
 def _read_plain(
     content: bytes, table: Table, form: TextForm, kinds: Mapping[str, str]
 ) -> dict[str, Cells]:
-    """Return the needed columns as pandas reads them; empty if anything in the file is not plain.
+    """Return the needed columns by name, read by pandas; none if anything in the file is not plain.
 
     Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
     that is not a finite number in a column of numbers.
+
+    table : only the names of its columns and the lines of its rows are used. kinds : the kind of
+    each column: "number", "word" (its cells are read as texts), or "" if it is not needed.
     """
     import pandas as pd
 
@@ -193,8 +202,9 @@ def _read_plain(
 def _read_strictly(content: bytes, table: Table, form: TextForm) -> Table:
     """Return the table with all cells as texts, without lines that are empty or dropped.
 
-    Lines that begin with a text of `form.drop` are dropped. A line with a wrong number of cells is
-    added to `damage`, and its row has empty cells. Raises UnreadableError if all lines are such.
+    `table` has the names of the columns and the lines of the rows. Lines that begin with a text of
+    `form.drop` are dropped. A line with a wrong number of cells is added to `damage` of the result,
+    and its row has empty cells. Raises UnreadableError if all lines have a wrong number of cells.
     """
     n = len(table.columns)
     rows = dict[int, list[str]]()
