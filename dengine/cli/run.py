@@ -348,8 +348,8 @@ CAPTION = (
     "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts "
     "rejected. FP and FN count as far as the cell tells the truth about parts that were not "
     "verified. novel: parts verified because they are unlike all known ones; safe: cycles of safe "
-    "mode; outside: parts that left a window, verified or rejected; good/h: good parts passed on "
-    "per hour."
+    "mode; outside: parts beyond the force limits, verified or rejected; good/h: good parts passed "
+    "on per hour."
 )
 COLUMNS = {  # title -> count of a stretch
     "accepted": "accepted",

@@ -241,11 +241,12 @@ def import_parts(
     for start in range(0, len(parts), CHUNK):
         chunk = parts[start : start + CHUNK]
         new: dict[str, StoredDecision] = {}
-        labels: list[NewLabel] = []
+        labels: dict[str, NewLabel] = {}
         for decision, trace, label in chunk:
             earlier = new.get(decision.id) or store.decisions.get(decision.id)
-            if earlier is not None and earlier.source is not None:  # a forgotten one has a label
-                outcome = "repeated" if label == earlier.success else "contradicted"
+            reported = labels.get(decision.id) or earlier
+            if reported is not None and reported.source is not None:  # a forgotten one has a label
+                outcome = "repeated" if label == reported.success else "contradicted"
                 counts[outcome] += label is not None
                 continue
             stored = earlier
@@ -260,9 +261,9 @@ def import_parts(
                 n_unreported -= n_since
                 source = source_of(decision.action, decision.audit, label)
                 about = (store.clock(), stored.content_hash, stored.time)
-                labels.append(NewLabel(decision.id, label, source, 0, None, n_since, *about))
+                labels[decision.id] = NewLabel(decision.id, label, source, 0, None, n_since, *about)
                 counts["quarantined" if stored.quarantined else "imported"] += 1
-        store.apply_records([*new.values(), *labels])
+        store.apply_records([*new.values(), *labels.values()])
         if on_traces is not None:
             on_traces(len(chunk))
     return ImportReport(**counts, resumed=True)

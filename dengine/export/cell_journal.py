@@ -187,7 +187,7 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
     risk = "lines may have been removed at its end, or lost with the power."
     try:
         number, crc = head.read_text(encoding="ascii").split()
-        has_line = int(crc, 16) in crcs[int(number) - 1 :][:1]
+        has_line = int(crc, 16) in crcs[: int(number)][int(number) - 1 :]
     except (OSError, ValueError):
         log.warning(
             "%s, which knows how long the journal is, is missing or cannot be read: %s", head, risk

@@ -137,9 +137,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     Raises
     ------
     ExportError
-        For a file that is missing, damaged or not signed with the key, that is no ONNX export or
-        has another schema, and if a package for ONNX is missing. Errors of onnxruntime are raised
-        as they are.
+        For a file that is missing, damaged or not signed with the key, that is no ONNX export, has
+        another schema or is refused by onnxruntime, and if a package for ONNX is missing.
     """
     onnx = _import_package("onnx")
     target = Path(path)
@@ -149,7 +148,9 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     ):  # protobuf's errors have no common base
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
-    return OnnxModel(content, check_schema(metadata, target))
+    metadata = check_schema(metadata, target)
+    with instead(ExportError, f"onnxruntime cannot run {target}", Exception):
+        return OnnxModel(content, metadata)
 
 
 def _refuse_unsupported(source: Exportable) -> None:

@@ -31,7 +31,7 @@ from asyncua.server.user_managers import UserManager
 from asyncua.ua import VariantType
 from asyncua.ua.status_codes import StatusCodes
 
-from ..errors import DengineError, SettingError, as_options, log
+from ..errors import DengineError, SettingError, TraceError, as_options, log
 from ..files import FilePath
 from .auth import host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
@@ -249,14 +249,14 @@ class AddressSpace:
         same decision again.
 
         If the queue is full, or the service or its engine is closed, the result is VERIFY with an
-        empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises SettingError if the
-        trace is empty, if its length is not a multiple of `channels`, or if `channels` is not from
-        1 to `MAX_CHANNELS`. Raises TraceError for a trace or part that the engine does not take
-        and for an id of another trace, ReportError for an invalid id, and SettingError for a first
-        trace that the settings do not allow.
+        empty id, the reason "busy", the bounds 0 and 1, and version 0. Raises TraceError if the
+        trace is empty, if its length is not a multiple of `channels`, if `channels` is not from 1
+        to `MAX_CHANNELS`, for a trace or part that the engine does not take, and for an id of
+        another trace. Raises ReportError for an invalid id, and SettingError for a first trace that
+        the settings do not allow.
         """
         if not 1 <= channels <= MAX_CHANNELS or len(trace) % channels or not trace:
-            raise SettingError(
+            raise TraceError(
                 f"Expected as many samples of each channel, got {len(trace)} of {channels} "
                 "channels."
             )

@@ -78,7 +78,7 @@ class Job(NamedTuple):
             if has_caller:
                 self.future.set_exception(error)
             else:
-                log.error("a decision that came too late failed: %s", error)
+                log.error("work for a caller that had gone failed: %s", error)
 
 
 @dataclass(frozen=True, slots=True)
