@@ -377,8 +377,8 @@ def verdict_lines(rows: pd.DataFrame) -> list[str]:
     if not table:
         return [TOO_FEW, ""]
     return [
-        f"The three numbers count the sets on which `{REFERENCE}` is ahead, on which the interval of "
-        f"the difference contains zero, and on which `{REFERENCE}` is behind.",
+        f"The three numbers count the sets on which `{REFERENCE}` is ahead, on which the interval "
+        f"of the difference contains zero, and on which `{REFERENCE}` is behind.",
         "",
         *table_lines(["method", "sets", "certain decisions", "net seconds"], table),
     ]
