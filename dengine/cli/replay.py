@@ -101,10 +101,11 @@ class PlayedTasks(NamedTuple):
 def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
     """Play tasks, each a replay to be played, with a progress bar; return what was finished.
 
-    That is the finished replays in the order of their tasks, and the time they took. Of `stream`
-    the cycles, the number of processes and the folder of kept replays are used. Ctrl-C or an error
-    ends the work and is not raised: the replays that were finished until then are returned, with
-    the error, which the caller must pass to `_end`.
+    That is the finished replays in the order of their tasks, and the time they took; kept replays
+    count with the time of the run that played them. Of `stream` the cycles, the number of processes
+    and the folder of kept replays are used. Ctrl-C or an error ends the work and is not raised: the
+    replays that were finished until then are returned, with the error, which the caller must pass
+    to `_end`.
     """
     from ..experiments.grid import iterate_replays
 
@@ -133,7 +134,8 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
-    """End the subcommand if an error or Ctrl-C interrupted its replays; nothing if `error` is None.
+    """End the subcommand if an error or Ctrl-C interrupted its replays; do nothing if `error` is
+    None.
 
     `text` says which replays are shown. After Ctrl-C it is printed to stderr, and the exit code is
     130. Any other error is raised; before, `text` is printed to stderr if `is_shown`.
@@ -340,7 +342,8 @@ def _replay_and_print(
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
 
     After Ctrl-C or an error the finished replays are shown, if there are some. Then the process
-    ends with exit code 130, or the error is raised.
+    ends with exit code 130, or the error is raised. Errors of the data set or the settings are
+    raised before anything is played.
 
     Parameters
     ----------
@@ -421,9 +424,9 @@ def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> st
     """Return the title of tables and pictures.
 
     It names the recipes and baselines (the keys of `by_name`), the data set, the order of the parts
-    (recorded if `in_order`, else shuffled), the number of replays of each, and the number of
-    cycles. The bundled data set is called "simulated insertions". There must be at least one
-    replay.
+    (recorded if `in_order`, else shuffled), the number of seeds that each played, and the number of
+    cycles, of the first replay. The bundled data set is called "simulated insertions". There must
+    be at least one replay.
     """
     counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
     n_cycles = len(next(iter(by_name.values()))[0])
@@ -557,7 +560,8 @@ def costs(
     --lower-bound, around break-even, where accepting costs as much as verifying. One value
     (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
     seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
-    replay, ends it and shows what was finished, if at least two shuffles are finished.
+    replay, ends it and shows what was finished, if at least two shuffles are finished by every
+    policy that is left.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of
@@ -628,8 +632,9 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
     """Return the sentences below the table of a cost curve: what a part costs under each policy.
 
     They say which policy was chosen, and how the choice depends on the prices. If there are any,
-    they also say how many recordings of the data set repeat another, which policies were left
-    behind because they were dearer in the first shuffles, and which were not tried.
+    they also say how many recordings of the data set equal an earlier one sample by sample, which
+    policies were left behind because they were dearer in the first shuffles, and which were not
+    tried.
     """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset
