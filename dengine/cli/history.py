@@ -102,11 +102,11 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
     STORE is the file or URL of an engine's store, and must exist. The options choose which
-    decisions; --events adds the retrains and events since the first of these decisions, or since
-    --since, and before --until. In the table good and bad are the labels that were counted, bound
-    is the interval of the success rate that follows from them, v is the version of the model, and
-    label is what the part turned out to be. If no decision fits, a sentence says so. `dengine
-    explain` tells more about one decision.
+    decisions; --events adds the retrains and events since the first of these decisions (if no
+    decision fits, all), or since --since, and before --until. In the table good and bad are the
+    labels that were counted, bound is the interval of the success rate that follows from them, v is
+    the version of the model, and label is what the part turned out to be. If there is nothing to
+    list, a sentence says so. `dengine explain` tells more about one decision.
     """
     from ..history.status import history as read_history
     from ..representation import to_jsonable

@@ -764,7 +764,7 @@ def out_option(
     """
 
     def make_out(out: Path | None, force: bool) -> Out | None:
-        """Check the files, and return the `Out`."""
+        """Return the `Out`, None without `--out`; OutputError if a file must not be written."""
         from ..files import check_output
 
         if out is None:

@@ -398,7 +398,7 @@ def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], N
         n_steps += n
 
     def write_lines() -> None:
-        """Write until the block ends."""
+        """Write a line every `LINE_SECONDS` until the block ends."""
         begin = time.monotonic()
         while not ended.wait(LINE_SECONDS):
             seconds = format_duration(time.monotonic() - begin)

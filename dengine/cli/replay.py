@@ -170,7 +170,7 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
     """
 
     def make_stream(repeats: int, seed: int, in_order: bool = False, **settings: Any) -> Stream:
-        """Return the stream; a usage error if `--repeats` is given beside `--in-order`."""
+        """Return the stream; in order it has one seed, and a given `--repeats` is a usage error."""
         if in_order:
             source = click.get_current_context().get_parameter_source("repeats")
             if source is not ParameterSource.DEFAULT:
@@ -295,9 +295,10 @@ def compare(
 
     Methods are reducers and baselines, each with a name of its own. They are played under one
     policy or a grid of policies: give a setting either as one value (--alpha) or as a list to try
-    (--alphas); both are a usage error. For each method the output is that of `dengine replay`.
-    umap-learn takes much longer than the others. Ctrl-C, or an error in a replay, ends it and shows
-    the replays that were finished.
+    (--alphas); both are a usage error. --paper gives the lists of the paper, each unless you give
+    your own. For each method the output is that of `dengine replay`. umap-learn takes much longer
+    than the others. Ctrl-C, or an error in a replay, ends it and shows the replays that were
+    finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -632,9 +633,9 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
     """Return the sentences below the table of a cost curve: what a part costs under each policy.
 
     They say which policy was chosen, and how the choice depends on the prices. If there are any,
-    they also say how many recordings of the data set equal an earlier one sample by sample, which
-    policies were left behind because they were dearer in the first shuffles, and which were not
-    tried.
+    they also say how many recordings of the data set equal an earlier one (by `content_hash`),
+    which policies were left behind because they were dearer in the first shuffles, and which were
+    not tried.
     """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset

@@ -239,7 +239,9 @@ def _simulated_cell(
     from ..cells.simulation.conditions import CellParameters
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
-        """Return the simulated cell for this engine's store, and its name."""
+        """Return the simulated cell for this engine's store, and its name; SettingError for an
+        unknown scenario.
+        """
         store = engine.store
         # Another seed for a resumed run: the same parts again would be counted twice.
         seed = engine.seed + store.decisions.counts()["decisions"]
@@ -307,7 +309,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
     Raises
     ------
     SettingError
-        No host, a port that is no number, or an option that the recorder does not take.
+        No host, a port that is no number, or values that no trace can have. Also raised by the
+        function, for a trigger or a channel that cannot be used.
     CellError
         Raised by the function, when it makes the cell: the controller cannot be reached, or its
         program is not ready in time.
@@ -332,7 +335,8 @@ def host_and_port(address: str) -> tuple[str, int]:
     Raises
     ------
     SettingError
-        The port is not a number; whether it is in range is not checked.
+        The port is not a number, like in an IPv6 address; whether it is in range is not checked,
+        nor is the host.
     """
     from ..cells.ur.protocol import PORT
 

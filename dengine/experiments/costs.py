@@ -189,7 +189,7 @@ class CostCurve:
 
         It assumes that the shares of wrong decisions stay as they were seen, and counts different
         accepted parts, recordings, and parts of production. None if the verdict is another, or if
-        10,000 times as many recordings are too few.
+        10,000 times the parts of a shuffle are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -206,7 +206,9 @@ class CostCurve:
         ]
 
         def surplus(n_recordings: int) -> float:
-            """Return how far so many recordings like these bring the interval below the check."""
+            """Return how far so many recordings like these bring the interval below the check;
+            negative if it stays above.
+            """
             more = n_recordings / self.cycles
             bad, good = (
                 float(
@@ -532,7 +534,7 @@ def candidates(
     policy = contender.recipe.policy
 
     def levels(factors: Sequence[float]) -> Sequence[float]:
-        """Return levels of LB, the laxest first."""
+        """Return the user's levels of LB, or those of these factors, the laxest first."""
         tolerances = [factor * costs.worst_accept for factor in factors]
         allowed = [share for share in tolerances if share <= LARGEST_TOLERANCE]
         shares = allowed or [LARGEST_TOLERANCE]

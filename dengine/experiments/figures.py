@@ -85,7 +85,8 @@ def blank(width: float, height: float, title: str = "") -> Figure:
 
 
 def finish(axes: Axes, legend: int = 3, **settings: Any) -> None:
-    """Give axes a light grid, no box, and a legend above them, where it hides no curve.
+    """Give axes a light grid, no lines at the top and the right, and a legend above them, where it
+    hides no curve.
 
     Returns nothing; the axes are changed.
 
@@ -232,7 +233,7 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     Parameters
     ----------
     replays : sequence of Replay
-        All equally long.
+        At least one; all equally long.
     window : int, default 300
         Cycles in a window. At the first cycles, before there are so many, a window has all cycles
         so far.

@@ -431,7 +431,7 @@ def grid_tasks(
     Raises
     ------
     SettingError
-        Two contenders have the same name and policy, or a setting is out of range.
+        A recipe cannot be loaded, two have the same name and policy, or a setting is out of range.
     """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound", "guarantee")

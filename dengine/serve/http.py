@@ -310,7 +310,11 @@ class HttpApi:
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
-            """Start the retrain, record as an event who asked for it, and return what changed."""
+            """Release a pinned version, record an event, begin the retrain, and return what
+            changed.
+
+            If a retrain is under way, or waits until it can begin, nothing is done.
+            """
             if engine.state.is_retraining:
                 return Changed(
                     "retrain",

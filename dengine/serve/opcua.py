@@ -345,7 +345,9 @@ class AddressSpace:
 
         @wraps(call)
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
-            """Check the arguments, call, and return the results or a status code."""
+            """Check the arguments, call, and return the results; for an error write its text into
+            LastRefused, and return a bad status code.
+            """
             # Controllers send an empty text as null.
             texts = [ua.Variant("") if item.Value is None else item for item in variants]
             given = [_form(item.VariantType, isinstance(item.Value, list)) for item in texts]

@@ -289,8 +289,12 @@ class CellService:
         label = as_success(success)
 
         def work(engine: DataEngine) -> tuple[bool, RetrainReport | None]:
-            """Report unless the label is known; return whether it was, and the retrain that it set
-            off.
+            """Report unless the decision has this label; return whether it had, and the retrain
+            that was set off.
+
+            If the report contradicts the label, everything is flushed, and the label is looked at
+            once more. A new label with an author is recorded as an event. Raises the errors of
+            `CellService.report`.
             """
             stored = engine.find(decision_id)
             if stored is not None and stored.success is label:
