@@ -343,7 +343,7 @@ def _replay_and_print(
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
 
     After Ctrl-C or an error the finished replays are shown, if there are some. Then the process
-    ends with exit code 130, or the error is raised. Errors of the data set or the settings are
+    ends with exit code 130, or the error is raised. Errors of the data set or the policies are
     raised before anything is played.
 
     Parameters
@@ -558,7 +558,8 @@ def costs(
     everything is verified. Says how certain these costs are, and how to set the policy. If no
     policy pays or may pay, the choice is to verify everything, and the output names no policy to
     set. The policies that are tried have the guarantees pooled and cost, or values of LB, the
-    --lower-bound, around break-even, where accepting costs as much as verifying. One value
+    --lower-bound, around break-even, where accepting costs as much as verifying (or those of
+    --lower-bounds); a baseline or a rule of your own is tried without pooled and cost. One value
     (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
     seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
     replay, ends it and shows what was finished, if at least two shuffles are finished by every

@@ -125,13 +125,15 @@ def serve(
     retrains in a separate process. It runs until SIGTERM or Ctrl-C, which end it in order, with
     exit code 0: waiting requests are answered, and everything known is written. --shadow stays in
     force in the store, until `dengine policy STORE --shadow off`. --demo plays recorded parts as a
-    robot would, with a deadline of 5 s or more. It keeps them in a new --store, or without --store
-    forgets them at the end; one of both must be given. Without --token-file, programs on the same
-    machine need no token. Other machines reach it only with --host, which needs --token-file, and
-    should have --cert and --key. --samples, --rate-hz, --unit, --channels and --fit say what a
-    trace looks like. Without them a new store takes the shape of its first trace, and rate and unit
-    are unknown; with --robot, it takes 1000 samples at 500 Hz. With --deploy nothing is served:
-    examples are written, and that is all; a folder that holds something is refused.
+    robot would, with a deadline of 5 s or more, and without a recipe under conv with alpha 0.1, LB
+    90 % and 5 % of audits. It keeps them in a new --store, or without --store forgets them at the
+    end; one of both must be given. Without --token-file, programs on the same machine need no
+    token. Other machines reach it only with --host, which needs --token-file, and should have
+    --cert and --key. --samples, --rate-hz, --unit, --channels and --fit say what a trace looks
+    like; with --demo only --samples counts. Without them a new store takes the shape of its first
+    trace, and rate and unit are unknown; with --robot, it takes 1000 samples at 500 Hz. With
+    --deploy nothing is served: examples are written, and that is all; a folder that holds something
+    is refused.
     """
     if deploy is not None:
         from shutil import copytree

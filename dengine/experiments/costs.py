@@ -444,8 +444,9 @@ class PolicySearch:
         """Halve the number of policies in rounds, and let the last two play fresh shuffles.
 
         Fresh shuffles are those by which no policy was chosen. While more than two policies remain,
-        they play two shuffles, and the dearer half (of an odd number the larger half) is removed
-        from `remaining`, until two are left; policies that verified every part count as the
+        they play two shuffles (on the scores of one engine that checks every part, unless a
+        baseline plays; see `_play`), and the dearer half (of an odd number the larger half) is
+        removed from `remaining`, until two are left; policies that verified every part count as the
         dearest. Others are compared by their expected cost over all shuffles so far. The replays
         are kept in this object, and `curve` computes the result from them. Call this once.
 

@@ -260,8 +260,8 @@ class CellService:
         ----------
         decision_id : str
         success : bool or float
-            1 or True: good. The label that the decision has (also one that a correction gave it) is
-            no error.
+            1 or True: good. If the decision has this label already, also by a correction, nothing
+            is done.
         author : str
             The person who reports, for the event log. "": a machine's report, which is not recorded
             as an event. A repeated report is not recorded either.
@@ -279,9 +279,9 @@ class CellService:
             the one that the decision has, also if that was forgotten; but a line stop after a
             confirmation is no error and corrects the label.
         StoreError
-            If the label is not known to be on disk, the id cannot be looked up, or the engine is
-            closed: report it again. Also if only the event cannot be stored; it is then missing for
-            good.
+            If the label is not known to be on disk, or the id cannot be looked up: report it again.
+            Also if the engine is closed, and if only the event cannot be stored; it is then missing
+            for good.
         BusyError
             If the queue is full or the service is closing.
         """
