@@ -564,8 +564,8 @@ def _read_explanation(store: SqlStore, id_: str) -> Json:
     Beside the `Explanation` it has the decision's trace, the corrections of its label, the envelope
     (low, median, high; None without one), and the newest `N_BADS` traces of bad parts among the
     newest `N_LABELS` labels of cell and product (none if their shape differs). Raises what
-    `explain` raises, such as StoreError for a damaged trace; other damaged rows are left out, which
-    is an event.
+    `explain` raises, such as StoreError for a damaged trace; other damaged rows are left out, and
+    an event says so.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
