@@ -293,9 +293,9 @@ def iterate_replays(
     Raises
     ------
     SettingError
-        A baseline's library is missing: this is raised after the kept replays were yielded, and
-        before anything is played. A replay that cannot be played, see `replay`. With `keep` also
-        for a reducer that cannot be hashed.
+        A baseline that cannot be found or imported: this is raised after the kept replays were
+        yielded, and before anything is played. A replay that cannot be played, see `replay`. With
+        `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
     OutputError
