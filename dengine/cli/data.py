@@ -60,10 +60,11 @@ def data(
 
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
     .npz, .ts or .mcap. The subcommand shows the saved description or, without one, a proposal, in
-    which ? marks what you have to state with --set. While a ? is left, no recording is read, and
-    --check ends with exit code 1. Below, it shows what was read by the description, and drift.
-    --out draws the traces. Look at them, and write the description with --save, because every other
-    subcommand needs it to read the recordings.
+    which ? marks what you have to state with --set. While a ? is left, no recording is read, no
+    picture is drawn, and --check ends with exit code 1. Below, it shows what was read by the
+    description. --out draws the traces, and how they drift. Look at them, and write the description
+    with --save, because every other subcommand needs it to read the recordings; it replaces another
+    description only with --force.
 
     DATA may also be a source that needs no description: a bundled set, the file of a store, or an
     .npz file with X (traces, samples) and y (1 success, 0 failure).
@@ -131,10 +132,10 @@ def _print_open_keys(source: DataChoice, description: "Description", path: Path 
 def _survey_parts(dataset: "Dataset", survey: "Survey") -> Iterator[Any]:
     """Yield what `dengine data` prints of a data set and its survey: tables, and sentences.
 
-    These are the survey's counts with the first and last trace, the notes of the data set, the
-    drift over the tenths of the recorded order (or that the order is unknown), a sentence if many
-    traces nearly repeat another, and one if the tolerance of the default policy is too wide for
-    these parts. A sentence may be "".
+    These are the survey's counts with the first and last trace, the notes of the data set, a
+    sentence if the order of recording is unknown, one if more than 25 of the newest usable traces
+    nearly repeat another, and a warning if the tolerance of the default policy is too wide for
+    these parts, else "". The data set must have a trace.
     """
     from ..datasets.checks import tolerance_note
     from ..decision.policy import Policy
@@ -162,7 +163,8 @@ def _save(
 ) -> Path | None:
     """Write the description if `--save` asks for it, and return its path; else None.
 
-    It replaces another one only with `--force`; else that is an OutputError.
+    It replaces another one only with `--force`. Raises OutputError without it, and if the file
+    cannot be written.
     """
     return description.save(source.path, bool(context.params.get("force"))) if save else None
 
@@ -245,11 +247,11 @@ def train(
     Each trace counts once, however often its file is imported. A bad trace (not finite, constant)
     is stored, but never trained on. A store that has been used has its own recipe and seed: leave
     these options out, because other values are refused. Recordings are brought to the length of the
-    store's traces. If no label is new and the version in force lacks no training step, nothing is
-    trained. If training needs more time than the recipe's time budget, several retrains follow each
-    other. The exit code is 1 if a new version is dropped, or if training steps are missing at the
-    end, because several retrains in a row had no time for a single step. If steps are missing, and
-    after Ctrl-C, which keeps what was imported, the same command continues there.
+    store's traces. If there is a version, no label is new to it, and it lacks no training step,
+    nothing is trained. If training needs more time than the recipe's time budget, several retrains
+    follow each other. The exit code is 1 if a new version is dropped, or if training steps are
+    missing at the end, because ten retrains in a row had no time for a single step. If steps are
+    missing, and after Ctrl-C, which keeps what was imported, the same command continues there.
     """
     from ..datasets.importing import import_labelled, in_form_of
     from ..engine.engine import DataEngine

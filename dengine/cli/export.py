@@ -70,7 +70,8 @@ def export(
     and the exit code is 1. STORE needs --out, and --out needs STORE; --make-key and --cpp need
     neither. If --make-key is given together with STORE and --out, the new key also signs FILE; so
     --key and --make-key exclude each other. Whoever has the key can check an exported file, and can
-    also sign one. The output names the files, the version and its number of references.
+    also sign one. The output names the files, the version and its number of references. The key
+    comes first, then the sources, then FILE; if one of them fails, what was written before stays.
     """
     if (store is None) is not (out is None) or not (store or new_key or cpp):
         raise click.UsageError(

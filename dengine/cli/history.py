@@ -52,7 +52,8 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
         """Return the time in seconds since 1970; a usage error for a text that is no time.
 
         "30m" is 30 minutes before now (likewise s, h and d); otherwise the text is a date, with or
-        without a time, in ISO 8601, which is in UTC if it has no offset.
+        without a time, in ISO 8601, which is in UTC if it has no offset. A date alone is its
+        midnight.
         """
         ago = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", value)
         if ago:
@@ -101,11 +102,11 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
     STORE is the file or URL of an engine's store, and must exist. The options choose which
-    decisions; --events adds the retrains and events since the first of these decisions, or since
-    --since, and before --until. In the table good and bad are the labels that were counted, bound
-    is the interval of the success rate that follows from them, v is the version of the model, and
-    label is what the part turned out to be. If no decision fits, a sentence says so. `dengine
-    explain` tells more about one decision.
+    decisions; --events adds the retrains and events since the first of these decisions (if no
+    decision fits, all), or since --since, and before --until. In the table good and bad are the
+    labels that were counted, bound is the interval of the success rate that follows from them, v is
+    the version of the model, and label is what the part turned out to be. If there is nothing to
+    list, a sentence says so. `dengine explain` tells more about one decision.
     """
     from ..history.status import history as read_history
     from ..representation import to_jsonable
@@ -178,8 +179,8 @@ def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> s
     """Return a table of decisions as text, in the order of the items.
 
     It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
-    Retrains and events are lines between its rows, cut to 119 characters. Without any item the text
-    is a sentence that says so.
+    Retrains and events are lines between its rows, cut to 119 characters; the rows are not cut.
+    Without any item the text is a sentence that says so.
     """
     from ..store.records import StoredDecision
 
@@ -235,9 +236,10 @@ def explain(store: str, decision: str, neighbours: int, out: Out | None) -> None
     The decision is named by its id, as `dengine history STORE` lists it, by its part's number, or
     by the word last, for the newest. If a part has several decisions that are no rejects, its
     number is refused with exit code 1; the message has their ids. A decision that is not in the
-    store is refused, too. Counts, bound and action are shown as they were recorded. Neighbours are
-    searched again with the version that decided, if the store still has it. The picture of --out
-    shows the trace with its neighbours and with the band that holds 95 % of the known successes.
+    store is refused, too, and so is one whose trace, or a neighbour's, is damaged. Counts, bound
+    and action are shown as they were recorded. Neighbours are searched again with the version that
+    decided, if the store still has it. The picture of --out shows the trace with its neighbours and
+    with the band that holds 95 % of the known successes.
     """
     from ..errors import ReportError
     from ..experiments.figures import explained_picture
@@ -279,7 +281,7 @@ def _explanation_rows(explanation: Explanation) -> Iterator[tuple[str, str]]:
     They say when the decision was made and by which version, on which part (if it has a number),
     and why. Then come the notes on what was computed again, and the share of samples that leave the
     envelope, the band of the known successes; or a sentence that there are too few successes for an
-    envelope. Of several sentences only the first has a title.
+    envelope. Of several sentences, or notes, only the first has a title.
     """
     decision = explanation.decision.decision
     version = decision.model_version

@@ -278,8 +278,9 @@ class RecipeChoice:
         Raises
         ------
         SettingError
-            The recipe or its reducer is not found, or a setting is out of range. This is checked
-            here, before a store is created; a reducer of the user's own is imported for that.
+            The recipe or its reducer is not found or cannot be read, or a setting is out of range.
+            This is checked here, before a store is created; a reducer of the user's own, given as
+            module:Class, is imported for that, but a rule of the user's own is not.
         """
         from ..recipe import Recipe
         from ..reducers import REDUCERS, reducer_class
@@ -302,8 +303,8 @@ class RecipeChoice:
         """Return who plays a replay: a `Contender`, which is a recipe or a baseline with its name.
 
         It is the baseline if the name is that of a baseline, and otherwise the recipe that `load`
-        returns. Both get the settings that were given. Without a name it is the recipe conv. Raises
-        SettingError like `load`.
+        returns. Both get the settings that were given. Without a name it is the recipe conv. A
+        recipe's name is shortened, as `short_name` does. Raises SettingError like `load`.
         """
         from ..experiments.replay import Contender
 
@@ -450,13 +451,15 @@ class DataChoice:
         ----------
         propose : bool
             If no description is given or saved: True proposes one, in which `?` marks what is open;
-            False raises DataError.
+            False raises DataError, whose message says what to type.
 
         Raises
         ------
         DataError
             If the source does not exist or is damaged, or its description cannot be read or
             proposed.
+        SettingError
+            If none was saved, and a stated `windows.trigger` is malformed.
         """
         from ..datasets.loading import description_of, own_reader
 
@@ -470,8 +473,9 @@ class DataChoice:
 
         Its notes, and the first three recordings that were left out, are printed to stderr, but not
         with `--json`. `description` is the description to read by; None takes the one that
-        `describe` returns. Raises DataError if the data set cannot be read, or if a description is
-        needed and none is saved.
+        `describe` returns. Raises the errors of `load_dataset`: DataError if the data set cannot be
+        read, if a description is needed and none is saved, or if it has a `?`; SettingError for a
+        malformed trigger; StoreError for a store that cannot be opened.
         """
         from ..datasets import load_dataset
         from ..datasets.loading import count_files
@@ -654,7 +658,8 @@ def recorder_settings(options: Options) -> tuple[dict[str, Any], TraceSpec]:
 def trace_spec_from(options: Options) -> TraceSpec | None:
     """Return the `TraceSpec` that the options in `TRACE` state of live traces, those of a cell.
 
-    If `--channels` is one number, this is the number of channels; otherwise it has their names.
+    If `--channels` is one whole number, this is the number of channels; otherwise it has their
+    names. Without it there is one channel.
 
     Parameters
     ----------
@@ -753,12 +758,13 @@ def out_option(
     The subcommand gets both as its argument `out`, an `Out`; it is None without `--out`. `names`
     are the files that the subcommand will write into the folder `--out`; the name "" is `--out`
     itself. Before the subcommand begins, OutputError is raised if one of them must not be written,
-    for example because it exists and there is no `--force`, so that no work is lost. `kind` is the
-    type of the path, and `text` the help of `--out`.
+    for example because it exists and there is no `--force`, so that no work is lost. Files that are
+    not named are only checked when they are written. `kind` is the type of the path, and `text` the
+    help of `--out`.
     """
 
     def make_out(out: Path | None, force: bool) -> Out | None:
-        """Check the files, and return the `Out`."""
+        """Return the `Out`, None without `--out`; OutputError if a file must not be written."""
         from ..files import check_output
 
         if out is None:

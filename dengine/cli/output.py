@@ -91,7 +91,8 @@ class Out:
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
         """Write files into the folder `path`, and a manifest that lists them; return their paths.
 
-        The folder is created if it is missing. If the file is `path` itself, there is no manifest.
+        The folder is created if it is missing. If one of the files is `path` itself, there is no
+        manifest.
 
         Parameters
         ----------
@@ -106,8 +107,8 @@ class Out:
         Raises
         ------
         OutputError
-            A file exists and `force` is not set, or it cannot be written. The files before it in
-            `contents` are written already.
+            A file exists and `force` is not set, it cannot be written, or no format of figures has
+            its suffix. The files before it in `contents` are written already.
         """
         from matplotlib.figure import Figure
 
@@ -138,8 +139,9 @@ def print_result(
     Parameters
     ----------
     record : mapping
-        The JSON document, which `--json` prints alone. The subcommand's name, as "verb", and the
-        paths of the files are added to it, in a copy.
+        The JSON document, which `--json` prints alone. The subcommand's name, as "verb", and, with
+        `make_files`, the paths of the files that were written, as "files", are added to it, in a
+        copy.
     *parts : str or rich.Table
         What is printed without `--json`. A line for each file that was written follows.
     out : Out or None
@@ -151,7 +153,8 @@ def print_result(
     ------
     DengineError
         `make_files` raised it, or a file could not be written. It is raised after the result was
-        printed, so that what was computed is not lost.
+        printed, so that what was computed is not lost; any other exception of `make_files` is
+        raised before.
     """
     files: list[Path] = []
     refusal: DengineError | None = None
@@ -179,7 +182,7 @@ def print_parts(*parts: Any) -> None:
 
     `table_of_rows` masks them in its tables. Tables and texts fit the terminal, or 80 columns if
     there is none. A text of one line is wrapped between words, which keeps long paths whole. A text
-    of several lines is printed as it is.
+    of several lines is printed as it is, and "" as an empty line.
     """
     from rich.console import Console
 
@@ -251,8 +254,17 @@ def format_value(name: str, value: Any) -> str:
     value : object
         A number, a text, a dataclass, or a mapping, list or tuple of these. None, NaN and "" give
         "-", a bool "yes" or "no". A dataclass gives its own `str`, or else its fields with their
-        headings. Of a mapping only the items that are not 0 are shown; if there are none, the text
-        is "none". Items are joined by commas. Passwords of database URLs in a text are masked.
+        headings, of which those that are None or empty are left out. Of a mapping only the items
+        that are not 0 are shown, each after its key, which is its name; if there are none, the text
+        is "none". Items are joined by commas; those of `prices` have titles (`TUPLE_TITLES`); an
+        empty list or tuple gives "". A number whose name has no known ending has 4 significant
+        digits, or is whole if it is a whole number, with commas between thousands. Passwords of
+        database URLs in a text are masked.
+
+    Raises
+    ------
+    ValueError
+        For `prices` with another number of items than three.
     """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"
@@ -373,9 +385,9 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
 def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Write a line on the progress to stderr every `LINE_SECONDS` while the block runs.
 
-    A thread writes the lines: `label`, the number of steps done of `total` ("?" if it is None), and
-    the time so far. The function that is yielded, `advance(n)`, adds n steps and writes nothing
-    itself.
+    A thread writes the lines: `label`, the number of steps done of `total` ("?" if it is None or
+    0), and the time so far. The function that is yielded, `advance(n)`, adds n steps and writes
+    nothing itself.
     """
     n_steps = 0
     ended = Event()
@@ -386,7 +398,7 @@ def _progress_lines(label: str, total: int | None) -> Iterator[Callable[[int], N
         n_steps += n
 
     def write_lines() -> None:
-        """Write until the block ends."""
+        """Write a line every `LINE_SECONDS` until the block ends."""
         begin = time.monotonic()
         while not ended.wait(LINE_SECONDS):
             seconds = format_duration(time.monotonic() - begin)
@@ -408,10 +420,11 @@ class StepInterruptedError(Exception):
 def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show a progress bar, and let Ctrl-C or SIGTERM end the work between two steps.
 
-    It replaces the handlers of these signals until the block ends. The first signal makes the next
-    call of `count` raise StepInterruptedError; if no call follows, the signal has no effect. A
-    second signal acts at once, as it would have without this block. It must be used in the main
-    thread, because Python allows signal handlers only there.
+    It replaces the handlers of these signals, and of Ctrl-Break on Windows, until the block ends.
+    The first signal makes the next call of `count` raise StepInterruptedError; if no call follows,
+    the signal has no effect. A second signal of the same kind acts at once, as it would have
+    without this block; one of another kind is only remembered, too. It must be used in the main
+    thread, because Python allows signal handlers only there; elsewhere ValueError is raised.
 
     Parameters
     ----------
@@ -423,8 +436,8 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
     Yields
     ------
     count : callable
-        `count(n)` records n finished steps, moves the bar, and raises StepInterruptedError if a
-        signal has arrived.
+        `count(n)` records n finished steps, moves the bar, and, if a signal has arrived, raises
+        StepInterruptedError, whose argument is the number of finished steps.
     """
     from ..serve.retraining import END_SIGNALS
 
@@ -433,7 +446,7 @@ def interruptible_steps(label: str, total: int) -> Iterator[Callable[[int], None
     previous = {number: signal.getsignal(number) for number in END_SIGNALS}
 
     def interrupt(number: int, frame: FrameType | None) -> None:
-        """Remember the signal, and restore the handler that a second one finds."""
+        """Remember the signal, and restore the earlier handler for a second signal of its kind."""
         nonlocal interrupted
         interrupted = True
         signal.signal(number, previous[signal.Signals(number)])

@@ -101,10 +101,11 @@ class PlayedTasks(NamedTuple):
 def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
     """Play tasks, each a replay to be played, with a progress bar; return what was finished.
 
-    That is the finished replays in the order of their tasks, and the time they took. Of `stream`
-    the cycles, the number of processes and the folder of kept replays are used. Ctrl-C or an error
-    ends the work and is not raised: the replays that were finished until then are returned, with
-    the error, which the caller must pass to `_end`.
+    That is the finished replays in the order of their tasks, and the time they took; kept replays
+    count with the time of the run that played them. Of `stream` the cycles, the number of processes
+    and the folder of kept replays are used. Ctrl-C or an error ends the work and is not raised: the
+    replays that were finished until then are returned, with the error, which the caller must pass
+    to `_end`.
     """
     from ..experiments.grid import iterate_replays
 
@@ -133,7 +134,8 @@ def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Play
 
 
 def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
-    """End the subcommand if an error or Ctrl-C interrupted its replays; nothing if `error` is None.
+    """End the subcommand if an error or Ctrl-C interrupted its replays; do nothing if `error` is
+    None.
 
     `text` says which replays are shown. After Ctrl-C it is printed to stderr, and the exit code is
     130. Any other error is raised; before, `text` is printed to stderr if `is_shown`.
@@ -168,7 +170,7 @@ def stream_options(repeats: int, least: int, n_jobs: int, text: str) -> Callable
     """
 
     def make_stream(repeats: int, seed: int, in_order: bool = False, **settings: Any) -> Stream:
-        """Return the stream; a usage error if `--repeats` is given beside `--in-order`."""
+        """Return the stream; in order it has one seed, and a given `--repeats` is a usage error."""
         if in_order:
             source = click.get_current_context().get_parameter_source("repeats")
             if source is not ParameterSource.DEFAULT:
@@ -293,9 +295,10 @@ def compare(
 
     Methods are reducers and baselines, each with a name of its own. They are played under one
     policy or a grid of policies: give a setting either as one value (--alpha) or as a list to try
-    (--alphas); both are a usage error. For each method the output is that of `dengine replay`.
-    umap-learn takes much longer than the others. Ctrl-C, or an error in a replay, ends it and shows
-    the replays that were finished.
+    (--alphas); both are a usage error. --paper gives the lists of the paper, each unless you give
+    your own. For each method the output is that of `dengine replay`. umap-learn takes much longer
+    than the others. Ctrl-C, or an error in a replay, ends it and shows the replays that were
+    finished.
     """
     short_names = [short_name(name) for name in names]
     if len(set(short_names)) < len(short_names):
@@ -340,7 +343,8 @@ def _replay_and_print(
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
 
     After Ctrl-C or an error the finished replays are shown, if there are some. Then the process
-    ends with exit code 130, or the error is raised.
+    ends with exit code 130, or the error is raised. Errors of the data set or the policies are
+    raised before anything is played.
 
     Parameters
     ----------
@@ -421,9 +425,9 @@ def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> st
     """Return the title of tables and pictures.
 
     It names the recipes and baselines (the keys of `by_name`), the data set, the order of the parts
-    (recorded if `in_order`, else shuffled), the number of replays of each, and the number of
-    cycles. The bundled data set is called "simulated insertions". There must be at least one
-    replay.
+    (recorded if `in_order`, else shuffled), the number of seeds that each played, and the number of
+    cycles, of the first replay. The bundled data set is called "simulated insertions". There must
+    be at least one replay.
     """
     counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
     n_cycles = len(next(iter(by_name.values()))[0])
@@ -554,10 +558,12 @@ def costs(
     everything is verified. Says how certain these costs are, and how to set the policy. If no
     policy pays or may pay, the choice is to verify everything, and the output names no policy to
     set. The policies that are tried have the guarantees pooled and cost, or values of LB, the
-    --lower-bound, around break-even, where accepting costs as much as verifying. One value
+    --lower-bound, around break-even, where accepting costs as much as verifying (or those of
+    --lower-bounds); a baseline or a rule of your own is tried without pooled and cost. One value
     (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
     seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
-    replay, ends it and shows what was finished, if at least two shuffles are finished.
+    replay, ends it and shows what was finished, if at least two shuffles are finished by every
+    policy that is left.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
     from ..experiments.costs import PolicySearch, settings_of
@@ -628,8 +634,9 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
     """Return the sentences below the table of a cost curve: what a part costs under each policy.
 
     They say which policy was chosen, and how the choice depends on the prices. If there are any,
-    they also say how many recordings of the data set repeat another, which policies were left
-    behind because they were dearer in the first shuffles, and which were not tried.
+    they also say how many recordings of the data set equal an earlier one (by `content_hash`),
+    which policies were left behind because they were dearer in the first shuffles, and which were
+    not tried.
     """
     from ..experiments.costs import policy_name
     from ..experiments.survey import survey_dataset

@@ -121,8 +121,9 @@ def run(
     known ones, the engine enters safe mode: parts are verified until new outcomes allow decisions
     again. --shadow stays in force in the store, until `dengine policy STORE --shadow off`. At the
     end a table shows what was decided, what was wrong and what was saved. Ctrl-C or SIGTERM ends
-    the run after the current cycle and shows what was done; a second one ends it at once. If the
-    cell fails, what was done is shown, too, and the exit code is 1.
+    the run after the current cycle, and a second Ctrl-C at once; what was done is shown, and the
+    exit code is 130. A second SIGTERM ends the process, and nothing is shown. If the cell fails,
+    what was done is shown, too, and the exit code is 1.
     """
     if kind == "simulated":
         options.require_modules("the simulated cell", "sim", "mujoco")
@@ -183,8 +184,9 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
     """Let the engine drive the cell with a progress bar named `name`, and return what was done.
 
     It ends after `cycles` parts, or after the current one at Ctrl-C or SIGTERM; a second Ctrl-C
-    ends it at once. If the cell fails, its CellError is returned and not raised; other errors are
-    raised. When safe mode begins or ends, a line is printed to stderr, unless `--json`.
+    ends it at once, without its last cycle, and a second SIGTERM ends the process. If the cell
+    fails, its CellError is returned and not raised; other errors are raised. When safe mode begins
+    or ends, a line is printed to stderr, unless `--json`.
     """
     from ..experiments.replay import ObservedCycle, observe_cycles, to_replay
 
@@ -230,14 +232,16 @@ def _simulated_cell(
     The `TraceSpec` has what the options of `source` state; the rest is the simulation's own. The
     cell's seed depends on the number of decisions in the store, and in a product also on the cell,
     so that no part comes twice. A verification takes `check_seconds` of simulated time. `scenario`
-    says what changes in the course of the `cycles`. `others` are settings of other kinds of cell,
-    and are ignored.
+    says what changes in the course of the `cycles`; for an unknown one SettingError is raised when
+    the cell is made. `others` are settings of other kinds of cell, and are ignored.
     """
     from ..cells.simulation.cell import SimulatedCell
     from ..cells.simulation.conditions import CellParameters
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
-        """Return the simulated cell for this engine's store, and its name."""
+        """Return the simulated cell for this engine's store, and its name; SettingError for an
+        unknown scenario.
+        """
         store = engine.store
         # Another seed for a resumed run: the same parts again would be counted twice.
         seed = engine.seed + store.decisions.counts()["decisions"]
@@ -257,10 +261,10 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of a recording, and a function that makes a cell which plays it.
 
     The recording is the data set of `source`, and is loaded at once. The cell begins after the last
-    part that was played before. A part was played before if its trace has a label of this cell in
-    the store, or if it is this cell's newest accepted part without a report. Making the cell raises
-    SettingError if fewer parts than `cycles` are left. `others` are settings of other kinds of
-    cell, and are ignored. Raises DataError if the recording cannot be read.
+    part that was played before. A part was played before if its trace equals one that has a label
+    of this cell in the store (but none that was forgotten or quarantined), or that of this cell's
+    newest accepted part without a report. Making the cell raises SettingError if fewer parts than
+    `cycles` are left. `others` are ignored. Raises the errors of `DataChoice.load`.
     """
     import numpy as np
 
@@ -305,7 +309,8 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
     Raises
     ------
     SettingError
-        No host, a port that is no number, or an option that the recorder does not take.
+        No host, a port that is no number, or values that no trace can have. Also raised by the
+        function, for a trigger or a channel that cannot be used.
     CellError
         Raised by the function, when it makes the cell: the controller cannot be reached, or its
         program is not ready in time.
@@ -330,7 +335,8 @@ def host_and_port(address: str) -> tuple[str, int]:
     Raises
     ------
     SettingError
-        The port is not a number; whether it is in range is not checked.
+        The port is not a number, like in an IPv6 address; whether it is in range is not checked,
+        nor is the host.
     """
     from ..cells.ur.protocol import PORT
 
@@ -367,11 +373,11 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
     """Print the result of a run: a table of stretches, the cell's own report, and sentences.
 
     A stretch is a number of consecutive cycles. The cell's own report is shown if the cell has a
-    method `report`. The sentences say how much time was saved, how the retrains went, when safe
-    mode began and ended, and what the certificate is. `record` has the title, the duration of a
-    check, the changes of safe mode and the certificate; the counts are added to it, in place, and
-    `--json` prints it in place of all that. run.csv and run.png are written to `out`, if it is
-    given.
+    method `report`. The sentences say how much time was saved (the checks left out, less 120 s for
+    each line stop and 47.5 s for each rejected good part), how the retrains went, when safe mode
+    began and ended, and what the certificate is. The counts are added to `record`, which has the
+    rest, in place, and `--json` prints it in place of all that. run.csv and run.png are written to
+    `out`, if it is given; OutputError, if that fails, is raised after the printing.
     """
     from ..experiments.figures import curves
     from ..experiments.metrics import Costs

@@ -121,16 +121,19 @@ def serve(
 ) -> None:
     """Answer robots, controllers and people.
 
-    Continues with its store, or starts a new one, and retrains in a separate process. It runs until
-    SIGTERM or Ctrl-C, which end it in order, with exit code 0: waiting requests are answered, and
-    everything known is written. --shadow stays in force in the store, until `dengine policy STORE
-    --shadow off`. --demo plays recorded parts as a robot would, with a deadline of 5 s or more. It
-    keeps them in a new --store, or without --store forgets them at the end; one of both must be
-    given. Without --token-file, programs on the same machine need no token. Other machines reach it
-    only with --host, which needs --token-file, and should have --cert and --key. --samples,
-    --rate-hz, --unit, --channels and --fit say what a trace looks like. Without them a new store
-    takes the shape of its first trace, and rate and unit are unknown; with --robot, it takes 1000
-    samples at 500 Hz. With --deploy nothing is served: examples are written, and that is all.
+    Continues with its store, which must have the settings that are given, or starts a new one, and
+    retrains in a separate process. It runs until SIGTERM or Ctrl-C, which end it in order, with
+    exit code 0: waiting requests are answered, and everything known is written. --shadow stays in
+    force in the store, until `dengine policy STORE --shadow off`. --demo plays recorded parts as a
+    robot would, with a deadline of 5 s or more, and without a recipe under conv with alpha 0.1, LB
+    90 % and 5 % of audits. It keeps them in a new --store, or without --store forgets them at the
+    end; one of both must be given. Without --token-file, programs on the same machine need no
+    token. Other machines reach it only with --host, which needs --token-file, and should have
+    --cert and --key. --samples, --rate-hz, --unit, --channels and --fit say what a trace looks
+    like; with --demo only --samples counts. Without them a new store takes the shape of its first
+    trace, and rate and unit are unknown; with --robot, it takes 1000 samples at 500 Hz. With
+    --deploy nothing is served: examples are written, and that is all; a folder that holds something
+    is refused.
     """
     if deploy is not None:
         from shutil import copytree
@@ -196,8 +199,9 @@ def _open_engine(
 
     The engine trains in `executor`, and logs when safe mode begins or ends. If `shadow` is True,
     shadow mode is turned on, and stays on in the store. `seed` is the seed of a new store's engine,
-    None for 0; `settings` are further arguments of `DataEngine.open_or_create`. Raises what that
-    raises.
+    None for that of a peer or 0; a used store must have the same one, if it is given. `settings`
+    are further arguments of `DataEngine.open_or_create`. Raises what that raises, and StoreError if
+    turning on shadow mode fails.
     """
     from ..engine.engine import DataEngine
     from ..serve.server import log_safe_mode

@@ -71,8 +71,9 @@ def _change_and_print(
     `change` returns a `Changed`, whose text is printed after the engine was closed, with the number
     of the event; the text may say that nothing changed. With `--json` a document is printed
     instead, which also has the policy and the certificate after the change. `allow_import` permits
-    to import the reducer or rule, module:Class, that the store names. Raises StoreError if an
-    engine runs on the cell, and whatever `change` raises.
+    to import the reducer or rule, module:Class, that the store names. Raises the errors of
+    `DataEngine.open` (StoreError if an engine runs on the cell), those of `certificate`, and
+    whatever `change` raises.
     """
     from ..engine.engine import DataEngine
     from ..store.opening import LONG_WAIT
@@ -100,11 +101,11 @@ def report(part: str, label: str, **changing: Any) -> None:
     Name the part by its number, or by the id of its decision. The number is enough if the part has
     one decision, or one that is no reject; otherwise it is refused, and so is a part that is not in
     the store. For an accepted part, bad is a line stop, and good a confirmation. For a rejected
-    part the label is that of an inspection, and the engine trains on it. An event records the
-    report. The same label again changes nothing. Another label than the reported one is refused
-    with exit code 1, unless it is a line stop; `dengine correct` puts a wrong label right. The
-    subcommand is refused while an engine runs on the cell. A store that names a reducer or rule of
-    your own, module:Class, needs --allow-import.
+    part the label is that of an inspection: the engine trains on it, and the rule does not learn
+    it. An event records the report. The same label again changes nothing. Another label than the
+    reported one is refused with exit code 1, unless it is a line stop; `dengine correct` puts a
+    wrong label right. The subcommand is refused while an engine runs on the cell. A store that
+    names a reducer or rule of your own, module:Class, needs --allow-import.
     """
     from ..engine.corrections import Changed
     from ..history.explain import find_decision_id
@@ -159,9 +160,9 @@ def forget(decisions: tuple[str, ...], reason: str, **changing: Any) -> None:
     """Leave labels out of everything that is learned and counted.
 
     Nothing is deleted: traces and labels stay in the store, and `dengine correct` brings a label
-    back. If one of the decisions is unknown or has no label, none is forgotten. A pinned version
-    that was trained with one of them is released. The subcommand is refused while an engine runs on
-    the cell.
+    back. If one of the decisions is unknown or has no label, none is forgotten, and the exit code
+    is 1. A pinned version that was trained with one of them is released. The subcommand is refused
+    while an engine runs on the cell.
     """
     _change_and_print(
         lambda engine, author: engine.forget(*decisions, author=author, reason=reason), **changing
@@ -204,12 +205,13 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
     """Show the policy in force, or change it.
 
     Without options it is shown, even while an engine runs on the cell; a change is refused then. A
-    change is recorded as an event. A setting that is not given stays as it is. Earlier decisions
-    keep their bounds. The certificate starts again after any change. The rule also forgets what it
-    learned, after a change of --alpha, --lower-bound, --interval, --guarantee, --stops or --prices,
-    and with some guarantees of --audit-rate: a tolerance that is chosen after the data was seen
-    needs fresh evidence. Shadow mode lasts over restarts; `dengine status` counts what the model
-    would have done, and how much of it was wrong.
+    change is recorded as an event. A setting that is not given stays as it is, but --prices alone
+    also change the guarantee local or pooled to cost, and an audit rate of 0 to 0.05. Earlier
+    decisions keep their bounds. The certificate starts again after any change. The rule also
+    forgets what it learned, after a change of --alpha, --lower-bound, --interval, --guarantee,
+    --stops or --prices, and with some guarantees of --audit-rate: a tolerance that is chosen after
+    the data was seen needs fresh evidence. Shadow mode lasts over restarts; `dengine status` counts
+    what the model would have done, and how much of it was wrong.
     """
     if settings:
         _change_and_print(
@@ -235,11 +237,12 @@ def policy(store: str, settings: dict[str, Any], author: str, allow_import: bool
 def retrain(store: str, author: str, allow_import: bool) -> None:
     """Train now, on the store's labels with all corrections.
 
-    An event records it. The new version replaces a pinned one, too. If the recipe's time budget
-    ends before the training does, the output says how many steps are to go, and the next retrain
-    continues. If the training fails or has no label to train on, or the new version fails its
-    tests, it is dropped, the previous version stays in use, and the exit code is 1. The subcommand
-    is refused while an engine runs on the cell.
+    An event records it, also if the version is dropped. The new version replaces a pinned one, too;
+    a pinned version is released first. If the recipe's time budget ends before the training does,
+    the output says how many steps are to go, and the next retrain continues. If the training fails
+    or has no label to train on, or the new version fails its tests, it is dropped, the previous
+    version stays in use, and the exit code is 1. The subcommand is refused while an engine runs on
+    the cell.
     """
     from ..engine.engine import DataEngine
     from ..experiments.tables import retrain_line
@@ -293,7 +296,8 @@ def verify(
 
     Every row is compared with its checksum, and every entry of the ledger, a chain of digests over
     the rows, with its rows. The subcommand lists rows that were changed, that are missing or that
-    are in no entry, and data that was lost, at most 20. If there are any, the exit code is 1. The
+    are in no entry, damaged or missing records of a journal, data that was lost, and a --expect
+    that the history does not hold, at most 20 in all. If there are any, the exit code is 1. The
     subcommand writes only with --acknowledge, after which it checks again, and engines may run
     meanwhile.
     """
@@ -316,8 +320,9 @@ def verify(
 def _verification_lines(report: HistoryReport) -> list[str]:
     """Return the lines that say what a check of a store's history found.
 
-    For each cell they say how many entries and rows it has, its newest digest, and what is known of
-    its journal. Then come the faults, at most 20, and whether everything is as it was written.
+    For each cell they say how many entries and rows it has, its newest digest, and that its journal
+    is missing or holds records, if so. Then come the differences that it found (`report.faults`),
+    at most 20, how many more there are, and whether everything is as it was written.
     """
     lines = []
     for cell in report.cells:
@@ -367,8 +372,8 @@ def backup(store: str, out: Path) -> None:
 
     The copy is one file with all cells and with the contents of the journals that lie beside the
     store, which a plain copy of the file lacks. It can be opened, and checked by `dengine verify`,
-    wherever it is. A store in PostgreSQL is refused (pg_dump copies it), and so is an --out that
-    exists.
+    wherever it is. A store in PostgreSQL is refused (pg_dump copies it), and so are an --out that
+    exists and a journal that cannot be read.
     """
     from ..store.backup import backup_store
 
@@ -398,10 +403,13 @@ def restore(copy: str, store: Path) -> None:
     """Put a backup in the place of a store.
 
     COPY is what `dengine backup` wrote, on this or another machine. It is checked first; if it is
-    not as it was written, or --store exists, it is refused with exit code 1. Beside --store each
-    cell gets a journal. It names the newest entry of the cell's ledger, by which the next engine
-    sees that the store is complete. A journal that is there already stays, and that engine takes
-    from it what the copy lacks.
+    not as it was written, its ledger has another key than the file that DENGINE_LEDGER_KEY names,
+    or --store exists, it is refused with exit code 1. Beside --store each cell gets a journal. It
+    names the newest entry of the cell's ledger, by which the next engine sees that the store is
+    complete. A journal that is there already stays, and that engine takes from it what the copy
+    lacks; if the journal names entries that the copy lacks, it raises an alarm. Records of journals
+    beside COPY are added to the store. If a journal cannot be made, the exit code is 1, and the
+    store stays.
     """
     from ..store.backup import restore_store
 
@@ -429,8 +437,8 @@ def import_labels(journal: Path, store: str, any_model: bool) -> None:
     JOURNAL is the CSV file that the program wrote. Each line counts once, however often it is
     imported. If a line was changed or is missing, the lines before it are imported, the others are
     not, and the exit code is 1. A file that is no journal, has no accepted or labelled part, has a
-    line that cannot be read, or belongs to another model (unless --any-model) is refused as a
-    whole. The subcommand is refused while an engine runs on the cell.
+    line that cannot be read, or belongs to another model (unless --any-model, or the store records
+    no export) is refused as a whole. The subcommand is refused while an engine runs on the cell.
     """
     from ..export.cell_journal import import_journal
 

@@ -87,6 +87,11 @@ class Baseline(ABC):
             Traces.
         y : array, shape (n,)
             1 is success, any other value failure.
+
+        Raises
+        ------
+        TraceError
+            For traces of another shape, or values that are no real numbers.
         """
         traces = as_traces(X)
         good = np.asarray(y) == 1
@@ -98,6 +103,7 @@ class Baseline(ABC):
         """Learn one trace `x` (C, T) with its label `y`, 1 for success, and return self.
 
         Nothing is learned before a training has succeeded, or if the method learns only in `fit`.
+        Raises TraceError for values that are no trace.
         """
         self._last = None
         if self.is_trained:
@@ -126,7 +132,8 @@ class Baseline(ABC):
 
         It is ACCEPT if the lower bound of the success probability is at least the accept threshold,
         REJECT if the upper bound is at most the reject threshold, and otherwise VERIFY. The
-        attribute `thresholds` has both; if it is None, they are LB and 1 - LB.
+        attribute `thresholds` has both; if it is None, they are LB and 1 - LB. Raises TraceError
+        like `predict`.
         """
         from ..decision.rule import action_of
 
@@ -145,6 +152,7 @@ class Baseline(ABC):
         The last result is cached: it is returned again for the same traces until the next `fit` or
         `add`. Before a training has succeeded, all bounds are 0 and 1. A baseline that counts no
         labels returns the integer 0, and no array, for both counts; so does an untrained one.
+        Raises TraceError for traces of another shape.
         """
         traces = as_traces(X)
         key = traces.shape, traces.tobytes()
@@ -260,8 +268,8 @@ class AgreeingNeighbours(Baseline):
     def _predict(self, X: Traces) -> BaselinePrediction:
         """Return the share of successes among the k nearest labelled traces as both bounds.
 
-        The counts are the numbers of successes and failures among the k. X has shape (n, C, T), and
-        all four arrays (n,).
+        The counts are the numbers of successes and failures among the k. Of traces at the same
+        distance any may be taken. X has shape (n, C, T), and all four arrays (n,).
         """
         distances = self._references.squared_distances(_rows(X))
         nearest = np.argpartition(distances, self.k - 1, axis=1)[:, : self.k]
@@ -310,7 +318,8 @@ def make_baseline(name: str, policy: Policy, seed: int = 0, **params: Any) -> Ba
 
 
 def baseline_class(name: str) -> type[Baseline]:
-    """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`.
+    """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`,
+    which runs the module's code.
 
     Raises SettingError if there is no such name or class, or the class is no `Baseline`.
     """

@@ -189,7 +189,7 @@ class CostCurve:
 
         It assumes that the shares of wrong decisions stay as they were seen, and counts different
         accepted parts, recordings, and parts of production. None if the verdict is another, or if
-        10,000 times as many recordings are too few.
+        10,000 times the parts of a shuffle are too few.
         """
         row = self.marked
         if self.verdict != "may pay":
@@ -206,7 +206,9 @@ class CostCurve:
         ]
 
         def surplus(n_recordings: int) -> float:
-            """Return how far so many recordings like these bring the interval below the check."""
+            """Return how far so many recordings like these bring the interval below the check;
+            negative if it stays above.
+            """
             more = n_recordings / self.cycles
             bad, good = (
                 float(
@@ -322,8 +324,8 @@ def settings_of(policy: Policy) -> dict[str, Any]:
     `Policy`.
 
     They are alpha, lower_bound and guarantee, or only the prices under the guarantee "cost", since
-    the prices imply the other three. audit_rate and stops are added if they are not the defaults.
-    The interval, the force limits and all other settings are left out.
+    the prices imply the other three. stops is added if it is "all", and audit_rate if it is not 0,
+    or, under "cost", not 0.05. The interval, the force limits and all other settings are left out.
     """
     names = ["alpha", "lower_bound", "guarantee"]
     if policy.guarantee == "cost":
@@ -442,9 +444,11 @@ class PolicySearch:
         """Halve the number of policies in rounds, and let the last two play fresh shuffles.
 
         Fresh shuffles are those by which no policy was chosen. While more than two policies remain,
-        they play two shuffles, and the dearer half is removed from `remaining`; policies that
-        verified every part count as the dearest. The replays are kept in this object, and `curve`
-        computes the result from them. Call this once.
+        they play two shuffles (on the scores of one engine that checks every part, unless a
+        baseline plays; see `_play`), and the dearer half (of an odd number the larger half) is
+        removed from `remaining`, until two are left; policies that verified every part count as the
+        dearest. Others are compared by their expected cost over all shuffles so far. The replays
+        are kept in this object, and `curve` computes the result from them. Call this once.
 
         Parameters
         ----------
@@ -518,18 +522,20 @@ def candidates(
 
     First come all pairs of an alpha and a lower bound LB (the success probability that accepted
     parts must have) for the guarantee "local", or for the user's own rule if the contender has one.
-    Then come "pooled" at each LB, and "cost" once with the prices `costs`, but not for a user's own
-    rule or a baseline. If the contender's policy has stops="some" and no audits, these two get an
-    audit rate of 5 %, because they need outcomes of accepted parts.
+    Then come "pooled" at each LB, and "cost" once with the prices `costs`, both with the
+    contender's own alpha, but not for a user's own rule or a baseline. If the contender's policy
+    has stops="some" and no audits, these two get an audit rate of 5 %, because they need outcomes
+    of accepted parts.
 
-    If `alphas` is empty, it is 0.1 alone. If `lower_bounds` is empty, LBs are taken around
-    break-even, at which 1 - LB is check / escape: up to six for "local", up to three for "pooled",
-    the lowest first, and none below 80 %.
+    If `alphas` is empty, it is 0.1 alone. LBs come the lowest first. If `lower_bounds` is empty,
+    they are taken around break-even, at which 1 - LB is check / escape: 1 - LB is that ratio times
+    0.5, 1, 2, 4, 8 and 16 for "local" (or the user's own rule), times 1, 2 and 4 for "pooled", each
+    rounded to two digits. None is below 80 %; if all would be below it, 80 % is the only one.
     """
     policy = contender.recipe.policy
 
     def levels(factors: Sequence[float]) -> Sequence[float]:
-        """Return levels of LB, the laxest first."""
+        """Return the user's levels of LB, or those of these factors, the laxest first."""
         tolerances = [factor * costs.worst_accept for factor in factors]
         allowed = [share for share in tolerances if share <= LARGEST_TOLERANCE]
         shares = allowed or [LARGEST_TOLERANCE]
@@ -556,9 +562,9 @@ def needed_parts(policy: Policy) -> int:
 
     For the guarantee "local" this is the number of good labels within the radius, without a bad
     one, that puts the lower end of the policy's interval at LB: z^2 LB / (1 - LB), rounded up, with
-    Wilson's interval. For "pooled" it is the number of good parts, without a bad one, whose score
-    reaches the accept threshold, until there is enough evidence at error level alpha. For other
-    guarantees it is 0.
+    Wilson's interval; at most 10,000,000. For "pooled" it is the number of good parts, without a
+    bad one, whose score reaches the accept threshold, until there is enough evidence at error level
+    alpha. For other guarantees it is 0.
     """
     if policy.guarantee == "local":
         counts = range(1, MOST_NEIGHBOURS)
@@ -676,13 +682,11 @@ def curve_of(
 def _choose(groups: Groups, costs: Costs) -> tuple[list[PolicyCost], PolicyCost, str]:
     """Return a row for each policy in `groups`, the cheapest first, the best row, and the verdict.
 
-    `groups` has each policy with its replays, and `costs` are the prices. The best row is the
-    cheapest, unless there are rows
-    that accept fewer bad parts, are not significantly dearer, and have an expected cost below the
-    price of a check: then it is the row of these that accepts fewest bad parts. The expected cost
-    has half an error added to each share of wrong decisions. The verdict is "pays" if the whole
-    interval of its cost is below the price of a check, "does not pay" if its mean or its expected
-    cost is not, else "may pay".
+    `groups` has each policy with its replays. The best row is the cheapest (of equal ones that with
+    fewer bad accepted parts), unless some rows accept fewer bad parts, are not dearer at a
+    one-sided level of 5 %, and have an expected cost below the price of a check: then it is the row
+    of these with the fewest. The verdict is "pays" if the whole interval of its cost is below that
+    price, "does not pay" if its mean or expected cost is not, else "may pay".
     """
     rows = [_policy_cost(policy, replays, costs) for policy, replays in groups.items()]
     rows.sort(key=lambda row: (row.cost, row.escaped, -row.policy.lower_bound))
@@ -742,7 +746,8 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
 
 
 def _expected_rate(error: ErrorRate) -> float:
-    """Return (wrong + 1/2) / (n + 1), where n counts different parts; 1/2 without any.
+    """Return (n r + 1/2) / (n + 1), where r is the share of wrong decisions, and n counts different
+    parts among those decided; 1/2 without any.
 
     It is the posterior mean of a share of errors with the Jeffreys prior.
     """
@@ -763,8 +768,8 @@ def _difference(
 
     The first value is a mean over all parts, in the unit of `costs`; it is negative if `first` is
     cheaper. The replays are those of two policies, which have played the same shuffles in the same
-    order. The standard error adds the variance between parts, whose differences are summed over the
-    shuffles first, and the variance between shuffles.
+    order. The standard error adds the variance between parts, whose differences (less their mean)
+    are summed over the shuffles first, and the variance between shuffles, which is 0 for one.
     """
     differences = np.array(
         [

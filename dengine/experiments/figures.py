@@ -85,7 +85,8 @@ def blank(width: float, height: float, title: str = "") -> Figure:
 
 
 def finish(axes: Axes, legend: int = 3, **settings: Any) -> None:
-    """Give axes a light grid, no box, and a legend above them, where it hides no curve.
+    """Give axes a light grid, no lines at the top and the right, and a legend above them, where it
+    hides no curve.
 
     Returns nothing; the axes are changed.
 
@@ -145,11 +146,12 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     """Draw the embeddings of a replay's newest 300 parts, and return the figure.
 
     The left panel shows which parts were good and bad, the right one what was decided. A point is
-    the mean over the embedding spaces of the folds, in its first two dimensions, as it was at the
-    decision; later retrains do not move it. Parts that no model embedded are left out, on the left
-    also parts of unknown truth. A circle with the recipe's radius is the neighbourhood of the
-    newest point. If the first dimension is a probability, the second says little: the vertical axis
-    is then the cycle, and two vertical lines bound the neighbourhood.
+    the mean over the embedding spaces of the folds, in its first two dimensions (0 for a second one
+    that is missing), as it was at the decision; later retrains do not move it. Parts that no model
+    embedded are left out, on the left also parts of unknown truth. A circle with the recipe's
+    radius is the neighbourhood of the newest point. Without any point a text says so. If the first
+    dimension is a probability, the second says little: the vertical axis is then the cycle, and two
+    vertical lines bound the neighbourhood.
 
     Parameters
     ----------
@@ -231,7 +233,7 @@ def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int =
     Parameters
     ----------
     replays : sequence of Replay
-        All equally long.
+        At least one; all equally long.
     window : int, default 300
         Cycles in a window. At the first cycles, before there are so many, a window has all cycles
         so far.
@@ -353,7 +355,8 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     On top are the policies that played the reported shuffles, the cheapest first. Below them,
     hollow, are those that were left behind: their costs are of earlier shuffles, and cannot be
     compared with the others. A line marks the cost of checking everything, and a ring the chosen
-    policy, if one pays or may pay. An interval that leaves the axes ends in an arrow with its
+    policy, if one pays or may pay. The axis begins at 0 and ends at 1.3 times the largest of these
+    costs and the price of a check; an interval that goes beyond its end ends in an arrow with its
     value. The right panel shows the share of parts that were decided without a check.
 
     Parameters
@@ -421,11 +424,11 @@ def _times(spec: TraceSpec, samples: int) -> tuple[Floats, str]:
 def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
-    It has a panel for each of at most four channels: those that are outside the envelope in most
-    samples. The envelope is the band in which 95 % of the successes lie at each sample. Samples
-    that are outside by more than a tenth of its width are shaded. Without an envelope only the
-    traces are drawn, of the first four channels. The title has the decision, its reason, the
-    version and the label.
+    It has a panel for each of at most four channels, in their order: those that are outside the
+    envelope in most samples, of equal ones the first. The envelope is the band in which 95 % of the
+    successes lie at each sample. Samples that are outside by more than a tenth of its width are
+    shaded. Without an envelope only the traces are drawn, of the first four channels. The title has
+    the decision, its reason, the version and the label.
     """
     stored = explanation.decision
     decision = stored.decision
@@ -497,8 +500,9 @@ def data_picture(data: Dataset, title: str = "") -> Figure:
 
     Above, a panel for each of the first three channels shows the median trace of good and of bad
     parts, and where the middle 80 % lie. Below are the share of good parts in a sliding tenth of
-    the set, and the mean of each trace's first channel, in recorded order. Traces with a sample
-    that is not finite are not drawn; their labels count in the share. `title` begins the title.
+    the set, and among all, and the mean of each trace's first channel, in the order of the set.
+    Traces with a sample that is not finite are not drawn; their labels count in the share. `title`
+    begins the title.
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
@@ -523,9 +527,10 @@ def _draw_drift(figure: Any, data: Dataset, finite: NDArray[np.bool_], label: st
     """Draw into `figure` the share of good parts in a sliding tenth of a data set, and the mean of
     each finite trace.
 
-    The share begins at the end of the first tenth. The mean is taken over the samples of the first
-    channel; `label` names this channel and its unit. `figure` is a Figure or SubFigure, and
-    `finite` (n,) says which of the n traces have no sample that is not finite.
+    The share begins at the end of the first tenth; a dotted line is the share in the whole set. A
+    tenth is at least one part. The mean is taken over the samples of the first channel; `label`
+    names this channel and its unit. `figure` is a Figure or SubFigure, and `finite` (n,) says which
+    of the n traces have no sample that is not finite.
     """
     import pandas as pd
 

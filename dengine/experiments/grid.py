@@ -98,7 +98,8 @@ class KeptReplays:
         Raises
         ------
         SettingError
-            The reducer holds an object that cannot be hashed, such as a lambda.
+            The reducer holds an object that cannot be hashed, such as a lambda, or is a
+            module:Class that cannot be imported.
         """
         contender = task.contender
         reducer = contender.recipe.reducer
@@ -132,7 +133,7 @@ class KeptReplays:
         file is damaged.
 
         The replay gets the name and recipe of the task's contender, who played it. Raises
-        SettingError for a reducer that cannot be hashed.
+        SettingError as `path` does.
         """
         path = self.path(task)
         try:
@@ -155,7 +156,7 @@ class KeptReplays:
 
         The file is compressed, and is written as a whole or not at all. Name and recipe are not
         written, since `get` takes them from the task. Raises OutputError if the file cannot be
-        written, and SettingError for a reducer that cannot be hashed.
+        written, and SettingError as `path` does.
         """
         arrays: dict[str, Any] = {}
         values: dict[str, Any] = {}
@@ -173,8 +174,8 @@ class KeptReplays:
 
 @cache
 def _digest_of_source() -> str:
-    """Return a hash, as hexadecimal text, of dengine's source and of the versions of Python and of
-    the `LIBRARIES`.
+    """Return a hash, as hexadecimal text, of dengine's Python files and of the versions of Python
+    (only its first two numbers) and of the `LIBRARIES`.
 
     It is computed once in a process. Libraries that are not installed are left out.
     """
@@ -268,7 +269,8 @@ def iterate_replays(
 
     Replays that an earlier run kept in the folder `keep` come first. The other tasks are begun seed
     by seed, so that the replays that an interrupted run has finished can be compared; they are
-    yielded in the order in which they end.
+    yielded in the order in which they end. Nothing is read, played or raised before the first
+    `next`.
 
     Parameters
     ----------
@@ -291,9 +293,9 @@ def iterate_replays(
     Raises
     ------
     SettingError
-        A baseline's library is missing: this is raised after the kept replays were yielded, and
-        before anything is played. A replay that cannot be played, see `replay`. With `keep` also
-        for a reducer that cannot be hashed.
+        A baseline that cannot be found or imported: this is raised after the kept replays were
+        yielded, and before anything is played. A replay that cannot be played, see `replay`. With
+        `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
     OutputError
@@ -383,7 +385,7 @@ def run_grid(
     Raises
     ------
     SettingError, DataError
-        As `grid_tasks` and `iterate_replays`.
+        As `grid_tasks` and `iterate_replays`; OutputError only with `keep`.
 
     References
     ----------
@@ -429,7 +431,7 @@ def grid_tasks(
     Raises
     ------
     SettingError
-        Two contenders have the same name and policy, or a setting is out of range.
+        A recipe cannot be loaded, two have the same name and policy, or a setting is out of range.
     """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound", "guarantee")

@@ -103,8 +103,9 @@ class Contender:
         ----------
         recipe : Contender, str or object
             A contender is returned as it is. A baseline's name gives the baseline with its default
-            settings. Otherwise anything that `Recipe.load` takes; the name of a contender that is
-            read from a TOML file is the file's name without suffix.
+            settings, and with the default `retrain_every` of reducers, not that of conv. Otherwise
+            anything that `Recipe.load` takes; the name of a contender that is read from a TOML file
+            is the file's name without suffix.
 
         Raises
         ------
@@ -125,7 +126,8 @@ class Contender:
     def with_policy(self, **changes: Any) -> "Contender":
         """Return a copy with other settings of the policy, such as alpha, lower_bound or guarantee.
 
-        Raises SettingError for one that is out of range.
+        Prices may imply a guarantee and audits, as for `Policy.changed`. Raises SettingError for
+        one that is out of range, TypeError for a name that is no setting.
         """
         return replace(self, recipe=self.recipe.with_policy(**changes))
 
@@ -135,7 +137,9 @@ class Contender:
 
         `trace` is the `TraceSpec` of the traces; None: the first trace sets it. A training ends
         after a number of steps and not by the time budget, so that the same seed gives the same
-        decisions. Raises SettingError if the baseline's library is not installed.
+        decisions. It limits this thread to one torch thread. Raises SettingError for settings that
+        `DataEngine` refuses, such as force limits in seconds at an unknown rate, and for a baseline
+        that cannot be made.
         """
         model = None
         if self.baseline is not None:
@@ -359,6 +363,11 @@ class Replay:
             a decision's (µs), and the seconds of the replay. saved_s, the seconds of checks that
             the certain parts saved; and net_s, which is saved_s minus the cost of errors, in
             seconds, by the defaults of `Costs`.
+
+        Raises
+        ------
+        SettingError
+            For `check_seconds` that is not finite or not above 0.
         """
         nan = float("nan")
         policy = self.recipe.policy
@@ -431,7 +440,8 @@ def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Obse
     With the cycle come the truth, whether the part was good, and the clock, the seconds of
     production. The truth is the cell's attribute `truth` if it has this attribute, otherwise the
     label that was reported, or NaN if none was. The clock is the cell's attribute `clock`, or None.
-    An exception of the cell is raised, after the engine has written its decisions and labels.
+    Raises what `DataEngine.run` raises. An exception of the cell is raised, too, after the engine
+    has written its decisions and labels.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)
@@ -444,6 +454,7 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 
     `recipe` is the recipe of the engine that drove the cell. The fields that only a replay of a
     recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
+    Either all cycles have a clock or none has.
     """
     cycles = [item.cycle for item in observed]
     decisions = [cycle.decision for cycle in cycles]
@@ -561,10 +572,12 @@ def replay(
     ------
     SettingError
         A number of cycles that the data set does not have, anything that is no recipe, a baseline
-        whose library is missing, alpha or lower_bound beside an engine, or a policy with force
-        limits in seconds for a data set of an unknown rate.
+        that cannot be made, alpha or lower_bound beside an engine, or a policy with force limits in
+        seconds for a data set of an unknown rate.
     DataError
         A data set that cannot be read.
+    TraceError
+        For an engine of yours, traces that it does not take.
     """
     changes = {"alpha": alpha, "lower_bound": lower_bound}
     changes = {name: value for name, value in changes.items() if value is not None}
@@ -612,7 +625,7 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     that an accepted part was good. One difference to such a replay stays: the predictions come from
     a model that has learned all labels. Audits are drawn anew, by the seed of the replay. A part
     for which the model was not asked, such as a novel one or one that left an operator's force
-    limits, is verified.
+    limits, is verified; the rule learns its outcome, too, with the bounds 0 and 1.
 
     Parameters
     ----------
@@ -625,6 +638,11 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     replay : Replay
         A copy with the actions of the policy, and with the policy in its recipe; all else, also the
         reasons and bounds, is as in `scores`.
+
+    Raises
+    ------
+    SettingError
+        If the class of the policy's guarantee cannot be imported or made.
     """
     import torch
 

@@ -52,7 +52,8 @@ class Survey:
     not_finite_in : tuple of str
         Files, or rows, of those that are not finite.
     duplicates, contradicting : int
-        Traces equal to an earlier one, sample by sample; and those of them with another label.
+        Traces equal to an earlier one, by `content_hash`; and those of them with another label than
+        the first of them.
     near_repeats, looked_at : int
         Among the newest `looked_at` usable traces: those that are much nearer to another part's
         trace than parts are to each other.
@@ -88,9 +89,10 @@ class Survey:
 def survey_dataset(data: Dataset) -> Survey:
     """Count the traces, labels, faults and repeats of a data set.
 
-    A repeat is a trace that equals, or nearly equals, that of another recording. Repeats are looked
-    for among the usable traces: finite, not constant, and without a sample beyond 1e18; near
-    repeats only among the newest 500 of these. Nothing is trained, and the data set is not changed.
+    A repeat is a trace that equals (by `content_hash`, which rounds), or nearly equals, that of
+    another recording. Repeats are looked for among the usable traces: finite, not constant, and
+    without a sample beyond 1e18; near repeats only among the newest 500 of these. Nothing is
+    trained, and the data set is not changed.
 
     Parameters
     ----------

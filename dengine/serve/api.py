@@ -142,7 +142,8 @@ async def read_body(request: Request, struct_type: type[T], *other_types: str) -
     The body is an object without nested objects. Raises Refusal: 415 for another media type than
     JSON, 400 for a body that is no JSON or has a name twice, 422 for fields that the type does not
     take. The message of 415 also lists `other_types`, the media types that the caller reads itself.
-    Raises ClientDisconnect if the client goes away before the whole body has come.
+    Raises ClientDisconnect if the client goes away before the whole body has come, and Refusal 413
+    while it is read, if `Guard` finds it too large.
     """
     media = media_type(request)
     if media != JSON:
@@ -241,9 +242,10 @@ def _look_like_float64(words: NDArray[np.float32]) -> bool:
 
     The low half of a float64 number, the words at even positions, is the end of its fraction:
     random bits, or zeros. So the result is True if all low halves are zero and some high half is
-    not. It is also True if many low halves, at least `LARGE_SHARE` of all words, are more than
-    `LARGE_FACTOR` times as large as the largest high half, or as 1 if that is larger; words that
-    are not finite do not count. It is False for fewer than `MIN_WORDS` words and for an odd number.
+    not. It is also True if many low halves, at least `LARGE_SHARE` of all words, are, without their
+    sign, more than `LARGE_FACTOR` times as large as the largest high half, or as 1 if that is
+    larger; words that are not finite do not count. It is False for fewer than `MIN_WORDS` words and
+    for an odd number.
     """
     if len(words) % 2 or len(words) < MIN_WORDS:
         return False
@@ -468,7 +470,8 @@ def _error_response(request: Request, error: Any) -> Response:
     A Refusal and starlette's HTTPException have a status and headers of their own; for the statuses
     404 and 405 of the latter, dengine has its own text. The status is 400 if the client
     disconnected, and for other errors the one that `STATUSES` has for their type, with the error's
-    text. Any other exception gets 500 with a general text, and is logged with its traceback.
+    text, in which Python's arguments are written as options. Any other exception gets 500 with a
+    general text, and is logged with its traceback.
     """
     if isinstance(error, Refusal):
         return problem_response(error.status, error.detail, error.headers)
@@ -541,8 +544,8 @@ class Operation:
         the operation has a `raw_parameter` and the body is bytes (application/octet-stream), the
         body is the field of this name, and the other fields are read from the query. Optional
         fields that were left out are not passed on. If the handler returns no response, its result
-        is sent as JSON. Raises Refusal for a request that cannot be read, and whatever the handler
-        raises; the application turns both into responses.
+        is sent as JSON. Raises Refusal for a request that cannot be read, ClientDisconnect for one
+        that is cut off, and whatever the handler raises; the application turns all into responses.
         """
         if self.method == "GET":
             values = read_query(request, self.request_type)
@@ -559,9 +562,10 @@ class Operation:
     def describe(self, schemas: Json) -> Json:
         """Return the operation as an OpenAPI operation object, a dict.
 
-        It has the summary, the parameters, the responses (200, and any other status as a problem),
-        and for a POST the request's body with its examples. `schemas` has the JSON schema of every
-        request type and response by name.
+        It has the summary, the responses (200, and any other status as a problem), and for a POST
+        the request's body with its examples. The fields are parameters of a GET, and of a POST
+        whose body may be bytes; only those in the path are marked as required. `schemas` has the
+        JSON schema of every request type and response by name.
         """
         request_schema = schemas[self.request_type.__name__]
         is_json = self.response in RESPONSES
@@ -600,8 +604,9 @@ class Operation:
 def openapi_document(operations: Iterable[Operation], version: str) -> Json:
     """Return the OpenAPI 3.1 document of these operations, a dict that can be encoded as JSON.
 
-    `version` is the version of the interface. An operation is a method on a path. Tokens, which
-    authorize requests, are described as optional.
+    `version` is the version of the interface. An operation is a method on a path; `operations` is
+    gone through twice, so an iterator will not do. Tokens, which authorize requests, are described
+    as optional.
     """
     types = [*RESPONSES.values(), *(operation.request_type for operation in operations)]
     _, schemas = msgspec.json.schema_components(types, ref_template=REF)

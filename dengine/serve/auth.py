@@ -221,13 +221,14 @@ class Guard:
             await self.app(scope, _limit_body(receive), _with_headers(send))
 
     def _check(self, scope: Scope) -> None:
-        """Raise Refusal for a request that is not allowed; otherwise set the context variable
-        `CURRENT_TOKEN` to its token.
+        """Raise Refusal for a request that is not allowed.
 
         The checks are, in this order: a request to a server without tokens must call it localhost
-        or by a loopback address (421); `_check_token` checks the token; a request that may change
-        something must not come from a web page of another site (403); and the announced length of
-        the body must be allowed (413). A token in the path is removed from `scope`.
+        or by a loopback address (421); `_check_token` checks the token, and sets the context
+        variable `CURRENT_TOKEN` to it; a request that may change something must not come from a web
+        page of another site, by its headers Origin and Sec-Fetch-Site (403); and the announced
+        length of the body must be at most `MAX_BODY` (413). A token in the path is removed from
+        `scope`.
         """
         headers = Headers(scope=scope)
         host = headers.get("host", "")

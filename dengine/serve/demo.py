@@ -29,7 +29,8 @@ async def playing(
 ) -> AsyncIterator[None]:
     """Play recordings through the service in a random order, in a task beside the context's block.
 
-    The task plays each recording once, and is cancelled when the context ends.
+    The task plays each recording once, and is cancelled when the context ends. Its errors are
+    logged (`drive`).
 
     Parameters
     ----------
@@ -64,7 +65,8 @@ async def drive(service: CellService, cell: ReplayCell, speed: float) -> None:
     parts, and for accepted parts that are bad, which stop the line. The first `N_FAST` parts come
     without a pause, but a retrain that is under way is waited for; later parts come at `speed`
     parts per second, and their report after 40 % of this time. If the queue is full, the part or
-    its report is left out. A log line says when all parts were played. Any other exception is
+    its report is left out, and the next part comes without a pause. An accepted good part and a
+    rejected part get no report. A log line says when all parts were played. Any other exception is
     logged and ends the demonstration, not the server.
     """
     loop = asyncio.get_running_loop()

@@ -193,15 +193,16 @@ class HttpApi:
     ) -> Json:
         """Report the outcome of a part. The label is on disk when the response comes.
 
-        State either the decision's id or the part; both or neither is 422, and so are a value that
-        is no label and an author that is not the token's. An unknown id or part is 404. Only the
-        newest 20 decisions on a part are looked at, and rejects count only if there is nothing
-        else; if several decisions count, it is 409. The same report twice is no error; a report
-        that contradicts an earlier one is 409. But `false` for an accepted part that was confirmed
-        as good before is a late line stop, and corrects the label. If the request has an author or
-        the token has a name, a new label is also recorded as an event. 503: the queue is full, or
-        the label may not be on disk; report it again. The response has the label, whether it was
-        known already, and the retrain that it set off if that is finished.
+        State either the decision's id or the part; both or neither is 422, and so are an invalid
+        id, a value that is no label, and an author that is not the token's. An unknown id or part
+        is 404. Only the newest 20 decisions on a part are looked at, and rejects count only if
+        there is nothing else; if several decisions count, it is 409. The same report twice is no
+        error; a report that contradicts an earlier one is 409. But `false` for an accepted part
+        that was confirmed as good before is a late line stop, and corrects the label. If the
+        request has an author or the token has a name, a new label is also recorded as an event.
+        503: the queue is full, or the label may not be on disk; report it again. The response has
+        the label, whether it was known already, and the retrain that it set off if that is
+        finished.
         """
         checked = _checked_author(author) if author or CURRENT_TOKEN.get().name else ""
         decision_id = await self._find_id(id_, part)
@@ -213,8 +214,9 @@ class HttpApi:
 
         Raises Refusal 422 for both or neither, UnknownDecisionError for a part without a decision,
         and ReportConflictError for a part with several (rejects count only if there is nothing
-        else). For a part it waits in the queue and raises what `CellService.read` does. An id is
-        not looked up.
+        else). A decision's id in place of the part's number is found, too. For a part it waits in
+        the queue, and raises BusyError if that is full or the service is closing, and StoreError.
+        An id is not looked up.
         """
         if bool(id_) == bool(part):
             raise Refusal(422, "Expected the id of a decision, or the part's number in its place.")
@@ -232,9 +234,10 @@ class HttpApi:
 
         The label as it was reported stays on record. A forgotten label counts again. If the part
         already counts with this label, nothing changes. 404: an unknown id or part; 409: a part
-        with several decisions that are no rejects; 422: a decision without a label, both or neither
-        of id and part, or no author (unless the token has a name); 503: the queue is full, or the
-        store does not answer.
+        with several decisions that are no rejects, or with nothing but several rejects; 422: a
+        decision without a label, both or neither of id and part, no author (unless the token has a
+        name), or an author that is not the token's; 503: the queue is full, or the store does not
+        answer.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -252,9 +255,10 @@ class HttpApi:
 
         /correct makes a forgotten label count again. If the id of one decision is unknown (404), a
         decision has no label, or no id is given (422), no label is forgotten. 422 also for a
-        request without an author, unless the token has a name. If a rollback pinned the version in
-        force, and this version was trained with one of the labels, it is released, so that retrains
-        may replace it. 503: the queue is full, or the store does not answer.
+        request without an author, unless the token has a name, and for an author that is not the
+        token's. If a rollback pinned the version in force, and this version was trained with one of
+        the labels, it is released, so that retrains may replace it. 503: the queue is full, or the
+        store does not answer.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -268,13 +272,17 @@ class HttpApi:
     ) -> Json:
         """Let an earlier version of the model decide again, as a new version, and pin it: no
         automatic retrain replaces it, until /release or /retrain, or until /forget of a label that
-        it was trained with. 404: a version that is not kept.
+        it was trained with. If it is pinned already, nothing changes. 404: a version that is not
+        kept; 422: no author (unless the token has a name), or an author that is not the token's;
+        503: the queue is full, or the store does not answer.
         """
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
 
     async def release(self, author: Author = "") -> Json:
         """Let retrains replace a version again that /rollback pinned; if none is pinned, nothing
-        changes.
+        changes, but a training under way begins again. 422: no author (unless the token has a
+        name), or an author that is not the token's; 503: the queue is full, or the store does not
+        answer.
         """
         return await self._change(author, lambda engine, by: engine.release(by))
 
@@ -282,7 +290,10 @@ class HttpApi:
         """Change settings of the policy, from the next decision on; shadow verifies every part.
 
         Settings that are left out stay as they are. Many changes start the decision rule anew, so
-        that it learns from later parts only. 422: a value that a setting cannot have.
+        that it learns from later parts only. If all are in force already, nothing changes;
+        otherwise a training under way begins again. 422: a value that a setting cannot have, no
+        author (unless the token has a name), or an author that is not the token's. 503: the queue
+        is full, or the store does not answer.
         """
         return await self._change(
             author, lambda engine, by: engine.set_policy(engine.policy.changed(**changes), by)
@@ -292,13 +303,18 @@ class HttpApi:
         """Begin a retrain, record who asked for it as an event, and do not wait for its end.
 
         A pinned version is released, so that the new version may replace it. If a retrain is under
-        way already, the response says so, and nothing changes. /versions tells afterwards whether
-        the new version was put in force or dropped. 422: no author, unless the token has a name.
-        503: the queue is full, or the store does not answer.
+        way already, or was asked for and cannot begin yet, the response says so, and nothing
+        changes. /versions tells afterwards whether the new version was put in force or dropped.
+        422: no author (unless the token has a name), or an author that is not the token's. 503: the
+        queue is full, or the store does not answer.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
-            """Start the retrain, record as an event who asked for it, and return what changed."""
+            """Release a pinned version, record an event, begin the retrain, and return what
+            changed.
+
+            If a retrain is under way, or waits until it can begin, nothing is done.
+            """
             if engine.state.is_retraining:
                 return Changed(
                     "retrain",
@@ -338,7 +354,9 @@ class HttpApi:
         id_: Id,
         trace: Annotated[bool, Meta(description="Include its samples.")] = False,
     ) -> Json:
-        """Return one decision with its label; 404 for an unknown id."""
+        """Return one decision with its label; 404 for an unknown id, 422 for an invalid one, 503 if
+        the queue is full or the id cannot be looked up.
+        """
         stored = await self._find(id_)
         return response_fields("Decision", stored, trace=stored.trace if trace else None)
 
@@ -361,8 +379,8 @@ class HttpApi:
         Only decisions with the given label, action, reason, predicted (what the model alone would
         have done) and part (the part's number) are returned, if these are given, and only those
         between the times since (included) and until (not included), in seconds since 1970. With
-        open, label and action are ignored. 422: a value that a field cannot have; 503: the queue is
-        full, or the store cannot be read.
+        open, label and action are ignored. 422: a value that a field cannot have, or an invalid
+        `before`; 503: the queue is full, or the store cannot be read.
         """
         selection = HistoryFilter(label=label, **where)
         before_id = (await self._find(before)).decision.id if before else None
@@ -379,7 +397,9 @@ class HttpApi:
         self, id_: Annotated[str, Meta(description="Of the decision, or its part's number.")]
     ) -> Json:
         """Explain a decision, with its trace, the band of good parts, and the newest bad parts.
-        404: an unknown id or part; 409: a part with several decisions.
+        404: an unknown id or part; 409: a part with several decisions that are no rejects, or with
+        nothing but several rejects; 503: the queue is full, the store cannot be read, or the trace
+        of the decision or of a neighbour is damaged.
         """
         return await self.service.read(lambda store: _read_explanation(store, id_))
 
@@ -389,9 +409,9 @@ class HttpApi:
         A stretch is a number of decisions that are counted together. With `hours` a stretch is a
         shift of this length, and `start` is when one of the shifts begins. Without it all decisions
         are split into at most 120 stretches of at least 20 decisions; the newest stretch may have
-        fewer. At most the newest 120 stretches are returned, but all retrains and safe modes of the
-        cell. 422: `hours` is shorter than one second and not 0; 503: the queue is full, or the
-        store cannot be read.
+        fewer. At most the newest 120 stretches with decisions are returned, but all retrains and
+        safe modes of the cell. 422: `hours` is not 0 and below 0.0003, about a second; 503: the
+        queue is full, or the store cannot be read.
         """
         expect(
             hours == 0.0 or hours >= MIN_SHIFT_HOURS,
@@ -407,7 +427,8 @@ class HttpApi:
         """Return where parts lie in the model's embedding, in two dimensions.
 
         The parts are the newest 250 references with a label of this cell and, of its newest 10
-        decisions, those that the version in force made. There are none before the first version.
+        decisions, those that the version in force made and for which it embedded the trace. There
+        are none before the first version, and no references if the version's state is not kept.
         503: the queue is full, or the store cannot be read.
         """
         engine = self.service.engine
@@ -417,7 +438,9 @@ class HttpApi:
         return response_fields("PartMap", parts)
 
     async def versions(self) -> Json:
-        """Return every retrain, dropped ones included; one that is kept can be rolled back to."""
+        """Return every retrain of the cell or its product, dropped ones included, oldest first; a
+        version that is kept can be rolled back to.
+        """
         versions = await self.service.read(lambda store: store.versions.all())
         return response_fields("Versions", versions=versions)
 
@@ -505,8 +528,9 @@ def _checked_author(author: str) -> str:
     """Return the author for the event log: the name of the token that the present request has
     (`CURRENT_TOKEN`), or the given name if this token has none.
 
-    In the given name repeated spaces become a single one. Raises Refusal 422 if there is no name,
-    if the name is too long or not printable, and if both names are given and differ.
+    In the given name each run of white space becomes a single space. Raises Refusal 422 if there is
+    no name, if the name is longer than 200 characters or not printable, and if both names are given
+    and differ.
     """
     owner = CURRENT_TOKEN.get().name
     name = " ".join(author.split())
@@ -537,13 +561,11 @@ def _read_newest(
 def _read_explanation(store: SqlStore, id_: str) -> Json:
     """Return the explanation of a decision, named by its id or its part's number, as a JSON dict.
 
-    Beside the fields of the `Explanation` it has the decision's trace, the corrections of its
-    label, the envelope (low, median and high are None if there is none), and the newest `N_BADS`
-    traces of bad parts among the newest `N_LABELS` labels (none if their shape differs).
-
-    Raises StoreError if the trace of the decision or of a neighbour is damaged; other damaged rows
-    are left out, and an event records that. Raises UnknownDecisionError if there is no such
-    decision, and ReportConflictError if the part has several.
+    Beside the `Explanation` it has the decision's trace, the corrections of its label, the envelope
+    (low, median, high; None without one), and the newest `N_BADS` traces of bad parts among the
+    newest `N_LABELS` labels of cell and product (none if their shape differs). Raises what
+    `explain` raises, such as StoreError for a damaged trace; other damaged rows are left out, and
+    an event says so.
     """
     explanation = explain(store, id_)
     trace = explanation.trace
@@ -603,7 +625,8 @@ def create_app(
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         """Enter what `beside` returns, and leave it when the application ends.
 
-        If that fails, the error is kept in `app.state.failure` and raised.
+        If a start fails, what was entered is left, and the error is kept in `app.state.failure` and
+        raised.
         """
         async with AsyncExitStack() as stack:
             try:

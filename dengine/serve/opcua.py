@@ -135,8 +135,8 @@ async def opcua_server(
     tokens : collection of str, optional
         Passwords of the user `dengine`; None: everybody may read and call.
     cert, key : path, optional
-        PEM or DER files. With them the server speaks only Basic256Sha256, signed and encrypted;
-        without them it encrypts nothing.
+        Files in PEM if their name ends in .pem, otherwise in DER. With them the server speaks only
+        Basic256Sha256, signed and encrypted; without them it encrypts nothing.
 
     Yields
     ------
@@ -150,6 +150,8 @@ async def opcua_server(
         key; for a certificate without its key, or a key alone.
     OSError
         For a port in use, and a file that cannot be read.
+    ValueError
+        For a file that holds no certificate, or no key without a password.
     """
     if (cert is None) != (key is None):
         raise SettingError("Expected a certificate and its key together, got one of them.")
@@ -269,16 +271,17 @@ class AddressSpace:
         disk.
 
         It is False for an unknown or empty id, and if the report cannot be stored now. Raises
-        ReportError for a report that contradicts an earlier one, unless it is a line stop after a
-        confirmation.
+        ReportError for an invalid id, and for a report that contradicts an earlier one, unless it
+        is a line stop after a confirmation.
         """
         return [await self._calls.report(decision_id, success)]
 
     async def follow_changes(self) -> None:
-        """Refresh the variables after each change, and at least every `MAX_REFRESH` seconds.
+        """Refresh the variables at once, after each change, and after `MAX_REFRESH` seconds without
+        one.
 
-        It refreshes at most once in `MIN_REFRESH` seconds, and ends when the service's
-        `end_listening` is called.
+        After each refresh it waits `MIN_REFRESH` seconds before the next one. It ends when the
+        service's `end_listening` is called.
         """
         async for _ in self._service.changes(MAX_REFRESH):
             await self.refresh()
@@ -287,8 +290,10 @@ class AddressSpace:
     async def refresh(self) -> None:
         """Read the cell's status and write it into the OPC UA variables.
 
-        If the status cannot be read, a warning is logged, and the variables keep their values with
-        the OPC UA status code UncertainLastUsableValue, which marks them as old. Nothing is raised.
+        An event is sent if the alarm has changed (`write_status`). If the status cannot be read or
+        written, a warning is logged, and the variables keep their values with the OPC UA status
+        code UncertainLastUsableValue, which marks them as old; LastRefused is not touched. Nothing
+        is raised.
         """
         try:
             await self.write_status(await self._calls.status())
@@ -340,7 +345,9 @@ class AddressSpace:
 
         @wraps(call)
         async def method(parent: ua.NodeId, *variants: ua.Variant) -> Any:
-            """Check the arguments, call, and return the results or a status code."""
+            """Check the arguments, call, and return the results; for an error write its text into
+            LastRefused, and return a bad status code.
+            """
             # Controllers send an empty text as null.
             texts = [ua.Variant("") if item.Value is None else item for item in variants]
             given = [_form(item.VariantType, isinstance(item.Value, list)) for item in texts]

@@ -76,8 +76,9 @@ class RetrainingProcess(Executor):
         """Queue a call of a picklable function, which runs in the process after earlier calls.
 
         Returns the future of its result. If the result has arrays, wait for it before you submit
-        the next call: the end of the next call closes the file that holds these arrays. Raises
-        BrokenExecutor if the process has ended.
+        the next call: the end of the next call closes the file that holds these arrays. An
+        exception of the call, or an argument or result that cannot be pickled, is the future's.
+        Raises BrokenExecutor if the process has ended, and RuntimeError after `shutdown`.
         """
         call = _SharedPickle((fn, args, kwargs))
         return self._pool.submit(_call, call)  # type: ignore[arg-type]  # arrives as the tuple
@@ -123,7 +124,7 @@ def _unpickle(pickled: bytes, path: str, sizes: list[int]) -> Any:
 
     `pickled` is the pickle of the value without its arrays. The arrays are read from the file at
     `path`, one after another; `sizes` are their sizes in bytes. Raises EOFError if the file is
-    shorter.
+    shorter, and OSError if it is gone, because the object or its process has ended.
     """
     arrays = [np.empty(size, np.uint8) for size in sizes]
     with Path(path).open("rb") as file:
@@ -139,7 +140,8 @@ def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _
     """Call a function, in the retraining process, and return its result for pickling.
 
     `call` is the function, its arguments and its keyword arguments. The result is kept until the
-    next call ends; before that the server's process must have read it.
+    next call ends; before that the server's process must have read it. Raises what the function
+    raises.
     """
     fn, args, kwargs = call
     _NEWEST_RESULT[:] = [_SharedPickle(fn(*args, **kwargs))]
@@ -149,11 +151,11 @@ def _call(call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> _
 def _prepare_process() -> None:
     """Set up the retraining process; this runs in it before anything else.
 
-    From now on the process ends when its parent ends, even during a call into C++; it ends at once,
-    with exit code 1, if the parent has ended already. If the system allows it, the process leaves
-    one of several cores to decisions and has a lower priority. It ignores the signals that ask a
-    process to end (`END_SIGNALS`): Ctrl-C reaches all processes of a terminal, but the server ends
-    this process in order.
+    From now on the process ends when the thread that started it ends (without Linux: the parent
+    process), even during a call into C++; it ends at once, with exit code 1, if its parent has
+    ended already. If the system allows it, the process leaves one of several cores to decisions and
+    has a lower priority. It ignores the signals that ask a process to end (`END_SIGNALS`): Ctrl-C
+    reaches all processes of a terminal, but the server ends this process in order.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None  # it was spawned

@@ -92,8 +92,9 @@ class RobotCalls:
         added under this id before are discarded. Pieces are kept for the newest `MAX_PARTS` parts;
         for an older part call this again. The recorder, which records the force of one insertion,
         works for the newest part alone: the recording of an earlier part that was not decided on is
-        dropped. If the recorder fails, that is logged, and `decide_recorded` then verifies the
-        part. Without a recorder the trace can only be sent, by `add` or `decide`.
+        dropped. With a recorder the call waits for a `decide_recorded` that is under way. If the
+        recorder fails, that is logged, and `decide_recorded` then verifies the part. Without a
+        recorder the trace can only be sent, by `add` or `decide`.
 
         Parameters
         ----------
@@ -144,8 +145,9 @@ class RobotCalls:
         ------
         TraceError
             For a part that was not begun, or is not among the newest `MAX_PARTS` any more; for a
-            piece that has no samples or several channels; and for more than `MAX_SAMPLES` samples
-            of the part.
+            piece that `as_samples` refuses, such as one without samples, or that has a list for
+            each channel; and for more than `MAX_SAMPLES` samples of the part. A refused piece is
+            not added.
         ReportError
             For an invalid id.
         """
@@ -185,13 +187,15 @@ class RobotCalls:
         -------
         struct
             A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If
-            the queue is full or the service is closing: verify, an id "" and the reason "busy";
-            nothing is recorded.
+            the queue is full, or the service or its engine is closed, which is logged: verify, an
+            id "" and the reason "busy"; nothing is recorded.
 
         Raises
         ------
         TraceError, ReportError
-            For a trace, or an id, that the engine does not take.
+            For a trace that cannot be read, and a trace, part or id that the engine does not take.
+        SettingError
+            For a first trace that the settings do not allow.
         """
         return await self.decide_array(as_samples(trace), request, part)
 
@@ -203,8 +207,8 @@ class RobotCalls:
         drops the pieces, even if the store did not record it (reason "no_store"). If the queue is
         full, or the service or its engine is closed, the result is VERIFY with an empty id and the
         reason "busy", and the pieces stay, so that the call can be repeated. Raises TraceError if
-        there are no pieces or the engine does not take the trace, ReportError for an invalid id,
-        and SettingError for a first trace that the settings do not allow.
+        there are no pieces or the engine does not take the trace or part, ReportError for an
+        invalid id, and SettingError for a first trace that the settings do not allow.
         """
         if (stored := await self._find(request)) is not None:
             return stored
@@ -239,14 +243,15 @@ class RobotCalls:
         -------
         struct
             A dict: action (0 verify, 1 accept, 2 reject), id, reason, lower, upper and version. If
-            the queue is full or the service is closing, verify with an id "" and the reason "busy".
+            the queue is full, or the service or its engine is closed, verify with an id "" and the
+            reason "busy".
 
         Raises
         ------
         SettingError
             For a server without a recorder, and for a first trace that the settings do not allow.
         TraceError, ReportError
-            For a trace, or an id, that the engine does not take.
+            For a trace, part or id that the engine does not take.
         """
         if self._recorder is None:
             raise SettingError(

@@ -104,7 +104,8 @@ def serve(
     """Serve a cell until SIGTERM, SIGINT, or Ctrl-Break of Windows; it blocks until then.
 
     Then the requests in the queue are answered, and the engine is closed. Logs go to stderr, a line
-    each, also after the end.
+    each, also after the end (`log_lines`). In another thread than the main thread no signal ends
+    it.
 
     Parameters
     ----------
@@ -125,7 +126,8 @@ def serve(
     port : int
         0: any free one.
     token_file : path or None
-        None: no request needs a token, and only this machine may reach the server.
+        As `read_tokens` takes it. None: no request needs a token, and only this machine may reach
+        the server.
     cert, key : path or None
         PEM files for TLS, both or none.
     deadline : float
@@ -143,7 +145,8 @@ def serve(
         For a port in use, files that cannot be used, and an address that other machines can reach
         without a token.
     Exception
-        What `make`, `recorder`, or a start of one of `beside` raises.
+        What `make`, `recorder`, or a start of one of `beside` or of OPC UA raises, such as OSError
+        for its port in use; StoreError if the second connection to the store cannot be opened.
     """
     if token_file is None and not is_loopback(host):
         raise SettingError(
@@ -218,10 +221,10 @@ class CellServer(uvicorn.Server):
         """Handle SIGINT, SIGTERM and Ctrl-Break, within the block, as a request to end in order.
 
         Each signal is logged, ends every iteration over `CellService.changes`, and asks uvicorn to
-        end after the requests under way; a second SIGINT makes it end without waiting for them. The
-        earlier handlers are set again after the block. The signals are not raised again then,
-        unlike by uvicorn's own method, so the exit code is 0. In another thread than the main
-        thread no handler is set.
+        end after the requests under way, which have `GRACE` seconds; a SIGINT after another of
+        these signals makes it end without waiting for them. The earlier handlers are set again
+        after the block. The signals are not raised again then, unlike by uvicorn's own method, so
+        the exit code is 0. In another thread than the main thread no handler is set.
         """
         # Python delivers signals to the main thread alone.
         if threading.current_thread() is not threading.main_thread():

@@ -199,8 +199,8 @@ class CellService:
         trace : array, shape (T,) or (C, T)
         request : str, optional
             The caller's id, a different one for each trace. The same id and trace get the same
-            decision, after a restart too, and it is on disk when this returns. None: a new id; the
-            decision may reach the disk later.
+            decision, after a restart too, and an ACCEPT or REJECT is on disk when this returns,
+            unless the store is in memory. None: a new id; the decision may reach the disk later.
         part : str or int, optional
             The part's number.
 
@@ -208,11 +208,12 @@ class CellService:
         -------
         ServiceResponse
             The engine's decision, which is waited for if the engine has begun it by the deadline.
-            Otherwise the response counts in `late`; it has the decision that the id already has, or
-            else VERIFY with `Reason.LATE` or the fault of the trace or the store. If the store
-            cannot be written or cannot look up the id, the decision is VERIFY with
-            `Reason.NO_STORE`, and may not be recorded. The response is also passed to each of
-            `observers`.
+            Otherwise the call returns a decision all the same, and the attribute `late` counts it:
+            the decision that the id already has, or else VERIFY with `Reason.LATE` or the fault of
+            the trace or the store; with a store in memory, and while no `TraceSpec` is in force,
+            this VERIFY is not recorded. If the store cannot be written or cannot look up the id,
+            the decision is VERIFY with `Reason.NO_STORE`, and may not be recorded. The response is
+            also passed to each of `observers`, whose exceptions are raised.
 
         Raises
         ------
@@ -259,7 +260,8 @@ class CellService:
         ----------
         decision_id : str
         success : bool or float
-            1 or True: good. The same label twice is no error.
+            1 or True: good. If the decision has this label already, also by a correction, nothing
+            is done.
         author : str
             The person who reports, for the event log. "": a machine's report, which is not recorded
             as an event. A repeated report is not recorded either.
@@ -268,16 +270,18 @@ class CellService:
         -------
         ReportResponse
             It is also passed to each of `observers`, after the retrain that the label set off if
-            that is finished.
+            that is finished; what an observer raises is raised.
 
         Raises
         ------
         ReportError
-            For an unknown id, for a value that is no label, and for another label than the reported
-            one; but a line stop after a confirmation is no error and corrects the label.
+            For an unknown or invalid id, for a value that is no label, and for another label than
+            the one that the decision has, also if that was forgotten; but a line stop after a
+            confirmation is no error and corrects the label.
         StoreError
             If the label is not known to be on disk, or the id cannot be looked up: report it again.
-            Also if only the event cannot be stored; it is then missing for good.
+            Also if the engine is closed, and if only the event cannot be stored; it is then missing
+            for good.
         BusyError
             If the queue is full or the service is closing.
         """
@@ -285,8 +289,12 @@ class CellService:
         label = as_success(success)
 
         def work(engine: DataEngine) -> tuple[bool, RetrainReport | None]:
-            """Report unless the label is known; return whether it was, and the retrain that it set
-            off.
+            """Report unless the decision has this label; return whether it had, and the retrain
+            that was set off.
+
+            If the report contradicts the label, everything is flushed, and the label is looked at
+            once more. A new label with an author is recorded as an event. Raises the errors of
+            `CellService.report`.
             """
             stored = engine.find(decision_id)
             if stored is not None and stored.success is label:
@@ -327,7 +335,7 @@ class CellService:
 
         It waits in the queue, without a deadline. With `read_only` the function changes nothing,
         and listeners to `changes` are not notified. Raises BusyError if the queue is full or the
-        service is closing.
+        service is closing; nothing is called then.
         """
         return await asyncio.wrap_future(self.submit(work, read_only))
 
@@ -340,14 +348,14 @@ class CellService:
         return self._enqueue(lambda engine, late: work(engine), read_only)
 
     async def read(self, work: Callable[[SqlStore], T]) -> T:
-        """Let the engine write its decisions to the store, call `work` with the store, and return
-        what it returns.
+        """Let the engine write all that it has recorded to the store, call `work` with the store,
+        and return what it returns.
 
-        The writing waits in the queue. Decisions that the disk or the store does not take in time
-        are missing, without an error. `work` must only read. It runs in another thread over a
-        second connection to the store (`read_store`), or in the engine's thread if the store is in
-        memory. Raises BusyError if the queue is full or the service is closing, and whatever `work`
-        raises.
+        The writing (`DataEngine.flush`) waits in the queue, and may also put the rule right.
+        Records that the disk or the store does not take in time are missing, without an error.
+        `work` must only read. It runs in another thread over a second connection to the store
+        (`read_store`), or in the engine's thread if the store is in memory. Raises BusyError if the
+        queue is full or the service is closing, and whatever `work` raises.
         """
         with suppress(NotTakenError):
             await self.call(lambda engine: engine.flush(), read_only=True)
@@ -358,8 +366,9 @@ class CellService:
     async def status(self, last: int = NEWEST, watching: bool = False) -> Status:
         """Return the status that `DataEngine.status` returns, but read the store like `read`.
 
-        Raises BusyError if the queue is full or the service is closing, and StoreError if the store
-        cannot be read.
+        `last` and `watching` are the arguments of `DataEngine.status`. Raises BusyError if the
+        queue is full or the service is closing, StoreError if the store cannot be read, and
+        SettingError for a stored recipe that cannot be read.
         """
         stored = await self.read(lambda store: status(store, last, watching))
         return self.engine.state.complete(stored)
@@ -379,9 +388,10 @@ class CellService:
     async def changes(self, quiet: float | None = None) -> AsyncIterator[bool]:
         """Yield True at once, and then whenever something has changed since the last yield.
 
-        A change is each call of the engine that is not read-only, and each retrain that has ended.
-        After `quiet` seconds without a change False is yielded; None: never. The iteration ends
-        when `end_listening` is called, and yields nothing if it was called before.
+        A change is each call of the engine that is not read-only, even if it raised, and each
+        retrain that has ended. After `quiet` seconds without a change False is yielded; None:
+        never. The iteration ends when `end_listening` is called, and yields nothing if it was
+        called before.
         """
         event = asyncio.Event()
         listener = (asyncio.get_running_loop(), event)
@@ -406,7 +416,8 @@ class CellService:
         """Answer the requests in the queue, close the engine and the stores, and end the threads.
 
         Every iteration over `changes` ends. It blocks until all this is done. Requests that come
-        after the call get BusyError. A second call does nothing.
+        after the call get BusyError. A second call does nothing; it does not wait for the first. An
+        error of the engine's closing ends its thread and is not raised here.
         """
         if self._closing:
             return

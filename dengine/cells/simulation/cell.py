@@ -55,9 +55,10 @@ def read_sensor(
 ) -> TraceArray:
     """Return what the sensor reports of a true force.
 
-    The force passes a low-pass filter, gets the sensor's faults, and is quantised. Then samples are
-    lost: a lost sample repeats the last sample that was not lost. The first is never lost. `rng` is
-    advanced.
+    The force passes a low-pass filter of first order, which starts at 0, gets the sensor's faults,
+    and is quantised. The drift grows linearly to its full value at the last sample. Then samples
+    are lost: a lost sample repeats the last sample that was not lost. The first is never lost.
+    `rng` is advanced.
 
     Parameters
     ----------
@@ -67,7 +68,8 @@ def read_sensor(
     parameters : CellParameters
         Only `bandwidth_hz` is used.
     rng : numpy.random.Generator
-        Draws the noise, the phase of the ripple, and which samples are lost.
+        Draws the noise, the phase of the ripple, and which samples are lost, and numbers that are
+        not used.
 
     Returns
     -------
@@ -175,9 +177,9 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
 
     `conditions` are those that were drawn, and `pushed` is what came of them. If a missed grasp or
     a wrong part was drawn, that is the cause. Debris that was drawn is the cause only if the part
-    stopped on it. Otherwise the cause is "slip" if the part moved more than `SLIP_MM` in the
-    gripper, and else where it stopped: "rim_contact" on the rim of the hole, "stuck" near its seat,
-    "wedging" in between.
+    stopped below the rim and at most `SLIP_MM` above the debris. Otherwise the cause is "slip" if
+    the part moved more than `SLIP_MM` in the gripper, and else where it stopped: "rim_contact" on
+    the rim of the hole, "stuck" at most `STUCK_MM` above its seat, "wedging" in between.
     """
     tip_mm = pushed.height_mm - conditions.extra_length_mm  # of the part's tip above the seat
     if conditions.fault in ("missed_grasp", "wrong_part"):

@@ -40,7 +40,7 @@ def simulate(
     n_jobs : int, default -1
         Number of processes; -1: one for each core. `joblib.parallel_config` chooses the backend.
     progress : callable, optional
-        Called with 1 after each insertion.
+        Called with 1 after each insertion, in the order of the cycles.
     time_step_s : float
         Step of the physics in seconds.
 

@@ -71,7 +71,8 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     DengineError
         If MuJoCo is not installed.
     SettingError
-        For a step that does not divide 2 ms, and for sizes that MuJoCo refuses.
+        For a step that does not divide 2 ms (within a relative error of 1e-9), and for sizes that
+        MuJoCo refuses.
     """
     with instead(
         DengineError,
@@ -107,10 +108,11 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
     """Let the simulated gripper push; return the force (1000,) in newtons, at 500 Hz.
 
     `mujoco` is the module, `model` and `data` are its model and its state, which is advanced in
-    place, and `steps` is the number of physics steps per sample. The force before the motion, with
-    the part in the gripper, counts as zero; pushing is positive. The conditions say when the
-    gripper starts, how fast it is, how far it goes, and the limit of the force. Near this limit the
-    push slows down, and above the limit the gripper moves back.
+    place, and `steps` is the number of physics steps per sample. The force after 40 samples at
+    rest, with the part in the gripper, counts as zero; pushing is positive. The conditions say when
+    the gripper starts, how fast it is, how far it goes, and the limit of the force. In the last 8 N
+    below this limit the push slows down, and above the limit the gripper moves back, by the newest
+    sample.
     """
     for _ in range(_SETTLE_SAMPLES):
         mujoco.mj_step(model, data, steps)

@@ -153,9 +153,10 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Have the robot insert a part, wait for that, and return the trace, (T,) or (C, T).
 
         Lost samples are NaN. All samples are NaN if no insertion was seen, for example because its
-        start was lost or the trigger is wrong. `last` becomes the record of this insertion (trace
-        and missing samples); a trace with missing samples is counted in `incomplete`. Raise
-        CellError if the robot does not answer in time, fails, or its program stops.
+        start was lost or the trigger is wrong; one that is not complete when the time for the order
+        is over has NaN for the rest. `last` becomes the record of this insertion (trace and missing
+        samples); a trace with missing samples is counted in `incomplete`. Raise CellError if the
+        robot does not answer in time, fails, or its program stops.
         """
         self._execute_order(Verb.INSERT)
         if self.last is None:  # the start was lost, or the trigger is wrong
@@ -251,9 +252,9 @@ class UrCell(AbstractContextManager["UrCell"]):
         """Wait until the robot's program runs and has answered its last order; return the number of
         this order.
 
-        Packages that arrive meanwhile are discarded. Raise CellError after `start_timeout` seconds;
-        its message says whether the robot sent nothing, its program does not run, or it has not
-        answered.
+        Packages that arrive meanwhile are discarded. The numbers of the order and of the result in
+        the registers must be equal. Raise CellError after `start_timeout` seconds; its message says
+        whether the robot sent nothing, its program does not run, or it has not answered.
         """
         problem = ""
         for row in self.recorder.rows(self.start_timeout):

@@ -49,7 +49,8 @@ def spec_of_recording(
 ) -> TraceSpec:
     """Return the `TraceSpec` of the traces that an `RtdeRecorder` with these settings records.
 
-    The unit of a force is N, any other unit is unknown.
+    The unit of a force is N, any other unit, also that of a torque, is unknown. Raises SettingError
+    for values that no trace can have.
     """
     forces = {f"actual_TCP_force[{i}]" for i in range(3)}
     unit = tuple("N" if CHANNELS.get(name, name) in forces else "" for name in channels)
@@ -195,6 +196,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def feed(self, row: Row) -> InsertionRecord | None:
         """Add a package of the stream, `row`; return the insertion that it completes, else None.
 
+        An insertion begins when the trigger goes on after its `quiet_s`, and is complete with the
+        first package at or after its last sample, within half a step.
+
         Samples that were lost are NaN in the trace; all samples are NaN if packages are missing
         where the insertion began, so that its start is unknown. If the clock of the controller went
         back, because it was restarted, an insertion that has begun is returned as far as it was
@@ -222,7 +226,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
         Samples that did not come are NaN. All samples are NaN if packages are missing where the
         insertion began, so that its start is unknown, or if no insertion has begun. The recorder
-        then looks for the next one.
+        then looks for the next one, and what `arm` noted is discarded, too.
         """
         start = self._start
         first = self._first_time()

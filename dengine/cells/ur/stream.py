@@ -119,7 +119,8 @@ class RtdeClient:
     def send(self, values: Values) -> None:
         """Write all input fields in one package; a column that is left out is written as 0.
 
-        Names that are no columns are ignored. Raise CellError if the connection is lost.
+        Names that are no columns are ignored. Raise CellError if the connection is lost, and the
+        errors of `RtdeRecipe.pack`.
         """
         self._send(self._inputs.pack(values))
 
@@ -318,8 +319,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         All input fields that the stream was opened with are written: those that are left out become
         0, and other names are ignored. A lost connection raises nothing: the newest inputs are
         written again on the next connection, unless they are 10 s old by then or the controller was
-        restarted. Raises struct.error for a number that its field cannot hold, and in an integer
-        field ValueError for NaN and OverflowError for an infinity.
+        restarted. While there is a connection, raises struct.error for a number that its field
+        cannot hold, and in an integer field ValueError for NaN and OverflowError for an infinity.
 
         Parameters
         ----------
@@ -337,7 +338,7 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
 
         The caller holds the lock `_news`. A lost connection is noted in the attribute `trouble` and
         not raised: the thread reconnects and writes the inputs again, unless they are 10 s old by
-        then.
+        then. Raises the errors of `RtdeRecipe.pack`.
         """
         if self._client is not None and self._written is not None:
             try:
@@ -348,8 +349,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def _read_loop(self) -> None:
         """Receive packages and buffer them until the stream is closed: the body of the thread.
 
-        If the connection is lost, it reconnects, as often as that takes, and counts each new
-        connection. While there is no connection, the attribute `trouble` says why.
+        If the connection is lost, or its bytes are no RTDE, it reconnects, as often as that takes,
+        and counts each new connection. An input that cannot be packed (`RtdeRecipe.pack`) ends the
+        thread. While there is no connection, the attribute `trouble` says why.
         """
         while self._client is not None:
             client = self._client
@@ -376,11 +378,11 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         """Count a package and the packages missing before it, buffer it, and wake callers of
         `take`.
 
-        `row` is the package. One with the same time as the package before is counted as repeated;
-        one with an earlier time shows that the controller was restarted, which is counted, and the
-        newest inputs are discarded. If the buffer is full, its oldest package is dropped. At the
-        first package of a new connection the newest inputs, if they were not discarded, are written
-        again if they are less than 10 s old.
+        `row` is the package. Times are compared in whole steps of 1 / rate, rounded. One with the
+        same time as the package before is counted as repeated; one with an earlier time shows that
+        the controller was restarted, which is counted, and the newest inputs are discarded. If the
+        buffer is full, its oldest package is dropped. At the first package of a new connection the
+        newest inputs, if they were not discarded, are written again if they are less than 10 s old.
         """
         with self._news:
             if self._newest is not None:
@@ -401,9 +403,9 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     def _connect(self, until: float = float("inf")) -> RtdeClient | None:
         """Try to connect until that succeeds; return the connection, None if the stream is closed.
 
-        Failures are noted in the attribute `trouble`, and the attempts go on, at growing intervals
-        of up to 1 s. But for the first connection of the stream `until` is given, a time of
-        `time.monotonic`: then a failure raises its CellError or SettingError at once, unless
+        Failures are noted in the attribute `trouble`, and the attempts go on, at intervals that
+        double from 0.05 to 1 s. But for the first connection of the stream `until` is given, a time
+        of `time.monotonic`: then a failure raises its CellError or SettingError at once, unless
         another client of the controller still writes an input; for this the attempts go on until
         that time.
         """
