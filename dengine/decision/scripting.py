@@ -125,7 +125,8 @@ def restore(module: nn.Module, arrays: Arrays) -> None:
     Raises
     ------
     StoreError
-        If the names or shapes are not those of the module; nothing is written then.
+        If the names or shapes are not those of the module; nothing is written then. The values are
+        not checked.
     """
     tensors = module.state_dict()  # shares its tensors with the module
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
