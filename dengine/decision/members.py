@@ -290,17 +290,18 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count the outcome of a part, choose thresholds anew, and end a safe mode if it is due.
 
-        The outcome is offered to both sides, accepting and rejecting (`count_outcome`). A side
-        counts it if the score reaches one of the side's levels or `predicted` is the side's action,
-        and its drift detector takes a step if the score reaches the side's threshold. `lower` and
-        `upper` are the bound on the success probability that the part was decided by, `success` is
-        its label, and `predicted` (an `ActionCode`: 0 verify, 1 accept, 2 reject) is what the model
-        alone would have done. If the decision rule knows all outcomes (its own inclusion
-        probability is 1), every part counts as checked. Otherwise `inclusion_probability`, with
-        which this outcome would be asked for, says how it counts: 1 as checked, above 0 as audited,
-        and at 0 only the drift detectors see it. A wrong outcome may raise an alarm, which starts
-        the safe mode: both thresholds are then `CLOSED`, which no score reaches, so parts are
-        verified until a side has another threshold.
+        The outcome is offered to both sides, accepting and rejecting (`count_outcome`). The score
+        is `lower` for accepting, 1 - `upper` for rejecting. A side counts the outcome if the score
+        reaches one of the side's levels or `predicted` is the side's action, and its drift detector
+        takes a step if the score reaches the side's threshold. `lower` and `upper` are the bound on
+        the success probability that the part was decided by, `success` is its label, and
+        `predicted` (an `ActionCode`: 0 verify, 1 accept, 2 reject) is what the model alone would
+        have done. If the decision rule knows all outcomes (its own inclusion probability is 1),
+        every part counts as checked. Otherwise `inclusion_probability`, with which this outcome
+        would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0 only the
+        drift detectors see it. A wrong outcome may raise an alarm, which starts the safe mode: both
+        thresholds are then `CLOSED`, which no score reaches, so parts are verified until a side has
+        another threshold.
 
         A safe mode ends only here. After an alarm about accepted or rejected parts it ends when
         that side has another threshold than `CLOSED`; the other side may have one earlier, and then

@@ -182,13 +182,13 @@ class NoveltyGate(nn.Module):
 def fit_novelty(
     traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None
 ) -> NoveltyGate:
-    """Fit a novelty gate, by which these traces are not novel; there is no randomness.
+    """Fit a novelty gate, by which traces like these are not novel; there is no randomness.
 
     At most 500 (`REFERENCES`) of the traces, evenly spaced in time, become references, to which
-    other traces are compared; of these, traces whose features overflow are left out. Each of four
-    groups of features has a limit of its own: level (minima and maxima), texture (roughness),
-    distortions (what a faulty sensor or clock would do) and gaps (the quietest and the loudest
-    brief stretches).
+    other traces are compared; of these, traces whose features overflow are left out. A reference is
+    not novel; of the other traces some may be. Each of four groups of features has a limit of its
+    own: level (minima and maxima), texture (roughness), distortions (what a faulty sensor or clock
+    would do) and gaps (the quietest and the loudest brief stretches).
 
     Parameters
     ----------

@@ -110,7 +110,9 @@ def prepare_export(
     ----------
     engine_or_model : DataEngine or ModelPrediction
     trace : TraceSpec or None
-        The `TraceSpec` of the file, if it is not the engine's or the model's own.
+        The `TraceSpec` of the file, if it is not the engine's or the model's own. It must have the
+        shape of the model's traces; another one is noticed only if there are labelled traces to
+        compare, and is then an ExportError.
     path : path-like
         Where the file will be written.
     force : bool
@@ -220,11 +222,11 @@ def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
     `source` is what the file is made from. The dict has the schema (the version of its keys), the
-    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy, the limit of
-    novelty, the numbers of embedding spaces and of coordinates, the references (labelled points:
-    their number, their largest number and their SHA-256), the order of the fields of a decision, of
-    actions, reasons and safe modes, the audit rate, the seed and the recipe. `metadata_of` reads it
-    without loading the model.
+    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy (with a user's
+    rule as `module:Class`), the limit of novelty, the numbers of embedding spaces and of
+    coordinates, the references (labelled points: their number, their largest number and their
+    SHA-256), the order of the fields of a decision, of actions, reasons and safe modes, the audit
+    rate, the seed and the recipe. `metadata_of` reads it without loading the model.
     """
     model = source.model
     index = model.index

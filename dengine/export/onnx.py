@@ -78,7 +78,8 @@ def export_onnx(
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
         Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
-        `TraceSpec`. None: the engine's `TraceSpec`, or the shape of the model's traces.
+        `TraceSpec`. Its shape must be that of the model's traces. None: the engine's `TraceSpec`,
+        or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -336,7 +337,8 @@ def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None
     `spec`, if there is one. Raises ExportError if a coordinate of an embedding differs by more than
     0.0001 times (1 + its absolute value), if the counts of good and bad labels together differ by
     more than two, or if counts are equal but the action differs, or the two ends of the bound
-    together by more than 1e-6. Counts may differ, since a reference may lie exactly at the radius.
+    together by more than 1e-6. The noise is always the same. Counts may differ, since a reference
+    may lie exactly at the radius.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

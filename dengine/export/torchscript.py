@@ -106,7 +106,8 @@ def export_torchscript(
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
         Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
-        `TraceSpec`. None: the engine's `TraceSpec`, or the shape of the model's traces.
+        `TraceSpec`. Its shape must be that of the model's traces. None: the engine's `TraceSpec`,
+        or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False

@@ -825,9 +825,9 @@ class ModelPrediction(EngineModel):
     def defect(self) -> str:
         """Return why an engine must not use this version; "" if its tests find no reason.
 
-        The references must be finite, and so must the points to which the reducer maps `examples`,
-        some training traces. A reducer that is restored from the state of this one must map
-        `examples` to the same points within 1e-5 (`is_close`), each of two times; if a reducer
+        The references must be finite, and the points to which the reducer maps `examples`, some
+        training traces, must not be NaN. A reducer that is restored from the state of this one must
+        map `examples` to the same points within 1e-5 (`is_close`), each of two times; if a reducer
         gives no state, it must do so itself. The points, divided by the scale of their embedding
         space, are kept for `check_answers`. If restoring raises a StoreError, that is a defect;
         other errors are raised.

@@ -322,7 +322,8 @@ class RocketReducer(Reducer):
         """Draw the kernels anew and fit the classifier heads; earlier fits are discarded.
 
         If it raises, the earlier fit may be lost already, as after SettingError for a single class.
-        Unlike `train` it takes fewer than 20 traces, too.
+        Unlike `train` it takes fewer than 20 traces, too. Of more than 4000 traces, the heads are
+        fitted to 4000.
 
         Parameters
         ----------

@@ -415,7 +415,8 @@ class TorchReducer(Reducer):
         `optimizer` is that of `make_optimizer`. `members_`, with its statistics of batch
         normalisation, and the averaged weights change in place, and `n_steps_` grows by 1. Dropout
         draws from torch's global generator, if `members_` is in training mode. The loss is the one
-        before the step, the mean over the batch and over the K copies of the network.
+        before the step, the mean over the batch and over the K copies of the network; each copy
+        moves by the gradient of its own mean loss.
         """
         logits = self.members_(x)  # (B, K)
         loss = F.binary_cross_entropy_with_logits(logits, y)
@@ -431,8 +432,8 @@ class TorchReducer(Reducer):
         """Return a new AdamW for `members_`, with the moments that the last training left.
 
         The moments are the running means of gradients and of their squares. They are not copied: a
-        step of the optimiser changes `optimizer_state_`. Weight decay is for weights only, not for
-        biases and the parameters of batch normalisation.
+        step of the optimiser changes `optimizer_state_`. Weight decay is only for parameters of two
+        dimensions or more whose name ends in "weight", so not for biases and batch normalisation.
         """
         decayed: list[nn.Parameter] = []
         others: list[nn.Parameter] = []
@@ -602,11 +603,12 @@ class TorchReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self.
 
-        The constructor's parameters must be the same. Raises StoreError if the sizes are others, or
-        if the network gives points for a fixed trace that differ by more than 0.001 from those when
-        the state was taken; a state without these points is not checked so. Raises KeyError if an
-        array of counts, shape or loss is missing, and SettingError for a parameter or network that
-        cannot be used. After an error do not use the reducer.
+        The constructor's parameters must be the same. A tensor that the state lacks keeps its
+        initial value, since earlier releases stored fewer. Raises StoreError if the sizes are
+        others, or if the network gives points for a fixed trace that differ by more than 0.001 from
+        those when the state was taken; a state without these points is not checked so. Raises
+        KeyError if an array of counts, shape or loss is missing, and SettingError for a parameter
+        or network that cannot be used. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])

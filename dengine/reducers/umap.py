@@ -357,10 +357,11 @@ class UmapReducer(Reducer):
     ) -> None:
         """Train on traces (n, C, T) with their labels' numbers, and make a new `encoder_`.
 
-        It finds neighbours, joins them to a graph, and moves the points for `n_epochs` epochs
-        (None: `n_epochs_due`), or fewer if `stop` ends them. Without numbers all traces count as
-        new. Neighbours, points and encoder are replaced, and the counters of epochs grow. Noise and
-        negative samples follow from `seed_` and `n_steps_`.
+        It finds neighbours (from those of `precompute` or of the last training), joins them to a
+        graph, and moves the points for `n_epochs` epochs (None: `n_epochs_due`), or fewer if `stop`
+        ends them. Without numbers all traces count as new. Neighbours, points and encoder are
+        replaced, and the counters of epochs grow. Noise and negative samples follow from `seed_`
+        and `n_steps_`.
         """
         if numbers is None:
             numbers = np.arange(-len(traces), 0)  # numbers that no label has
