@@ -369,13 +369,12 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
 def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
     """Return (usual squared distance between nearest points, squared reach of each point (n,)).
 
-    `points` (n, P) are the features of n references; `same` (n, n), bool, marks pairs whose
-    distance does not count. The usual distance is the 99.5 % quantile of the squared distances to
-    the nearest other point, at most six times their 0.9 quantile, and at least 0.001. Points are
-    outliers if their nearest point is farther than that, or than both 0.001 and three times the 0.9
-    quantile. The reach is the usual distance. But if there are more than three outliers, one
-    reaches to its third nearest outlier, if that is farther and all other points are more than
-    twice as far.
+    `points` (n, P) are features of n references; `same` (n, n), bool, marks pairs whose distance
+    does not count. The usual distance is the 99.5 % quantile of squared distances to the nearest
+    other point, at most six times their 0.9 quantile, and at least 0.001. Outliers are farther than
+    that from all points, or than both 0.001 and three times the 0.9 quantile. The reach is the
+    usual distance; but of more than three outliers, one reaches to its third nearest outlier, if
+    that is farther and all other points are more than twice as far.
     """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)

@@ -74,7 +74,7 @@ def attributes_of(module: nn.Module) -> dict[str, Any]:
 
 
 def has_tensor(value: Any) -> bool:
-    """Return whether a value is a tensor, or a list, tuple or dict with a tensor in it."""
+    """Return whether a value is a tensor, or a list, tuple or dict with one in it at any depth."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list | tuple):

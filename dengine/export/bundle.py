@@ -111,8 +111,7 @@ def prepare_export(
     engine_or_model : DataEngine or ModelPrediction
     trace : TraceSpec or None
         The `TraceSpec` of the file, if it is not the engine's or the model's own. It must have the
-        shape of the model's traces; another one is noticed only if there are labelled traces to
-        compare, and is then an ExportError.
+        shape of the model's traces.
     path : path-like
         Where the file will be written.
     force : bool
@@ -128,10 +127,11 @@ def prepare_export(
     Raises
     ------
     ExportError
-        For a baseline; before the first training; for a rule, an interval or a reducer that
-        TorchScript cannot compile or run; if the compiled decision and the reducer map one of up to
-        eight labelled traces to different points (`compare_points`); if the rule is stale, because
-        an update of it failed; and if the store was changed from outside.
+        For a baseline; before the first training; for a `trace` of another shape; for a rule, an
+        interval or a reducer that TorchScript cannot compile or run; if the compiled decision and
+        the reducer map one of up to eight labelled traces to different points (`compare_points`);
+        if the rule is stale, because an update of it failed; and if the store was changed from
+        outside.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError

@@ -496,13 +496,12 @@ class RocketReducer(Reducer):
     ) -> None:
         """Fit the classifier heads of each `Tower`, and write them to `net_`, weighed to one logit.
 
-        Head k starts from its last weights, on the rows outside fold k of the raw features `raw`
-        (n, P), or of 4000 of them if there are more (`sample_rows`). `labels` (n,) are 1 or 0; for
-        `numbers` see `train`. `stop` may end the Newton steps of each tower, but in the first fit
-        its deadline leaves three. Principal components are computed anew at the first fit, after
-        every 20, and if there are at least 1.5 times as many rows as at the last time. It sets
-        `towers_`, `n_iter_` (most steps of a tower), `holdout_losses_`, `n_fits_`, and `note_`
-        (heads at their base rate in every tower, or "").
+        Head k starts from its last weights, on the rows outside fold k of raw features `raw` (n,
+        P), or of 4000 of more rows (`sample_rows`). `labels` (n,) are 1 or 0; for `numbers` see
+        `train`. `stop` may end each tower's Newton steps; in the first fit its deadline leaves
+        three. Components are computed anew at the first fit, after every 20, and if the rows are
+        1.5 times as many as then. It sets `towers_`, `n_iter_` (most steps of a tower),
+        `holdout_losses_`, `n_fits_`, and `note_` (heads at their base rate in every tower, or "").
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -633,10 +632,10 @@ class RocketReducer(Reducer):
         """Return the unscaled features (n, P) of traces (n, C, T), as a tensor.
 
         They are float32, computed from the outputs of the kernels. `numbers` (n,), those of the
-        labels, increasing, identify the traces: only features that the cache lacks are computed. It
-        is not checked that they increase. Afterwards the cache holds the features of these traces
-        and no others; the tensor that is returned shares its memory. Without numbers the cache is
-        neither read nor written.
+        labels, increasing, identify the traces: only features that the cache lacks are computed.
+        They must be neither -1 nor out of order, which is not checked. Afterwards the cache holds
+        the features of these traces and no others; the tensor that is returned shares its memory.
+        Without numbers the cache is neither read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
