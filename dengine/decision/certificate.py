@@ -370,11 +370,11 @@ class Certificate:
         """Return the claim about a group of parts as one sentence.
 
         It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
-        tolerance or, with prices, the share up to which the decision pays; or that nothing can be
-        said: if the group is empty, its `propensity` is 0 (for the reason `unknown`; accepts except
-        known stops), or the bound is 1. `which` describes the parts. With audits they are those
+        tolerance or, with prices, the share up to which the decision pays. Nothing can be said if
+        the group is empty, if its `propensity` is 0 (`unknown` says why; of accepts the known stops
+        are excepted), or if the bound is 1. `which` describes the parts. With audits they are those
         that the model would `verb` ("accept", "reject"), and so many were audited; in shadow mode
-        each was checked. `wrong`, "bad" or "good", is what a wrongly decided part was.
+        each was checked. `wrong` is "bad" or "good", what a wrongly decided part was.
         """
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""

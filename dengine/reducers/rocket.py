@@ -496,12 +496,12 @@ class RocketReducer(Reducer):
     ) -> None:
         """Fit the classifier heads of each `Tower`, and write them to `net_`, weighed to one logit.
 
-        Head k starts from its last weights, on the rows outside fold k of raw features `raw` (n,
-        P), or of 4000 of more rows (`sample_rows`). `labels` (n,) are 1 or 0; for `numbers` see
-        `train`. `stop` may end each tower's Newton steps; in the first fit its deadline leaves
-        three. Components are computed anew at the first fit, after every 20, and if the rows are
-        1.5 times as many as then. It sets `towers_`, `n_iter_` (most steps of a tower),
-        `holdout_losses_`, `n_fits_`, and `note_` (heads at their base rate in every tower, or "").
+        Head k starts from its last weights. It is fitted on the rows outside fold k of `raw` (n,
+        P), of at most 4000 (`sample_rows`). `labels` (n,) are 1 or 0; for `numbers` see `train`.
+        `stop` may end each tower's Newton steps; in the first fit its deadline leaves three.
+        Components are new at the first fit, after every 20, and for at least 1.5 times as many rows
+        as the last ones. Sets `towers_`, `n_iter_` (most steps of a tower), `holdout_losses_`,
+        `n_fits_`, and `note_` (heads at their base rate in every tower, or "").
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
