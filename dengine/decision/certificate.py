@@ -49,8 +49,9 @@ def log_evidence(n: int, n_bad: int, tolerance: float, propensity: float = 1.0) 
 
     The evidence is the capital of a bettor who bets on each part being good. It starts at 1, so the
     result is 0 for no parts. It falls with each bad part, unless tolerance and propensity are 1,
-    and rises with each other part, unless the tolerance is 0. It is a weighted mean of the capitals
-    of six bettors, each of whom always bets the same share of the capital. No argument is checked.
+    and rises with each other part, unless the tolerance is 0. It is the mean of the capitals of six
+    bettors, each of whom always bets the same share of the capital (`BETS`, 0.05 to 0.98), weighted
+    by these shares. No argument is checked.
 
     Parameters
     ----------
@@ -132,7 +133,8 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     """Design the CUSUM detector that notices soonest when the share of wrong decisions doubles.
 
     A wrong decision adds `step` to a sum, a right one takes 1 from it, and the sum restarts at 0 if
-    it would fall below. The detector alarms when the sum is `limit` or more.
+    it would fall below. The detector alarms when the sum is `limit` or more. The doubled share is
+    taken as 0.99 at most.
 
     Parameters
     ----------
@@ -145,7 +147,9 @@ def cusum(share: float, parts: float) -> tuple[int, int]:
     Returns
     -------
     step : int
-        What a wrong decision adds to the sum; at least 1.
+        What a wrong decision adds to the sum: its log likelihood ratio, of the doubled share to
+        `share`, in units of what a right decision takes from it, rounded to a whole number, and at
+        least 1.
     limit : int
         The smallest limit, 1 or more, with which `parts` or more pass on average.
 
@@ -303,7 +307,8 @@ class Certificate:
         """Return the price of the checks left out, and an upper bound on the cost of bad parts.
 
         Both are about accepted parts and in the unit of `prices`, which are the prices of a check,
-        of a bad accepted part and of a good rejected part; the last is not used.
+        of a bad accepted part and of a good rejected part; the last is not used. The bad parts are
+        at most `n * upper` of `accepted`, and at most all parts without a check.
         """
         check, escape, _ = prices
         n_unchecked = self.accepted.n_unchecked
@@ -322,9 +327,9 @@ class Certificate:
         It names the confidence and the tolerance (with prices, the share of bad parts up to which
         accepting pays). If nothing can be claimed, it says so, and why. If the certificate has
         prices, it also says what the checks that were left out would have cost, what bad parts cost
-        at most, rounded up, and the difference, rounded down: what was saved at least, or lost at
-        most. These costs are missing if the bound is 1 or all parts were checked. With prices the
-        last sentence says when accepting pauses.
+        at most, rounded up to a whole number, and the difference, rounded down: what was saved at
+        least or, if it is not above 0, lost at most. These costs are missing if the bound is 1 or
+        all parts were checked. With prices the last sentence says when accepting pauses.
         """
         unknown = (
             "silence is no success: set audit_rate, or stops='all' where every bad part stops the "
@@ -365,14 +370,11 @@ class Certificate:
         """Return the claim about a group of parts as one sentence.
 
         It gives the number of parts, the bound in per cent, rounded up, the confidence, and the
-        tolerance or, with prices, the share up to which the decision pays. It says that nothing can
-        be said if the group is empty, if its `propensity` is 0, because no outcome was asked for
-        (`unknown` is the reason that is given), or if the bound is 1.
-
-        `which` describes the parts, for example "rejected without a check". If outcomes come from
-        audits, the claim names instead the parts that the model would `verb` ("accept" or
-        "reject"), and how many of them were audited; in shadow mode, that each was checked. `wrong`
-        says what a wrongly decided part was, "bad" or "good".
+        tolerance or, with prices, the share up to which the decision pays. Nothing can be said if
+        the group is empty, if its `propensity` is 0 (`unknown` says why; of accepts the known stops
+        are excepted), or if the bound is 1. `which` describes the parts. With audits they are those
+        that the model would `verb` ("accept", "reject"), and so many were audited; in shadow mode
+        each was checked. `wrong` is "bad" or "good", what a wrongly decided part was.
         """
         parts = counted(group.n, "part")
         but = " beyond the known stops" if verb == "accept" else ""
@@ -443,14 +445,15 @@ def certify(
 
     Notes
     -----
-    If `stops` is "all", or every accepted part was confirmed or stopped the line, all outcomes are
-    known, and the bound is about the accepted parts. Otherwise it comes from audits and is about
-    all parts that the model would have accepted, those that were audited included; it is never
-    below the share known to be bad. Without audits it is 1. With audits and `stops` "some", the
-    bound may come from known outcomes now and from audits later. The two then share alpha, a tenth
-    for known outcomes and nine tenths for audits: whoever sees both is wrong with probability alpha
-    at most. The bound on rejected parts comes from audits, and without these it is 1; it is never
-    below the share known to be good. A forgotten or overdue label counts as a wrong decision.
+    If `stops` is "all", or if there are accepted parts and each was confirmed, stopped the line or
+    had its label forgotten, all outcomes are known, and the bound is about the accepted parts.
+    Otherwise it comes from audits and is about all parts that the model would have accepted, those
+    that were audited included; it is never below the share known to be bad. Without audits it is 1.
+    With audits and `stops` "some", the bound may come from known outcomes now and from audits
+    later. The two then share alpha, a tenth for known outcomes and nine tenths for audits: whoever
+    sees both is wrong with probability alpha at most. The bound on rejected parts comes from
+    audits, and without these it is 1; it is never below the share known to be good. A forgotten or
+    overdue label counts as a wrong decision.
     """
     expect(stops in ("all", "some"), "stops among all, some", stops)
     expect(0.0 < tolerance < 1.0, "0 < tolerance < 1", tolerance, "0.05 tolerates 5 % of errors")

@@ -77,6 +77,8 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         ------
         ValueError
             For more than two classes, and for arrays that scikit-learn refuses.
+        TypeError
+            If Z is sparse.
         SettingError
             For a radius or a setting of the policy out of its range; `capacity` is not checked.
         """
@@ -126,7 +128,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Parameters
         ----------
         Z : array, shape (n, d)
-            Points; ValueError if scikit-learn refuses them.
+            Points; ValueError if scikit-learn refuses them, TypeError if they are sparse.
 
         Returns
         -------
@@ -184,7 +186,7 @@ class WilsonRadiusClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[mi
         Returns float64 (n, 5), with the columns `ActionCode` (0 verify, 1 accept, 2 reject), lower,
         upper (bound on the success probability), n_success and n_failure (labels within the
         radius). Raises NotFittedError before `fit`, and ValueError for arrays that scikit-learn
-        refuses.
+        refuses (TypeError for sparse ones).
         """
         check_is_fitted(self)
         valid = validate_data(self, Z, reset=False)

@@ -99,7 +99,8 @@ class Decider(nn.Module):
         """Decide on one trace.
 
         First come faults of the trace, then the operator's force limits, then the model, then the
-        audit draw. The model predicts only if the trace has no fault and is within the limits.
+        audit draw. The model predicts only if the trace has no fault and is within the limits;
+        outside the limits it only embeds. What it raises is raised here.
 
         Parameters
         ----------

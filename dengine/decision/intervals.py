@@ -86,7 +86,7 @@ def wilson_interval(n_success: ArrayLike, n_failure: ArrayLike, alpha: float = 0
     Raises
     ------
     SettingError
-        If alpha is not between 0 and 1.
+        If alpha is not between 0 and 1, or so small that 1 - alpha / 2 rounds to 1.
     ValueError
         If the shapes differ or a count is negative.
 
@@ -205,7 +205,8 @@ def wilson_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[An
     Returns
     -------
     lower, upper : float64 array or tensor of that shape
-        (0, 1) if nothing was counted.
+        Cut to [0, 1], and moved to enclose the observed rate if rounding left it outside; (0, 1) if
+        nothing was counted.
     """
     n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
     centre = (n_success + z * z / 2.0) / (n + z * z)
@@ -228,7 +229,8 @@ def wald_limits(xp: Any, n_success: Any, n_failure: Any, z: float) -> tuple[Any,
     Returns
     -------
     lower, upper : float64 array or tensor of that shape
-        Cut to [0, 1]; (0, 1) if nothing was counted.
+        Cut to [0, 1], and moved to enclose the observed rate if rounding left it outside; (0, 1) if
+        nothing was counted.
     """
     n = xp.where(n_success + n_failure > 0.0, n_success + n_failure, 1.0)
     half_width = z / xp.sqrt(n) * xp.sqrt(n_success * n_failure / (n * n))
@@ -240,8 +242,8 @@ def wilson_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float
     """Compute the Wilson interval of a success probability from two integer counts.
 
     `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
-    [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles
-    it.
+    [0, 1], which encloses the observed rate, and is (0, 1) if both counts are 0. The counts are not
+    checked. TorchScript compiles it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:
@@ -256,8 +258,8 @@ def wald_bound(n_success: int, n_failure: int, z: float) -> tuple[float, float]:
     """Compute the Wald interval of a success probability from two integer counts.
 
     `z` is the normal quantile of the interval (`normal_quantile`). Returns (lower, upper) within
-    [0, 1], which is (0, 1) if both counts are 0. The counts are not checked. TorchScript compiles
-    it.
+    [0, 1], which encloses the observed rate, and is (0, 1) if both counts are 0. The counts are not
+    checked. TorchScript compiles it.
     """
     total = float(n_success + n_failure)
     if total == 0.0:
@@ -277,7 +279,8 @@ def scalar_interval(
     """Evaluate any interval of `INTERVALS` on two integers; TorchScript cannot compile it.
 
     It has the parameters of a `ScalarBound` behind `interval` and `alpha`; z is not used. Returns
-    lower and upper as floats. Raises ValueError for a negative count.
+    lower and upper as floats. Raises ValueError for a negative count, SettingError for an alpha out
+    of range.
     """
     lower, upper = INTERVALS[interval](n_success, n_failure, alpha)
     return float(lower), float(upper)

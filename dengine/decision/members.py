@@ -93,8 +93,10 @@ def log_capital_steps(tolerance: float, inclusion_probability: float) -> list[fl
 
     The bet is that the share of wrong parts (bad if accepted, good if rejected) is below
     `tolerance`, and its capital is the evidence for this: 1 / alpha or more refutes, at error level
-    alpha, that the share of wrong parts is above the tolerance. A checked part's outcome was asked
-    for with certainty, an audited part's with the probability `inclusion_probability`.
+    alpha, that the share of wrong parts is above the tolerance. The stake is `BET` / (1 - `BET` *
+    tolerance), where `BET` is 0.55. A checked part's outcome was asked for with certainty, an
+    audited part's with the probability `inclusion_probability`; the stake on a checked part is
+    multiplied by this probability.
 
     Returns
     -------
@@ -261,8 +263,9 @@ class MemberEvidence(nn.Module):
 
         `novel` says whether the trace of this part was novel. Outside of a safe mode it steps the
         detector of novel traces. In a safe mode that began because of novel traces, the sum of that
-        detector counts how long few traces have been novel, by which `update` ends the safe mode.
-        In any other safe mode `novel` has no effect.
+        detector counts how long few traces have been novel, by which `update` ends the safe mode: a
+        trace that was not novel adds 1, a novel one takes 4 from the sum, or from 0 if that was
+        lower. In any other safe mode `novel` has no effect.
         """
         self.step_detector(Detector.ACCEPTED_PARTS.value, self.correct_step, n_unreported)
         safe_mode = int(self.safe_mode.item())
@@ -287,21 +290,24 @@ class MemberEvidence(nn.Module):
     ) -> None:
         """Count the outcome of a part, choose thresholds anew, and end a safe mode if it is due.
 
-        In a safe mode all parts are verified. The outcome is counted on both sides, for accepting
-        and for rejecting. `lower` and `upper` are the bound on the success probability that the
-        part was decided by, `success` is its label, and `predicted` (an `ActionCode`: 0 verify, 1
-        accept, 2 reject) is what the model alone would have done. If the decision rule knows all
-        outcomes (its own inclusion probability is 1), every part counts as checked. Otherwise
-        `inclusion_probability`, with which this outcome would be asked for, says how it counts: 1
-        as checked, above 0 as audited, and at 0 only the drift detectors see it. A wrong outcome
-        may raise an alarm, which starts the safe mode: both thresholds are then `CLOSED`, which no
-        score reaches, so parts are verified until a side has another threshold.
+        The outcome is offered to both sides, accepting and rejecting (`count_outcome`). The score
+        is `lower` for accepting, 1 - `upper` for rejecting. A side counts the outcome if the score
+        reaches one of the side's levels or `predicted` is the side's action, and its drift detector
+        takes a step if the score reaches the side's threshold. `lower` and `upper` are the bound on
+        the success probability that the part was decided by, `success` is its label, and
+        `predicted` (an `ActionCode`: 0 verify, 1 accept, 2 reject) is what the model alone would
+        have done. If the decision rule knows all outcomes (its own inclusion probability is 1),
+        every part counts as checked. Otherwise `inclusion_probability`, with which this outcome
+        would be asked for, says how it counts: 1 as checked, above 0 as audited, and at 0 only the
+        drift detectors see it. A wrong outcome may raise an alarm, which starts the safe mode: both
+        thresholds are then `CLOSED`, which no score reaches, so parts are verified until a side has
+        another threshold.
 
         A safe mode ends only here. After an alarm about accepted or rejected parts it ends when
         that side has another threshold than `CLOSED`; the other side may have one earlier, and then
-        decides again. After too many novel traces it ends when few traces are novel again and one
-        of the two thresholds is not `CLOSED`. The sum of the detector of novel traces then restarts
-        at 0.
+        decides again. After too many novel traces it ends when few traces are novel again (the sum
+        of their detector is 25 or more, see `observe`) and one of the two thresholds is not
+        `CLOSED`. At the end of any safe mode this sum restarts at 0.
         """
         side = Detector.ACCEPTED_PARTS.value
         self.count_outcome(side, lower, not success, predicted, inclusion_probability)
@@ -329,7 +335,8 @@ class MemberEvidence(nn.Module):
         Side 0 is accepting, and its `score` is the lower bound of the success probability; side 1
         is rejecting, and its score is 1 - upper bound. `wrong` says whether this action would have
         been wrong for the part. If the score reaches the threshold of the side, the drift detector
-        of the side takes a step first, which may start the safe mode (all is verified).
+        of the side takes a step first, which may start the safe mode; all that follows then uses
+        the strictest level as target.
 
         If the decision rule knows all outcomes, the part counts as checked; otherwise
         `inclusion_probability` says how: 1 as checked, above 0 as audited, and 0 not at all. Each
@@ -416,13 +423,14 @@ class MemberEvidence(nn.Module):
         """Set target level and threshold of one side (0 accepting, 1 rejecting) from the counts.
 
         The target is the lowest level (possible threshold) whose parts since the last alarm give
-        enough evidence. The evidence is the log capital of a bet on the tolerance, or under the
-        priced rule what was saved minus what errors cost. Under the pooled rule it is also required
-        that few of the newest 50 parts of the level were wrong (`max_recent_errors`). If no level
-        meets this, the target is the strictest level. The threshold is the score of the target if
-        such a level was found, all members (the parts that the promise is about) so far give enough
-        evidence, and the members since an alarm, if there was one, show recovery; otherwise it is
-        `CLOSED`, which no score reaches.
+        enough evidence. The evidence is the log capital of a bet on the tolerance, of which log(1 /
+        alpha) is enough. Under the priced rule it is what was saved minus what errors cost, in
+        units of one error, of which -2 (`OVERDRAFT`) is enough for accepting and 0 for rejecting.
+        Under the pooled rule it is also required that few of the newest 50 parts of the level were
+        wrong (`max_recent_errors`). If no level meets this, the target is the strictest level. The
+        threshold is the score of the target if such a level was found, all members (the parts that
+        the promise is about) so far give enough evidence, and the members since an alarm, if there
+        was one, show recovery; otherwise it is `CLOSED`, which no score reaches.
 
         The watched rule (the paper's rule with a safe mode) has no target. Only an alarm closes its
         threshold, which becomes the first level again once the members since the alarm show
@@ -464,9 +472,11 @@ class MemberEvidence(nn.Module):
 
         `side` is 0 for accepting, 1 for rejecting; members are the parts that the promise is about.
         The number supposes that their outcomes go on as they were since the alarm. It is 0 or less
-        if they show recovery now, so that the side may open again. It is huge, about 1e12 or more,
-        while their evidence does not grow. Under the priced rule at least 25 members since the
-        alarm (`FEWEST_SINCE_ALARM`) are needed. Nothing is changed.
+        if they show recovery now, so that the side may open again. It is huge, of the order of
+        1e12, while their evidence is not enough and not above 0. The evidence is the log capital of
+        the bet; under the priced rule it is the balance of costs, and at least 25 members since the
+        alarm (`FEWEST_SINCE_ALARM`) are needed; under the watched rule it is the log likelihood
+        ratio of the tolerance to its double. Nothing is changed.
         """
         counts: list[int] = self.member_counts_since_alarm[side].flatten().tolist()
         n = counts[0] + counts[2]

@@ -20,7 +20,7 @@ def fade(probability: float, n_labels: int, prior_labels: float) -> float:
 
     Its logit is multiplied by `n_labels` / (`n_labels` + `prior_labels`), where `prior_labels` says
     how strongly it is drawn, as a number of labels. If `prior_labels` is 0, the probability is
-    returned unchanged.
+    returned unchanged; otherwise it is 1/2 without labels.
     """
     if prior_labels == 0.0:
         return probability
@@ -90,8 +90,8 @@ class RadiusNeighbours(nn.Module):
             0 verify, 1 accept, 2 reject.
         lower, upper : float
             Bound on the success probability, from the counts. If `scored`, both are the mean of the
-            first coordinates in the K spaces, drawn towards 1/2 by the rule's `prior_labels`
-            (`fade`), and the action follows from this mean.
+            first coordinates in the K spaces, drawn towards 1/2 by the rule's `prior_labels` and
+            the number of all references (`fade`), and the action follows from this mean.
         n_success, n_failure : int
             Labels within the radius; several labels of one part may count as fewer
             (`RadiusIndex.count_votes`).

@@ -139,11 +139,11 @@ class NoveltyGate(nn.Module):
         A channel is cut into S segments, overlapping stretches of equal length that together cover
         the trace. For each channel the features are the S minima and the S maxima of the segments,
         then 2*S + 3 logarithms of roughness, which is the norm of the differences of successive
-        samples in a stretch. The first S are of first differences in the segments, the next S of
-        second differences in the segments. The last three, for gaps, are of first differences in
-        brief stretches, which have a hundredth of the samples of a trace: the least roughness over
-        stretches of twice that length, then the least and the largest over stretches of that
-        length.
+        samples in a stretch, plus `noise_floor`. The first S are of first differences in the
+        segments, the next S of second differences in the segments. The last three, for gaps, are of
+        first differences in brief stretches, which have a hundredth of the samples of a trace,
+        rounded down, and at least one: the least roughness over stretches of twice that length,
+        then the least and the largest over stretches of that length.
         """
         pieces = x.unfold(-1, self.length, self.stride)  # (..., C, S, L)
         steps = x[..., 1:] - x[..., :-1]  # from sample to sample
@@ -171,7 +171,8 @@ class NoveltyGate(nn.Module):
     def roughness(self, x: Tensor, length: int, stride: int) -> Tensor:
         """Return the norm of each stretch of `length` values of x (..., T), shape (..., n).
 
-        A stretch begins at every `stride`-th value. A shorter x is one stretch.
+        A stretch begins at every `stride`-th value, as long as it fits; values behind the last one
+        are not read. A shorter x is one stretch.
         """
         stretches = x.unfold(-1, max(0, min(length, x.size(-1))), stride)
         norms: Tensor = torch.linalg.vector_norm(stretches, dim=-1)
@@ -181,28 +182,30 @@ class NoveltyGate(nn.Module):
 def fit_novelty(
     traces: NDArray[np.float32], margin: float, parts: NDArray[np.int64] | None = None
 ) -> NoveltyGate:
-    """Fit a novelty gate, by which these traces are not novel; there is no randomness.
+    """Fit a novelty gate, by which traces like these are not novel; there is no randomness.
 
     At most 500 (`REFERENCES`) of the traces, evenly spaced in time, become references, to which
-    other traces are compared; of these, traces whose features overflow are left out. Each of four
-    groups of features has a limit of its own: level (minima and maxima), texture (roughness),
-    distortions (what a faulty sensor or clock would do) and gaps (the quietest and the loudest
-    brief stretches).
+    other traces are compared; of these, traces whose features overflow are left out. A reference is
+    not novel; of the other traces some may be. Each of four groups of features has a limit of its
+    own: level (minima and maxima), texture (roughness), distortions (what a faulty sensor or clock
+    would do) and gaps (the quietest and the loudest brief stretches).
 
     Parameters
     ----------
     traces : array of float32, shape (n, C, T)
         Finite, with any labels, oldest first.
     margin : float
-        Factor on the limits, which are squared distances. A limit is the 99.5 % quantile of the
-        references' squared distances to the nearest other reference, at least 0.001; if there are
-        outliers, it is less, so that a few of them do not set it. With n < 200 different references
-        it is multiplied by 200 / n; the limit of distortions is multiplied by 500 / n with n < 500.
-        The limit of gaps is at least 4 in the end. An outlier in a cluster of outliers has a wider
-        limit, by the distance to its third nearest outlier.
+        Factor on the limits, which are squared distances; above 0, which is not checked. A limit is
+        the 99.5 % quantile of the references' squared distances to the nearest other reference, at
+        least 0.001; it is capped at six times the 90 % quantile, so that a few outliers do not set
+        it. With n < 200 different references it is multiplied by 200 / n; the limit of distortions
+        is multiplied by 500 / n with n < 500. The limit of gaps is at least 4 in the end. An
+        outlier in a cluster of outliers has a wider limit, by the distance to its third nearest
+        outlier.
     parts : array of int64, shape (n,), optional
-        Hash of the part of each trace; None: each trace is of another part. Only distances between
-        different parts and different traces count, because a trace that came twice is near itself.
+        Hash of the part of each trace; traces with the same value, also 0, are of one part. None:
+        each trace is of another part. Only distances between different parts and different traces
+        count, because a trace that came twice is near itself.
 
     Returns
     -------
@@ -261,8 +264,9 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
 
     `gate` says how many samples each of the 2*S + 3 roughnesses of a channel is taken over (they
     are norms of differences in a stretch of samples, see `plain_features`). The result is a
-    twentieth of the median roughness of the traces x (n, C, T), scaled to the length of the
-    stretch. For a channel that never moved it is 1e-12: any movement there is then far away.
+    twentieth of the median roughness of the traces x (n, C, T), times the root of the share of
+    samples in the stretch, and at least 1e-12, as for a channel that is constant in half of the
+    traces or more: any movement there is then far away.
     """
     n_samples = x.size(2)
     steps = torch.zeros(x.size(1))
@@ -275,9 +279,10 @@ def _noise_floor(gate: NoveltyGate, x: Tensor) -> Tensor:
 def _distort(x: Tensor) -> list[Tensor]:
     """Return distorted copies of traces x (n, C, T): a list of 14 tensors of that shape.
 
-    They are what a sensor or a clock would make of the traces, each in both directions: gain and
-    fading gain (4), offset, drift and a step (6), speed and delay (4). Beyond its ends a trace is
-    mirrored.
+    They are what a sensor or a clock would make of the traces, each in both directions: a gain of
+    0.6 and of 1.6, and one that falls or rises by 0.4 (4); an offset of 0.4, and a drift and a step
+    in the middle of 0.5 median deviations of the channel (6); 8 % of speed and a delay of a 30th
+    (4). Beyond its ends a trace is mirrored.
     """
     n_samples = x.size(2)
     t = torch.linspace(0.0, 1.0, n_samples)
@@ -299,13 +304,12 @@ def _distort(x: Tensor) -> list[Tensor]:
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) -> Tensor:
     """Return Fisher's discriminants between traces and their distortions, float32, shape (P, D).
 
-    A distortion is what a faulty sensor or clock would make of a trace (`_distort`). Column j
-    separates the traces from their j-th distortion; it is for features that are not standardised.
-    `x` (n, C, T) are the traces, and `plain` (n, P), float64, their features, computed by
-    `gate.plain_features`. `used` (P,), bool, marks the features that the discriminants read; the
-    rows of the others are 0. Only some of the traces, evenly spaced and fewer than 250, are
-    distorted; the mean difference is taken over these. Inside, standardised features are clipped at
-    6 deviations.
+    Column j separates the traces x (n, C, T) from their j-th distortion (`_distort`); it is for
+    features that are not standardised. `plain` (n, P), float64, are the traces' features by `gate`.
+    Only features that `used` (P,), bool, marks are read; the rows of the others are 0. Of the
+    traces fewer than 250, evenly spaced, are distorted, for the mean difference. The covariance is
+    that of all traces, shrunk towards the identity, plus half of that of the distorted. Inside,
+    standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
@@ -325,14 +329,12 @@ def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) ->
 def _standardise(features: Tensor) -> tuple[Tensor, Tensor]:
     """Return (offset, gain), float64 (P,) each, so that offset + gain * features is standardised.
 
-    `features` are float64 (n, P), where P is the number of features and n, the number of
-    references, is at least 3. The 1 + n // 200 smallest and largest values of each feature are
-    first clipped to the next value inside, so that a glitch in one reference does not set the scale
-    of the others. Mean and deviation are those of the clipped values.
-
-    The gain is 1 / (deviation + floor), so it is finite. The floor is 1 % of the median deviation
-    of all features, plus 1e-5 of the feature's absolute mean, which covers its rounding errors. So
-    a feature that is constant in the references lies far out as soon as it moves.
+    `features` are float64 (n, P); n, the number of references, is at least 3. The 1 + n // 200
+    smallest and largest values of each feature are first clipped to the next value inside, so that
+    a glitch sets no scale; mean and deviation are those of the clipped values. The gain is 1 /
+    (deviation + floor). The floor is 1 % of the median deviation of all features, plus 1e-5 of the
+    feature's absolute mean, for its rounding errors, plus 1e-12: a feature that is constant in the
+    references lies far out as soon as it moves.
     """
     n = len(features)
     n_outer = 1 + n // TAIL_TRACES
@@ -367,16 +369,12 @@ def _find_same(traces: NDArray[np.float32], parts: NDArray[np.int64] | None) -> 
 def _usual_distance_and_reach(points: Tensor, same: Tensor) -> tuple[float, Tensor]:
     """Return (usual squared distance between nearest points, squared reach of each point (n,)).
 
-    `points` is (n, P), the features of n references; `same` (n, n), bool, marks pairs whose
-    distance does not count. The usual distance is the 99.5 % quantile of the squared distances to
-    the nearest other point. It is capped at six times their 0.9 quantile, so that a few outliers
-    are not the measure of the others, and is at least 0.001. Outliers are the points whose nearest
-    point is farther than that, or farther than both 0.001 and three times the 0.9 quantile.
-
-    The reach of a point is the usual distance. But if more than three points are outliers, some of
-    them may be a cluster, a kind of its own: an outlier reaches to its third nearest outlier if all
-    points that are no outliers are more than twice as far as that one. The reach is never less than
-    the usual distance.
+    `points` (n, P) are features of n references; `same` (n, n), bool, marks pairs whose distance
+    does not count. The usual distance is the 99.5 % quantile of squared distances to the nearest
+    other point, at most six times their 0.9 quantile, and at least 0.001. Outliers are farther than
+    that from all points, or than both 0.001 and three times the 0.9 quantile. The reach is the
+    usual distance; but of more than three outliers, one reaches to its third nearest outlier, if
+    that is farther and all other points are more than twice as far.
     """
     norms = points.square().sum(1)
     squared = torch.addmm(norms + norms[:, None], points, points.t(), alpha=-2.0)

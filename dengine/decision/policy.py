@@ -183,8 +183,9 @@ class Policy:
         """Return the policy whose settings `to_values` returned; missing ones have their defaults.
 
         `values` holds the settings by name. The force limits are one text, separated by spaces, or
-        "none"; in older stores their name is "windows". Names that are no settings are ignored.
-        Raises SettingError for a value out of its range.
+        "none"; in older stores their name is "windows". Names that are no settings are ignored. A
+        missing audit rate, guarantee or price follows from the others, as in the class. Raises
+        SettingError for a value out of its range.
         """
         names = [field.name for field in fields(cls)]
         settings = {name: values[name] for name in names if name in values}

@@ -42,8 +42,9 @@ def label_agreement(
 ) -> float:
     """Bound from above how strongly the labels of one part agree: their intraclass correlation.
 
-    It is computed after the success rate around each point is subtracted from its label, because
-    neighbouring parts agree as well.
+    It is computed after the success rate among the 30 nearest points of other parts in the same
+    space is subtracted from each label (`_success_rate_around`), because neighbouring parts agree
+    as well.
 
     Parameters
     ----------
@@ -352,7 +353,8 @@ class RadiusIndex(nn.Module):
     ) -> None:
         """Add many points, the first row as the oldest; in a full index they replace the oldest.
 
-        `agreement` is not computed anew, see `estimate_agreement`.
+        `agreement` is not computed anew, see `estimate_agreement`. `total` grows by n, also if
+        fewer rows are added.
 
         Parameters
         ----------
@@ -370,7 +372,7 @@ class RadiusIndex(nn.Module):
         Raises
         ------
         ValueError
-            For other shapes.
+            For other shapes. If `numbers` has another one, the points are partly added already.
         """
         z = np.array(points, dtype=np.float32)  # copies, for torch needs writable arrays
         y = np.array(labels, dtype=np.float32)
@@ -479,8 +481,9 @@ class RadiusIndex(nn.Module):
         """Return a new index for `capacity` points with the points of a state.
 
         `state` is what `get_state` returned, and is not changed. With the same capacity each point
-        has its old position. With a smaller `capacity` the newest points stay. With a larger one
-        the oldest point is at the first position, and `total` no longer counts points that left.
+        has its old position. With a smaller `capacity` the newest points stay, as many as it holds.
+        With a larger one the oldest point is at the first position, and `total` no longer counts
+        points that left.
         """
         n = state["points"].shape[1]
         index = cls(len(state["points"]), capacity)

@@ -74,7 +74,7 @@ def attributes_of(module: nn.Module) -> dict[str, Any]:
 
 
 def has_tensor(value: Any) -> bool:
-    """Return whether a value is a tensor, or a list, tuple or dict with a tensor in it."""
+    """Return whether a value is a tensor, or a list, tuple or dict with one in it at any depth."""
     if isinstance(value, dict):
         value = list(value.values())
     if isinstance(value, list | tuple):
@@ -125,7 +125,8 @@ def restore(module: nn.Module, arrays: Arrays) -> None:
     Raises
     ------
     StoreError
-        If the names or shapes are not those of the module; nothing is written then.
+        If the names or shapes are not those of the module; nothing is written then. The values are
+        not checked.
     """
     tensors = module.state_dict()  # shares its tensors with the module
     shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}

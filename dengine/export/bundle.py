@@ -64,7 +64,8 @@ def make_key(path: FilePath) -> Path:
     Raises
     ------
     ExportError
-        If there is a file already, because models may be signed with it, or it cannot be written.
+        If there is a file already, because models may be signed with it, or it cannot be written; a
+        file that was begun then stays.
     """
     target = Path(path)
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL
@@ -101,14 +102,16 @@ def prepare_export(
 ) -> tuple[Exportable, DecisionModule]:
     """Check that an engine or a model can be exported, and build its decision module.
 
-    Nothing is written. The module shares references and decision rule with the model. Its decider
-    is compiled already; the module itself is not.
+    No file is written; but for an engine traces are read, and each damaged one is noted as an event
+    in the store. The module shares references and decision rule with the model. Its decider is
+    compiled already; the module itself is not.
 
     Parameters
     ----------
     engine_or_model : DataEngine or ModelPrediction
     trace : TraceSpec or None
-        The `TraceSpec` of the file, if it is not the engine's or the model's own.
+        The `TraceSpec` of the file, if it is not the engine's or the model's own. It must have the
+        shape of the model's traces.
     path : path-like
         Where the file will be written.
     force : bool
@@ -124,15 +127,20 @@ def prepare_export(
     Raises
     ------
     ExportError
-        For a baseline; before the first training; for a rule, an interval or a reducer that
-        TorchScript cannot compile or run; if the compiled decision and the reducer map a trace to
-        different points; if the rule is stale, because an update of it failed; and if the store was
-        changed from outside.
+        For a baseline; before the first training; for a `trace` of another shape; for a rule, an
+        interval or a reducer that TorchScript cannot compile or run; if the compiled decision and
+        the reducer map one of up to eight labelled traces to different points (`compare_points`);
+        if the rule is stale, because an update of it failed; and if the store was changed from
+        outside.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
         If one of the files (`path`, its checksum, its signature) must not be written; this is
         checked first.
+    StoreError
+        If the engine's store cannot be read.
+    OSError
+        If the source text of the reducer's module, which TorchScript compiles, cannot be found.
     """
     _check_outputs(path, force)
     source = exportable(engine_or_model, trace)
@@ -174,7 +182,8 @@ def exportable(engine_or_model: Any, trace: TraceSpec | None = None) -> Exportab
     traces it was trained on. The model is not copied, and goes on learning. `trace` replaces the
     `TraceSpec` of the engine or the model. If an `Exportable` is given, it is returned as it is,
     and `trace` is ignored. Raises ExportError before the first training, for a baseline, and if the
-    engine's store was changed from outside.
+    engine's store was changed from outside; StoreError if it cannot be read. A damaged trace is
+    left out, and noted as an event in the store.
     """
     if isinstance(engine_or_model, Exportable):
         return engine_or_model
@@ -213,11 +222,11 @@ def describe(source: Exportable) -> Metadata:
     """Return the description that is written into the file, as a dict for JSON.
 
     `source` is what the file is made from. The dict has the schema (the version of its keys), the
-    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy, the limit of
-    novelty, the numbers of embedding spaces and of coordinates, the references (labelled points:
-    their number, their largest number and their SHA-256), the order of the fields of a decision, of
-    actions, reasons and safe modes, the audit rate, the seed and the recipe. `metadata_of` reads it
-    without loading the model.
+    versions of dengine, torch and the model, the time, the `TraceSpec`, the policy (with a user's
+    rule as `module:Class`), the limit of novelty, the numbers of embedding spaces and of
+    coordinates, the references (labelled points: their number, their largest number and their
+    SHA-256), the order of the fields of a decision, of actions, reasons and safe modes, the audit
+    rate, the seed and the recipe. `metadata_of` reads it without loading the model.
     """
     model = source.model
     index = model.index
@@ -273,12 +282,14 @@ def write_export(
     content : bytes
         What it shall hold.
     force : bool, default False
-        Whether it may replace a file. Without a key the signature of the replaced file is removed.
+        Whether it may replace a file. If so, and without a key, the signature of the replaced file
+        is removed at the end.
     key : path-like, optional
         File of the key to sign with.
     source : Exportable, optional
         Its `note` records checksum and model version as an event. No event is recorded without
-        `source`, or if its `note` is None.
+        `source`, or if its `note` is None. What `note` raises is raised here, before a file is
+        written: StoreError, if an engine that only reads cannot write the event.
 
     Returns
     -------
@@ -288,9 +299,11 @@ def write_export(
     Raises
     ------
     OutputError
-        If a file must not or cannot be written.
+        If a file must not or cannot be written; files that were written before it stay.
     ExportError
         If the key cannot be read.
+    OSError
+        If an old signature cannot be removed.
     """
     target = Path(path)
     digest = hashlib.sha256(content).hexdigest()

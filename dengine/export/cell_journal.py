@@ -96,9 +96,10 @@ def read_journal(path: FilePath, spec: TraceSpec) -> CellJournal:
     later one with it (`late`). A last line that was not finished is left out, see `cut`.
 
     The first line whose checksum does not fit, and all lines after it, are set aside without an
-    error, and `set_aside` of the result says so. If all lines fit, they are compared with
-    FILE.head, which holds the number of lines and the last checksum: `set_aside` then says if lines
-    are missing at the end. If FILE.head is missing or cannot be read, a warning is logged.
+    error, and `set_aside` of the result says so (or the DataError, if nothing of use is left). If
+    all lines fit, they are compared with FILE.head, which holds the number of lines and the last
+    checksum: `set_aside` then says if lines are missing at the end. If FILE.head is missing or
+    cannot be read, a warning is logged.
 
     Parameters
     ----------
@@ -180,8 +181,8 @@ def _missing_at_end(path: FilePath, crcs: list[int]) -> str:
     """Return a sentence if a journal lacks the line that its head names, else "".
 
     The head is the file PATH.head; it holds a number of lines and the checksum of the last of them.
-    `crcs` are the checksums of the journal's lines. If the head is missing or cannot be read, a
-    warning is logged and "" is returned.
+    `crcs` are the checksums of the journal's lines, the first line included. If the head is missing
+    or cannot be read, a warning is logged and "" is returned.
     """
     head = Path(f"{os.fspath(path)}.head")
     risk = "lines may have been removed at its end, or lost with the power."
@@ -233,10 +234,11 @@ def _parse_part(words: list[str], spec: TraceSpec) -> JournalLine:
 def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) -> ImportReport:
     """Import what an exported cell learned into the store of its engine.
 
-    A part that was imported before is not imported again. The decision rule and the certificate
-    count imported parts like the engine's own. If a line is missing or was changed, only the lines
-    before it are imported. A store that was passed open stays open; on PostgreSQL it owns the cell
-    until it is closed.
+    A part that was imported before is not imported again, but its label is, if it has none yet; a
+    label that contradicts the stored one is only counted. A part whose trace has a fault is
+    quarantined. The decision rule and the certificate count imported parts like the engine's own.
+    If a line is missing or was changed, only the lines before it are imported. A store that was
+    passed open stays open; on PostgreSQL it owns the cell until it is closed.
 
     Parameters
     ----------
@@ -261,6 +263,8 @@ def import_journal(store: "StoreLike", path: FilePath, any_model: bool = False) 
     StoreError
         If there is no store, an engine runs on the cell, or the store has no `TraceSpec` or recipe.
         Also if the store fails; chunks of 500 parts that were stored before stay.
+    SettingError
+        If this version cannot read the store's recipe.
     OSError
         If the journal cannot be read.
     """

@@ -101,7 +101,7 @@ class DecisionModule(nn.Module):
 
         Before that, an accept that is still pending is settled (`settle`): it is learned as good,
         or counts as unreported. Any other pending decision is discarded. After a faulty trace no
-        decision is pending.
+        decision is pending. If the decider raises, the accept is settled already.
 
         Parameters
         ----------
@@ -175,7 +175,9 @@ class DecisionModule(nn.Module):
         If the trace and its part are those of the pending decision, its bound is used, and no
         decision is pending afterwards. Otherwise the trace is first decided on, because a bound
         must be computed before the label is known; the pending decision then stays pending. A
-        faulty trace is ignored. If the index is full, its oldest reference is dropped.
+        faulty trace is ignored. If the index is full, its oldest reference is dropped. The rule
+        also learns how many accepts were unreported since the last label, and this count restarts
+        at 0.
 
         Parameters
         ----------
@@ -231,7 +233,7 @@ class DecisionModule(nn.Module):
 
         A pending accept is the part decided last, if it was accepted and nothing was reported on
         it. With `stops_all` (every line stop is reported) it is learned as good: the decision rule
-        is updated, and the trace becomes a reference. Otherwise it counts as unreported. Then no
+        is updated, and the trace becomes a reference. Otherwise `n_unreported` grows by 1. Then no
         decision is pending. If the pending decision is no accept, or there is none, nothing
         changes.
         """
@@ -258,9 +260,10 @@ class DecisionModule(nn.Module):
         A pending accept is first settled by `settle`; any other pending decision is discarded. The
         trace, (T,) or (C, T), is embedded anew. `action` (0 verify, 1 accept, 2 reject), `reason`
         (a position in `Reason`) and the bound, `lower` and `upper`, are taken as they are given;
-        `part` is the hash of the part, 0 if unknown. What the model alone would have done follows
-        from action, reason and bound. After a faulty trace no decision is pending. Raises
-        ValueError, or torch.jit.Error if compiled, for another shape.
+        `part` is the hash of the part, 0 if unknown. What the model alone would have done is VERIFY
+        if a force limit decided, the action of the rule as it is now on this bound if the part was
+        audited, else `action`. After a faulty trace no decision is pending. Raises ValueError, or
+        torch.jit.Error if compiled, for another shape.
         """
         x = self.as_trace(trace)
         self.settle()

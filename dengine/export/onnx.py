@@ -68,7 +68,8 @@ def export_onnx(
     """Write the decision of an engine, or of a fitted model, as ONNX, with its checksum beside it.
 
     The file is written only if onnxruntime decides on random traces as the model does. An engine's
-    store records the export as an event.
+    store records the export as an event. While torch makes the program, Python's warnings, and log
+    messages up to level WARNING, are off in the whole process.
 
     Parameters
     ----------
@@ -77,7 +78,8 @@ def export_onnx(
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
         Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
-        `TraceSpec`. None: the engine's `TraceSpec`, or the shape of the model's traces.
+        `TraceSpec`. Its shape must be that of the model's traces. None: the engine's `TraceSpec`,
+        or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -98,11 +100,13 @@ def export_onnx(
         exported; if the compiled decision and the reducer map a trace to different points; if the
         rule is stale, because an update of it failed; if the store was changed from outside; if the
         key cannot be read; if a package is missing; and if onnxruntime does not decide like the
-        model.
+        model. Other errors of torch and onnxruntime are raised as they are.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
         If a file exists, without `force`, or cannot be written.
+    StoreError, OSError
+        As in `prepare_export` and `write_export`.
     """
     onnx = _import_package("onnx")
     source, _ = prepare_export(engine_or_model, trace, path, force)
@@ -137,8 +141,9 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     Raises
     ------
     ExportError
-        For a file that is missing, damaged or not signed with the key, that is no ONNX export, has
-        another schema or is refused by onnxruntime, and if a package for ONNX is missing.
+        For a file that is missing, damaged or not signed with the key, a key that cannot be read, a
+        file that is no ONNX export, has another schema or is refused by onnxruntime, and if a
+        package for ONNX is missing.
     """
     onnx = _import_package("onnx")
     target = Path(path)
@@ -289,7 +294,7 @@ class OnnxDecision(nn.Module):
 
         `distances` are the squared distances to the references, (n,). The results are tensors
         without a dimension. The action, 0 verify, 1 accept or 2 reject, follows from the bound
-        (`lower`, `upper`) by the paper's rule.
+        (`lower`, `upper`) by the paper's rule. A reference at the radius counts.
         """
         is_inside = distances <= self.radius * self.radius
         n_success = (is_inside & (self.labels == 1)).to(torch.int64).sum()
@@ -328,11 +333,12 @@ def _to_onnx(decision: OnnxDecision, spec: TraceSpec) -> Any:
 def _check_decisions(onnx_model: OnnxModel, model: Any, spec: TraceSpec) -> None:
     """Compare an ONNX model with the model that it was made from, on 64 traces of noise.
 
-    The noise has amplitudes from 0.01 to 100, and stays within 0.9 times the sensor's limit in
-    `spec`, if there is one. Raises ExportError if embeddings differ by more than 0.0001, if the
-    counts of good and bad labels together differ by more than two, or if counts are equal but
-    action or bound differ. Smaller differences of counts are allowed, since references may lie
-    exactly at the radius.
+    The noise has amplitudes from 0.01 to 100, and is clipped at 0.9 times the sensor's limit in
+    `spec`, if there is one. Raises ExportError if a coordinate of an embedding differs by more than
+    0.0001 times (1 + its absolute value), if the counts of good and bad labels together differ by
+    more than two, or if counts are equal but the action differs, or the two ends of the bound
+    together by more than 1e-6. The noise is always the same. Counts may differ, since a reference
+    may lie exactly at the radius.
     """
     rng = np.random.default_rng(0)
     shape = (N_CHECKED, spec.channels, spec.samples)

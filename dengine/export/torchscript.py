@@ -106,7 +106,8 @@ def export_torchscript(
         The checksum is written beside it, as PATH.sha256.
     trace : TraceSpec, optional
         Needed for a `ModelPrediction` whose traces have another rate or limit than the defaults of
-        `TraceSpec`. None: the engine's `TraceSpec`, or the shape of the model's traces.
+        `TraceSpec`. Its shape must be that of the model's traces. None: the engine's `TraceSpec`,
+        or the shape of the model's traces.
     key : path-like, optional
         File of a key (`make_key`); the signature is written beside the file, as PATH.sig.
     force : bool, default False
@@ -121,13 +122,15 @@ def export_torchscript(
     ------
     ExportError
         If nothing was trained yet, for a baseline, if the reducer, the interval or the decision
-        rule cannot be compiled, if the compiled decision and the reducer map a trace to different
-        points, if the rule is stale, because an update of it failed, if the store was changed from
-        outside, and if the key cannot be read.
+        rule cannot be compiled, if the compiled decision and the reducer map one of up to eight
+        labelled traces to different points, if the rule is stale, because an update of it failed,
+        if the store was changed from outside, and if the key cannot be read.
     SettingError
         If the engine's force limits do not fit `trace`.
     OutputError
         If a file exists, without `force`, or cannot be written.
+    StoreError, OSError
+        As in `prepare_export` and `write_export`.
     """
     source, module = prepare_export(engine_or_model, trace, path, force)
     with instead(ExportError, "The decision does not compile to TorchScript", RuntimeError):
@@ -286,8 +289,8 @@ class ExportedModel:
 
         Parameters, checksum and signature are as in `export_torchscript`; no store records it.
         Returns the file, which `load_exported` reads; its description lacks the checksum of the
-        references. Raises OutputError if it cannot be written, ExportError if the key cannot be
-        read.
+        references. Raises OutputError if it must not or cannot be written, ExportError if the key
+        cannot be read.
         """
         # The sum of the references is that of the first export.
         changes = {"references": self.module.n_references(), "references_sha256": None}
@@ -303,7 +306,8 @@ def _part_hash(part: Any) -> int:
 def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedModel:
     """Check an exported file, load it and warm it up.
 
-    From then on torch uses one thread in this process, which is steadier by far at these sizes.
+    Once checksum, signature and description are checked, torch uses one thread in this process for
+    good, also if the loading fails: it is steadier by far at these sizes.
 
     Parameters
     ----------
@@ -320,9 +324,11 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
     ------
     ExportError
         Before anything is loaded: for a file that is missing, damaged, truncated, no export or of
-        another schema, or that was not signed with the key. Afterwards: if it is no TorchScript, if
-        its description does not fit its module, or if this machine does not compute the embedding
-        that the file holds for a test trace.
+        another schema, or that was not signed with the key, and for a key that cannot be read.
+        Afterwards: if it is no TorchScript, if its description does not fit its module, or if this
+        machine does not compute the embedding that the file holds for a test trace, up to 0.0001
+        times (1 + the absolute value) of each coordinate. Errors inside the module, torch.jit.Error
+        or RuntimeError, are raised as they are.
     """
     target = Path(path)
     content = read_checked(target, key)
@@ -349,8 +355,10 @@ def load_exported(path: FilePath, *, key: FilePath | None = None) -> ExportedMod
 def _check_golden(model: ExportedModel, path: Path) -> None:
     """Warm a model up on the test trace in its file; raise ExportError for another embedding.
 
-    The test trace and its expected embedding are the entry "golden" of the description. The model
-    decides on the trace and learns it several times, so pass a copy. `path` is named in the error.
+    The test trace and its expected embedding are the entry "golden" of the description. A
+    coordinate may differ by 0.0001 times (1 + its absolute value). The model decides on the trace
+    three times, learns it as good, and as bad, and its `metadata` changes, so pass a copy. `path`
+    is named in the error.
     """
     golden = model.metadata["golden"]
     trace = np.array(golden["trace"], dtype=np.float32)

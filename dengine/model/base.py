@@ -197,8 +197,8 @@ class EngineModel(ABC):
 
         The conditions are the force limits, the range of the sensor and the audits. The decider is
         built anew if none is kept, or if the kept one is for other conditions; this raises what
-        `build_decider` raises. None, which only a `ModelPrediction` takes, stands for no force
-        limits, a sensor without a known range, and no audits.
+        `build_decider` raises. None, which only a `ModelPrediction` (dengine's own model) takes,
+        stands for no force limits, a sensor without a known range, and no audits.
         """
         is_same = conditions is self._conditions or conditions == self._conditions
         if self._decider is None or not is_same:
@@ -209,7 +209,8 @@ class EngineModel(ABC):
     def build_decider(self, conditions: Any) -> Decider:
         """Build a decider for these conditions, which asks this model's `predict_one`.
 
-        It is returned, not kept; `decider` keeps one.
+        It is returned, not kept; `decider` keeps one. Raises SettingError if the force limits do
+        not fit the traces.
         """
         return Decider(PythonPredictor(self), conditions)
 
@@ -398,8 +399,9 @@ class PythonPredictor(nn.Module):
 def as_engine_model(model: Model) -> EngineModel:
     """Return the model itself if it is an `EngineModel`, else a baseline in a `BaselineAdapter`.
 
-    The baseline is not copied. Raises SettingError for a class, and for an object that lacks a
-    method of `Model`: fit, add, count, predict_interval or decide.
+    The baseline is not copied. Only the names of its methods are checked. Raises SettingError for a
+    class, and for an object that lacks a method of `Model`: fit, add, count, predict_interval or
+    decide.
     """
     if isinstance(model, EngineModel):
         return model
@@ -444,9 +446,9 @@ class BaselineAdapter(EngineModel):
         It has the action, the bounds of the success probability and the label counts of the
         baseline. The reason is UNCERTAIN for VERIFY, otherwise CERTAIN; there is no embedding.
         `hash_` has no effect, because a baseline knows nothing of parts. Raises ValueError for an
-        unknown action and for counts that are not whole numbers from 0 to 2**63 - 1 (OverflowError
-        for an infinite count). Errors of the baseline are raised as they are, and bounds are not
-        checked.
+        unknown action, for other than one value of each, and for counts that are not whole numbers
+        from 0 to 2**63 - 1 (OverflowError for an infinite count). Errors of the baseline are raised
+        as they are, and bounds are not checked.
         """
         X = x[None]
         (lower,), (upper,) = self.model.predict_interval(X)

@@ -172,7 +172,7 @@ def template_of(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
     `warm_up_shape` (C, T) whose samples rise from 0 to 1, so that later calls are fast. The process
     keeps it, and drops the oldest if there were 16 (`KINDS`) before. All deciders of a structure
     have the same template, so do not change it: `compiled` copies it. Raises what `script` raises
-    if TorchScript cannot compile the decider.
+    if TorchScript cannot compile the decider, and torch.jit.Error if it cannot run.
     """
     structure = structure_of(eager)
     if (template := _COMPILED.get(structure)) is None:
@@ -191,7 +191,8 @@ def structure_of(eager: nn.Module) -> tuple[Any, ...]:
     """Return a hashable key, equal for two modules if one compiled module can serve for both.
 
     The key holds the class and the attributes of all submodules of `eager`, a module in Python; of
-    a tensor it holds only the shape, because `compiled` sets the values. The module of the force
+    a tensor it holds only the shape, because `compiled` sets the values. Objects that are no
+    constant, tensor, function, list, tuple or dict make no difference. The module of the force
     limits is left out, so that their number makes no difference. The class itself is in the key,
     not its name: a notebook cell that is run again defines another class.
     """
@@ -233,7 +234,7 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 
     It is a copy of the template that the process keeps for all deciders of this structure. If the
     process has no such template, `template_of` compiles it, and calls it on a trace of
-    `warm_up_shape` (C, T). Raises what `script` raises if TorchScript cannot compile it.
+    `warm_up_shape` (C, T). Raises what `template_of` raises.
     """
     module = copy.deepcopy(template_of(eager, warm_up_shape))
     submodules = dict(module.named_modules(remove_duplicate=False))
@@ -248,7 +249,7 @@ def compiled(eager: Decider, warm_up_shape: tuple[int, ...]) -> Any:
 def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]:
     """Compare the embeddings of a decider with the points of a reducer.
 
-    Each step of the iterator decides on one trace.
+    Each step of the iterator decides on one trace; what the decider raises is raised there.
 
     Parameters
     ----------
@@ -261,8 +262,8 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
     Yields
     ------
     str
-        For each trace a sentence on what is wrong; "" if the two agree within 0.001
-        (`SAME_POINTS`), and for a trace in which the decider finds a fault.
+        For each trace a sentence on what is wrong; "" if the two agree (`is_close`, within 0.001),
+        and for a trace in which the decider finds a fault.
     """
     for x, expected in zip(X, points, strict=True):
         with torch.inference_mode():
@@ -274,7 +275,7 @@ def compare_points(decider: Decider, X: Floats, points: Floats) -> Iterator[str]
 def is_close(points: Floats, expected: Floats, tolerance: float = SAME_POINTS) -> bool:
     """Return whether points are not NaN and equal the expected ones within a tolerance.
 
-    The tolerance is relative for large coordinates and absolute for small ones.
+    A coordinate may differ by `tolerance` times (1 + the absolute value of the expected one).
     """
     return bool(np.allclose(points, expected, rtol=tolerance, atol=tolerance))
 
@@ -343,8 +344,8 @@ class ModelPrediction(EngineModel):
         """Return the untrained model that a `Recipe` describes; `seed` is for the reducer.
 
         Reducer, radius, folds, novelty, policy and decision rule are the recipe's; `recipe.window`
-        is the largest number of references. Raises SettingError if the reducer or the rule cannot
-        be made.
+        is the largest number of references. The class of a user is imported. Raises SettingError if
+        the reducer or the rule cannot be made.
         """
         policy = recipe.policy
         classifier = WilsonRadiusClassifier(
@@ -372,7 +373,8 @@ class ModelPrediction(EngineModel):
 
         Radius, alpha, lower bound and interval are taken from the model's classifier, folds and
         novelty from the model. For fewer than 2 folds 2 is written, the least that a Recipe takes.
-        All else, such as the reducer and the window, stays as in the recipe.
+        All else, such as the reducer and the window, stays as in the recipe. Raises SettingError
+        for a setting that `Recipe` or `Policy` refuses.
         """
         classifier = self.classifier
         policy = replace(
@@ -457,9 +459,9 @@ class ModelPrediction(EngineModel):
         replaced, the decider is dropped and built anew when it is used, and the decision rule stays
         as it is. y (n,) are labels, 1 or 0; `hashes` (n,), of the parts, give the folds; `numbers`
         (n,), of the labels, are kept with the references; `stop` may end the reducer's training
-        early. Extreme samples are clipped first. Raises SettingError if the reducer cannot be
-        trained on these traces, and if 20 traces or more are all of one part. If the reducer
-        raises, it may be changed already; all else is not.
+        early. Extreme samples are clipped first. Raises what the reducer's `train` raises, such as
+        SettingError if it cannot be trained on these traces, and SettingError if 20 traces or more
+        are all of one part. If the reducer raises, it may be changed already; all else is not.
         """
         X = clip_extremes(X)
         y = y.astype(np.int64)
@@ -492,11 +494,13 @@ class ModelPrediction(EngineModel):
     def precompute(self, X: Floats, numbers: Ints | None = None) -> None:
         """Let the reducer compute in advance what a training on these traces (n, C, T) begins with.
 
-        `numbers` are the labels' sequence numbers, by which the reducer finds its results again. It
-        computes in a thread of its own. Before the first training, if reducer and decision rule can
-        be compiled, the caller's thread compiles a decider meanwhile, because the first retrain has
-        no time for that; the process keeps it as a template (`template_of`). The call returns when
-        both are done, and raises what either raised.
+        `numbers` are the labels' sequence numbers, by which the reducer finds its results again.
+        Extreme samples are clipped first. It computes in a thread of its own, with one thread of
+        torch, after its `untrained_module`, which may draw kernels, was asked for. Before the first
+        training, if reducer and decision rule can be compiled, the caller's thread compiles a
+        decider meanwhile, because the first retrain has no time for that; the process keeps it as a
+        template (`template_of`). The call returns when both are done, and raises what either raised
+        (the caller's thread first).
         """
         X = clip_extremes(X)
         encoder = self.spaces.untrained_module(X)
@@ -565,8 +569,10 @@ class ModelPrediction(EngineModel):
         ------
         ValueError, AttributeError
             If nothing was fitted.
-        RuntimeError, FrontendError, OSError
-            If TorchScript cannot compile the reducer's module, see `script`.
+        SettingError
+            If the force limits do not fit the traces.
+        RuntimeError, torch.jit.Error, FrontendError, OSError
+            If TorchScript cannot compile or run the reducer's module, see `script`.
         """
         conditions = conditions or DecisionConditions(self.trace_spec)
         encoder = self.spaces.module()
@@ -607,7 +613,7 @@ class ModelPrediction(EngineModel):
         stands for the part. The reducer is not trained, and a full index drops its oldest
         reference. Samples are not checked: a NaN makes a reference of NaN. Returns self. Raises
         ValueError if nothing was fitted, TraceError for a trace of another shape, and ReportError
-        for another label.
+        for another label; also what `build_decider` raises, if no decider is kept.
         """
         X = as_traces(np.asarray(x)[None], self.trace_spec)
         hash_ = int(content_hash(X)[0])
@@ -631,7 +637,7 @@ class ModelPrediction(EngineModel):
         without both it is computed from the trace. A full index drops its oldest reference. `y` is
         1 for success, 0 for failure; `number` is the sequence number of this label. Returns the
         reference point, float32 (d,), divided by the scale of the space. Raises ValueError if it
-        must be computed and nothing was fitted.
+        must be computed and nothing was fitted, otherwise AttributeError if nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])
@@ -696,7 +702,7 @@ class ModelPrediction(EngineModel):
         return self.rule.learns()
 
     def with_policy(self, policy: Policy) -> Self:
-        """Return a model under another policy; it shares the references and the reducer.
+        """Return a model under another policy; it shares all that was trained.
 
         Its decision rule is new, has learned nothing and is not stale; its decider is not built
         yet. This model does not change, except that a reference that is added to either is in both.
@@ -719,8 +725,9 @@ class ModelPrediction(EngineModel):
 
         Returns action, bounds of the success probability, label counts, embedding (K, d) and
         reason, as a `Prediction`. References of the part with the hash `hash_` are not counted; 0
-        excludes none. The trace's shape is not checked. Raises RuntimeError if the decision rule is
-        stale, because an update of it failed, and ValueError if nothing was fitted.
+        excludes none. The trace's shape is not checked. A decider is built and kept if none is.
+        Raises RuntimeError if the decision rule is stale, because an update of it failed,
+        ValueError if nothing was fitted, and what `build_decider` raises.
         """
         with torch.inference_mode():
             predicted = self.predictor(torch.from_numpy(x), hash_)
@@ -816,14 +823,14 @@ class ModelPrediction(EngineModel):
         return model
 
     def defect(self) -> str:
-        """Return why an engine could not open a store with this version; "" if it could.
+        """Return why an engine must not use this version; "" if its tests find no reason.
 
-        The references must be finite, and so must the points to which the reducer maps `examples`,
-        some training traces. A reducer that is restored from the state of this one must map
-        `examples` to the same points, each of two times; if a reducer gives no state, it must do so
-        itself. The points, divided by the scale of their embedding space, are kept for
-        `check_answers`. If restoring raises a StoreError, that is a defect; other errors are
-        raised.
+        The references must be finite, and the points to which the reducer maps `examples`, some
+        training traces, must not be NaN. A reducer that is restored from the state of this one must
+        map `examples` to the same points within 1e-5 (`is_close`), each of two times; if a reducer
+        gives no state, it must do so itself. The points, divided by the scale of their embedding
+        space, are kept for `check_answers`. If restoring raises a StoreError, that is a defect;
+        other errors are raised.
         """
         if not np.isfinite(self.index.column("points")).all():
             return "the embedding of a reference is not finite"
@@ -874,11 +881,12 @@ class ModelPrediction(EngineModel):
         References, scale (the divisor of the points in each embedding space), decision rule (in
         place) and novelty gate are restored, and the reducer if the state holds it. If it does not
         (`needs_refit`), train this model on the same traces before this call. The decider is
-        dropped. If the rule was stale, the state does not hold it, and this model's rule stays as
-        it is; `rule_is_stale` always stays as it is. Raises StoreError if the state holds no
-        reducer although this fitted reducer gives a state, and for a rule or gate of other sizes.
-        For the state of another reducer it raises StoreError, KeyError, ValueError or
-        NotImplementedError. After an error do not use the model.
+        dropped, and `examples` stay. An index with a smaller capacity keeps the newest references.
+        If the rule was stale, the state does not hold it, and this model's rule stays as it is;
+        `rule_is_stale` always stays as it is. Raises StoreError if the state holds no reducer
+        although this fitted reducer gives a state, and for a rule or gate of other sizes. For the
+        state of another reducer it raises StoreError, KeyError, ValueError or NotImplementedError.
+        After an error do not use the model.
         """
         if not self.needs_refit(state):
             self.spaces.set_state(arrays_with_prefix(state, "reducer."))
@@ -911,10 +919,12 @@ def near_repeats(traces: Floats, parts: NDArray[np.int64]) -> int:
     Labels are counted as independent trials, so the number of a part that is inserted again must be
     given (`part=`). This function notices plain cases in which it was not; no decision depends on
     it. A trace is compared with the traces of other parts only, by the distance between the means
-    of about 50 stretches of samples. It nearly repeats one if the nearest of them is nearer than
-    0.12 times the distance to the eleventh nearest (`NEAR`, `NEIGHBOURS`). So a trace with more
-    than 10 near repeats does not count, and a trace that has only 1 to 10 traces of other parts to
-    compare with counts.
+    of 50 to 99 stretches of samples (fewer if there are fewer samples), from which the mean over
+    all traces is subtracted, in units of the standard deviation of the channel. It nearly repeats
+    one if the nearest of them is nearer than 0.12 times the distance to the eleventh nearest
+    (`NEAR`, `NEIGHBOURS`), and that distance is above 1e-6. So a trace with more than 10 near
+    repeats does not count, and a trace that has only 1 to 10 traces of other parts to compare with
+    counts.
 
     Parameters
     ----------

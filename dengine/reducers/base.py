@@ -77,7 +77,7 @@ class StopRule:
     def exhausted(self, step: int, min_steps: int = 0) -> bool:
         """Return whether step number `step`, counted from 0, may not begin any more.
 
-        That is so once `max_steps` steps were taken, or once the deadline has passed and at least
+        That is so once `max_steps` steps were taken, or once the deadline is reached and at least
         `min_steps` steps were taken. With a deadline, `late` becomes True if the deadline is the
         reason; if the step may begin, `late` becomes False and `last_step` the present time. If
         `max_steps` is the reason, neither is changed.
@@ -180,6 +180,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
             Before a fit.
         ValueError
             If a value is not finite, or the traces have another shape than in `fit`.
+        TypeError
+            If X is sparse.
         """
         traces = self.check_traces(X)
         return np.concatenate(
@@ -422,7 +424,8 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
     Returns
     -------
     array of float32, shape (K,)
-        1 for a fold without points, or if their spread is not finite or not above rounding errors.
+        1 for a fold without points, or if their spread is not finite or not above rounding errors,
+        about 1e-6 of the largest coordinate.
     """
     scale = np.ones(n_spaces, dtype=np.float32)
     for k in range(n_spaces):
@@ -492,7 +495,7 @@ def folds_of(traces: Floats, n_folds: int, folds: Any = None) -> Ints:
     """Return the folds of traces (n, C, T), int64 (n,): those given, or by a hash of each trace.
 
     Given folds are cast to int64. Raises SettingError unless there is one for each trace, and each
-    lies between 0 and n_folds - 1.
+    lies between 0 and n_folds - 1; what NumPy raises for folds that are no numbers.
     """
     if folds is None:
         return content_fold(traces, n_folds)
@@ -660,9 +663,10 @@ class CrossFitted(_Wrapping):
         SettingError
             If K is below 2, the labels are missing or not of two classes, or the traces outside a
             fold have a single class.
-        TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite. Errors of the clones are
-            raised as they are.
+        TraceError, ValueError, TypeError
+            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
+            below 1e-12 but not all are 0 (`check_traces`). Errors of the clones are raised as they
+            are.
         """
         expect(self.folds >= 2, "folds >= 2 for a reducer that uses labels", self.folds)
         traces = self.check_traces(X, reset=True)

@@ -20,9 +20,9 @@ SEPARATE = re.compile(r"^(networks\.networks\.)\d+\.")  # names of parameters in
 def save_checkpoint(members: Members, path: str | Path) -> None:
     """Write the weights of `members`, a single copy of a network, to a file.
 
-    An existing file is replaced. The file is written as a whole or not at all. Buffers, such as the
-    statistics of batch normalisation, are written as well. Raises SettingError if `members` holds
-    more than one copy, OutputError if the file cannot be written.
+    An existing file is replaced, but no database, folder or link. The file is written as a whole or
+    not at all. Buffers, such as the statistics of batch normalisation, are written as well. Raises
+    SettingError if `members` holds more than one copy, OutputError if the file cannot be written.
     """
     expect(members.count == 1, "a single copy of the network", members.count)
     content = BytesIO()  # torch's own writer aborts the process on a full disk

@@ -91,8 +91,8 @@ class ConvNetwork(nn.Module):
 
         The module computes `members` separate networks at once. The outputs of their convolutions
         are pooled to the mean and maximum of each region of the trace (early, middle, late) and of
-        the whole trace, and then pass the hidden layer and a ReLU. In training mode dropout makes
-        the result random.
+        the whole trace (whose mean is that of the means of the regions), and then pass the hidden
+        layer and a ReLU. In training mode dropout makes the result random.
         """
         h = self.convolutions(x)  # (B, members * C * 2 * width, P)
         mean = F.avg_pool1d(h, self.window, self.stride)  # (B, ..., regions)
@@ -239,8 +239,11 @@ class ConvReducer(TorchReducer):
     ) -> Floats:
         """Fit the classifier heads of `rocket_`, then train the network until `stop` ends it.
 
-        `numbers` (n,) identify the traces, see `RocketReducer.train`. Returns the points of the
-        traces, float32 (n, d), with averaged logits, row i in space ``folds[i]``.
+        `stop` is asked before the steps of both, and counts each from 0. `numbers` (n,) identify
+        the traces, see `RocketReducer.train`. Returns the points of the traces, float32 (n, d),
+        with averaged logits, row i in space ``folds[i]``. Sets what `TorchReducer._train` and
+        `RocketReducer._fit_heads` set; raises SettingError like the former, with `rocket_` trained
+        already.
         """
         probabilities = self.rocket_.train_heads(traces, labels, folds, stop, numbers)  # (n, 1)
         points = super()._train(traces, labels, folds, stop, steps)
@@ -268,7 +271,8 @@ class ConvReducer(TorchReducer):
 
         The constructor's parameters must be the same. Raises StoreError if the state is of another
         network, or of an older release, which stored no `rocket_`. Raises what
-        `TorchReducer.set_state` raises. After an error do not use the reducer.
+        `TorchReducer.set_state` and `RocketReducer.set_state` raise. After an error do not use the
+        reducer.
         """
         rocket = arrays_with_prefix(state, "rocket.")
         if not rocket:  # stored when conv was its network alone

@@ -115,14 +115,15 @@ def fit_heads(
 ) -> HeadsFit:
     """Fit K classifier heads, ridge logistic regressions, by Newton's method with a line search.
 
-    Head k, trained without the labels of fold k, minimises the sum of its log losses plus
-    ``l2 / 2 * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the
-    same weights wherever it starts, unless the steps are limited. A step that raises the loss of a
-    head is halved up to six times, and then left out. A head has converged when its next step would
-    change no weight by more than about 0.0002. If the leave-one-out loss of a head is above the
-    loss of its base rate, the share of successes among its rows, the head is replaced by the base
-    rate. This is decided for each head alone, since a common decision would let the labels of fold
-    k choose head k.
+    Head k, trained without the labels of fold k, minimises the sum of its log losses plus ``l2 / 2
+    * |w| ** 2``; the ridge of the bias is nearly 0. This is convex, so a head ends at the same
+    weights wherever it starts, unless the steps are limited. A step that raises the loss of a head,
+    ridge included, is halved; if six sizes raise it, the step is left out. A head has converged
+    when its next step would change no weight by more than about 0.0002. The factor of its Hessian
+    is used again after a step whose largest change is at most a quarter of that of the step before,
+    and at most 0.3. If the leave-one-out loss of a head is above the loss of its base rate, the
+    share of successes among its rows, the head is replaced by the base rate. This is decided for
+    each head alone, since a common decision would let the labels of fold k choose head k.
 
     Parameters
     ----------
@@ -243,7 +244,8 @@ def leave_one_out(problem: RidgeProblem, logits: Tensor, factors: Tensor) -> Ten
     Returns
     -------
     Tensor of float64, shape (K, n)
-        Exact to first order for rows that train the head; of no use for other rows.
+        Exact to first order for rows that train the head, unless the divisor of the correction is
+        below 0.05, which is then taken; of no use for other rows.
 
     References
     ----------

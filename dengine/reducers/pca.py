@@ -59,9 +59,10 @@ class PcaReducer(Reducer):
         SettingError
             If there are `n_components` traces or fewer, or if a trace has fewer samples than that,
             all channels together.
-        TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite. ValueError also for a
-            parameter that scikit-learn refuses, such as `n_components=0`.
+        TraceError, ValueError, TypeError
+            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
+            below 1e-12 but not all are 0 (`check_traces`). ValueError also for a parameter that
+            scikit-learn refuses, such as `n_components=0`.
         """
         rows = as_rows(self.check_traces(X, reset=True))
         if len(rows) <= self.n_components:

@@ -49,9 +49,9 @@ class Preprocessor(nn.Module):
         """Set the mean and scale of each channel, and the scale of its differences, in place.
 
         Only the first 256 of the traces (n, C, T) are read. First `average` neighbouring samples
-        are averaged to one. A channel x is then standardised to (x - mean) * scale, clipped at
-        ±8. `difference_scale` is for the differences in time of the standardised channel. A scale
-        is 1 / (standard deviation + a small floor); the floor is for a channel that never moved.
+        are averaged to one. A channel x is then standardised to (x - mean) * scale, clipped at ±8.
+        `difference_scale` is for the differences in time of the standardised channel. A scale is 1
+        / (standard deviation + a small floor); the floor, 1e-6, is for a channel that never moved.
         """
         averaged = self.average_samples(traces[:STATISTICS_TRACES]).double()
         self.mean.copy_(averaged.mean((0, 2))[:, None])
@@ -93,8 +93,9 @@ def averaging(traces: Tensor, min_frames: int = MIN_FRAMES) -> int:
     Returns
     -------
     int
-        The largest number that leaves `min_frames` samples, and 80 % of the variance of each
-        channel; 1 if there is none, because the traces are short or oscillate.
+        The largest number that leaves at least `min_frames` samples, and at least 80 % of the
+        variance of each channel, taken over all traces and samples; 1 if there is none, because the
+        traces are short or oscillate.
     """
     traces = traces[:: 1 + (len(traces) - 1) // STATISTICS_TRACES]
     samples = traces.size(2)

@@ -180,7 +180,7 @@ class Tower(NamedTuple):
         -------
         Tower
             Its components are sorted by variance, the largest first. The axes of components that
-            are no more than noise, with less than a millionth of the largest variance, are 0.
+            are no more than noise, with a millionth of the largest variance or less, are 0.
         """
         centred = f - f.mean(0)
         # In float32, in half the time: components are told from noise to 1e-6.
@@ -216,8 +216,8 @@ def weigh_towers(
     Each `Tower`, a group of features, has a classifier head k, trained without the labels of fold
     k. The first tower starts with a share of 1. Then each further tower gets a share of 0 to 1 in
     steps of 0.1, and the shares of the towers before it are multiplied by the rest. The share is
-    chosen that has the smallest penalised log loss on the rows outside fold k, so that labels of
-    fold k do not reach embedding space k.
+    chosen that has the smallest penalised log loss on the rows outside fold k (of several the
+    largest), so that labels of fold k do not reach embedding space k.
 
     Parameters
     ----------
@@ -321,6 +321,10 @@ class RocketReducer(Reducer):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Draw the kernels anew and fit the classifier heads; earlier fits are discarded.
 
+        If it raises, the earlier fit may be lost already, as after SettingError for a single class.
+        Unlike `train` it takes fewer than 20 traces, too. Of more than 4000 traces, the heads are
+        fitted to 4000.
+
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
@@ -338,8 +342,9 @@ class RocketReducer(Reducer):
         SettingError
             If a parameter is out of its range, labels or folds do not fit the traces, a trace has
             a single sample, or the traces outside a fold have a single class.
-        TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite.
+        TraceError, ValueError, TypeError
+            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
+            below 1e-12 but not all are 0 (`check_traces`).
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -361,14 +366,15 @@ class RocketReducer(Reducer):
 
         The kernels are drawn at the first call of `train`, `precompute` or `untrained_module` and
         stay. X are traces (n, C, T), y (n,) their labels 1 or 0, `folds` (n,) their folds.
-        `numbers` (n,), those of the labels, identify the traces: a trace that was in the last call
-        has its features in a cache. `stop` may end the Newton steps, but in the first fit its
-        deadline leaves them three. If there are more than 4000 traces, the heads are fitted to 4000
-        of them, chosen by a hash of the numbers. The module `net_`, and so the module that `module`
-        returned before, is changed in place. The points are float32 (n, d), row i in embedding
-        space ``folds[i]``. Raises SettingError for fewer than 20 traces, if the traces outside a
-        fold have a single class, and at the first call for a parameter out of its range or fewer
-        than 2 samples.
+        `numbers` (n,), those of the labels, increasing, identify the traces: a trace that was in
+        the last call of `train` or `precompute` has its features in a cache. None: nothing is
+        cached, and traces are chosen by their rows. `stop` may end the Newton steps, but in the
+        first fit its deadline leaves them three. If there are more than 4000 traces, the heads are
+        fitted to 4000 of them, chosen by a hash of the numbers. The module `net_`, and so the
+        module that `module` returned before, is changed in place. The points are float32 (n, d),
+        row i in embedding space ``folds[i]``. Raises the errors of `check_traces`, and SettingError
+        for fewer than 20 traces, if the traces outside a fold have a single class, and at the first
+        call for a parameter out of its range or fewer than 2 samples.
         """
         do = "verify more parts first"
         expect(len(X) >= MIN_TRACES, f"at least {MIN_TRACES} traces", len(X), do)
@@ -389,9 +395,9 @@ class RocketReducer(Reducer):
 
         Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
         without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
-        and `numbers` are those of `train`. `net_` is changed in place. Returns the points of the
-        traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did not see the
-        label of row i.
+        and `numbers`, which must increase, are those of `train`. `net_` is changed in place.
+        Returns the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``,
+        whose head did not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -405,8 +411,8 @@ class RocketReducer(Reducer):
         It is `net_`, which later trainings change in place; before the first training its
         classifier heads are 0. If no kernels are drawn yet, they are drawn here from the traces X
         (n, C, T). If these are fewer than 20 (`MIN_TRACES`), the kernels are drawn in a clone,
-        whose module is returned, and this reducer stays as it is. Raises SettingError for a
-        parameter out of its range or fewer than 2 samples.
+        whose module is returned, and this reducer stays as it is. Raises the errors of
+        `check_traces`, and SettingError for a parameter out of its range or fewer than 2 samples.
         """
         is_initialized = "net_" in vars(self)
         reducer: Self = self if len(X) >= MIN_TRACES or is_initialized else clone(self)
@@ -426,7 +432,8 @@ class RocketReducer(Reducer):
     def _check_and_initialize(self, X: Floats) -> Floats:
         """Check traces and return them as (n, C, T); build the module `net_` at the first call.
 
-        The first traces set the shape, the scales of the channels and the kernels.
+        The first traces set the shape, the scales of the channels and the kernels. Raises the
+        errors of `check_traces`, and at the first call those of `build`.
         """
         if "net_" not in vars(self):
             self._initialize(self.check_traces(X, reset=True))
@@ -452,7 +459,8 @@ class RocketReducer(Reducer):
     def build(self, channels: int, samples: int, average: int) -> None:
         """Make the module `net_` for traces of this shape, with kernels and classifier heads of 0.
 
-        `towers_` and the cache of features become empty, the counters 0. `average` is the number of
+        `towers_` and the cache of features become empty, `n_fits_` and `n_component_traces_` 0;
+        what a fit reports (`n_iter_`, `holdout_losses_`, `note_`) stays. `average` is the number of
         samples that are averaged to one. Raises SettingError for a parameter out of its range or
         fewer than 2 samples.
         """
@@ -488,15 +496,12 @@ class RocketReducer(Reducer):
     ) -> None:
         """Fit the classifier heads of each `Tower`, and write them to `net_`, weighed to one logit.
 
-        Head k starts from its last weights and is fitted on the rows outside fold k of the raw
-        features `raw` (n, P); if there are more than 4000 rows, on 4000 of them (`sample_rows`).
-        `stop` may end the Newton steps; at the first fit its deadline does so after three steps at
-        the earliest. The principal components are computed anew at the first fit, after every 20
-        fits, and if there are at least 1.5 times as many rows as when they were computed last.
-        `labels` (n,) are 1 or 0, `folds` (n,) the folds, `numbers` (n,) the numbers of the labels.
-        It sets `towers_`, `n_iter_` (steps of this fit), `holdout_losses_` (leave-one-out loss of
-        each embedding space), `n_fits_` and `note_` (the heads that are no better than their base
-        rate in every tower; "" if there are none).
+        Head k starts from its last weights. It is fitted on the rows outside fold k of `raw` (n,
+        P), of at most 4000 (`sample_rows`). `labels` (n,) are 1 or 0; for `numbers` see `train`.
+        `stop` may end each tower's Newton steps; in the first fit its deadline leaves three.
+        Components are new at the first fit, after every 20, and for at least 1.5 times as many rows
+        as the last ones. Sets `towers_`, `n_iter_` (most steps of a tower), `holdout_losses_`,
+        `n_fits_`, and `note_` (heads at their base rate in every tower, or "").
         """
         with torch.no_grad():
             grew = len(raw) >= GROWTH * self.n_component_traces_
@@ -568,14 +573,11 @@ class RocketReducer(Reducer):
         """Compute feature scales and principal components anew from unscaled features (n, P).
 
         At most 1000 rows of `raw`, evenly spaced, are read; `n_component_traces_` becomes n.
-
-        A `Tower` holds a group of features, their principal components, and one linear classifier,
-        a head, for each fold. `towers_` gets a new tower for each group; its heads are the ones
-        nearest to the old heads, or 0 if there are none. The last tower is for the products of the
-        leading components. These components are new, so its heads are 0.
-
-        The scales, the leading components and, if `n_components` is 2, the second axis of the
-        embedding are written to `net_`. The heads are not: call `_set_heads` before `net_` is used.
+        `towers_` gets a new `Tower` for each group of features, whose heads are the ones nearest to
+        the old heads, or 0 if there are none, and a last one for the products of the leading
+        components, whose heads are 0. Scales, leading components and, if `n_components` is 2, the
+        second axis of the embedding are written to `net_`; the heads are not: call `_set_heads`
+        before `net_` is used.
         """
         net = self.net_
         encoder = net.encoder
@@ -631,8 +633,9 @@ class RocketReducer(Reducer):
 
         They are float32, computed from the outputs of the kernels. `numbers` (n,), those of the
         labels, increasing, identify the traces: only features that the cache lacks are computed.
-        Afterwards the cache holds the features of these traces and no others; the tensor that is
-        returned shares its memory. Without numbers the cache is neither read nor written.
+        They must be neither -1 nor out of order, which is not checked. Afterwards the cache holds
+        the features of these traces and no others; the tensor that is returned shares its memory.
+        Without numbers the cache is neither read nor written.
         """
         encoder = self.net_.encoder
         with torch.no_grad():
@@ -700,8 +703,8 @@ class RocketReducer(Reducer):
 
         They are the shape, the counters, the losses, the fields of each `Tower`, and the tensors of
         `net_`, whose names begin with "net.". The cache of features is not among them. Losses and
-        towers are not copies. Raises NotFittedError before there are kernels, AttributeError before
-        the first fit.
+        towers are not copies; `note_` is not in it. Raises NotFittedError before there are kernels,
+        AttributeError before the first fit.
         """
         check_is_fitted(self, "net_")
         counts = [self.average_, self.n_fits_, self.n_component_traces_, self.n_iter_]

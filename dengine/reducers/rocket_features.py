@@ -175,8 +175,8 @@ class RocketEncoder(nn.Module):
     def average_samples(self, x: Tensor) -> Tensor:
         """Raw traces (B, C, T) -> averaged traces (B, C, L), with channels of one scale.
 
-        If T is no multiple of `average`, the first samples are left out. The values are clipped at
-        ±1e6.
+        If T is no multiple of `average`, the first samples are left out. The scaled values are
+        clipped at ±1e6.
         """
         if self.average > 1:
             x = x[..., self.skipped :] if self.skipped > 0 else x
@@ -261,8 +261,9 @@ class RocketEncoder(nn.Module):
         """Set channel scales, kernels and thresholds, in place, from traces X (n, C, T).
 
         `rng` draws the kernels, and the traces that are read: at most 256 for the scales, and 64 of
-        these for the thresholds. A channel x is then scaled to scale * x + shift. Call this method
-        once: a second call sets everything anew, and the features of every trace change.
+        these for the thresholds. A channel x is then scaled to scale * x + shift, with mean 0 and
+        deviation 1; one that never moves is only shifted. Call this method once: a second call sets
+        everything anew, and the features of every trace change.
         """
         if len(X) > SCALE_TRACES:
             X = X[torch.from_numpy(rng.permutation(len(X))[:SCALE_TRACES])]
@@ -279,11 +280,11 @@ class RocketEncoder(nn.Module):
         """Draw the kernels, and set their scales and thresholds from their outputs on traces.
 
         `x`, float32 (n, C, T), are traces whose channels are scaled by `shift` and `scale`, which
-        must be set before. `rng` draws the kernels. The method writes the buffers `kernel`,
-        `threshold` and, if there are groups, `competing_kernel`. Thresholds, which only tower 1
-        has, are quantiles of the outputs, from 5 to 95 %. A kernel of tower 1 is scaled so that its
-        ramp is two standard deviations of its outputs wide, those of tower 2 so that this deviation
-        is 1.
+        must be set before. `rng` draws the kernels: MiniRocket's for tower 1, normal weights less
+        their mean for tower 2. It writes `kernel`, `threshold` and, if there are groups,
+        `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the outputs, from 5
+        to 95 %. A kernel of tower 1 gets a ramp two standard deviations of its outputs wide; those
+        of tower 2 are scaled so that all outputs of a dilation have the deviation 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)
@@ -316,8 +317,8 @@ class RocketEncoder(nn.Module):
 
         Both are changed in place. They are computed from the unscaled features `raw` (n, P). All
         features of tower 2 are divided by the same standard deviation, the root mean square of
-        their standard deviations. A small floor is added to each deviation so that a feature that
-        never varied does not become huge.
+        their standard deviations. A floor is added to each deviation, 0.001 of the median deviation
+        plus 1e-12, so that a feature that never varied does not become huge.
         """
         deviation, mean = torch.std_mean(raw.double(), 0, unbiased=False)
         for tower in self.towers[1:]:  # of shares, those that vary more tell more

@@ -205,6 +205,10 @@ class TorchReducer(Reducer):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Train `fit_steps` steps from initial weights; earlier trainings are discarded.
 
+        The initial weights are those of the checkpoint, if there is one. See `fit_loop` for the
+        steps. If it raises, earlier trainings may be lost already. Unlike `train` it takes fewer
+        than 20 traces, too.
+
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
@@ -223,8 +227,9 @@ class TorchReducer(Reducer):
             If a parameter is out of its range, labels or folds do not fit the traces, the network
             does not give (B, features), the checkpoint cannot be used, a trace has a single sample,
             or fewer than two traces lie outside a fold.
-        TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite.
+        TraceError, ValueError, TypeError
+            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
+            below 1e-12 but not all are 0 (`check_traces`).
         """
         traces = self.check_traces(X, reset=True)
         labels = binary_labels(y, len(traces), type(self).__name__)
@@ -244,10 +249,12 @@ class TorchReducer(Reducer):
         """Train on traces (n, C, T), labels y (n,) 1 or 0, and folds (n,); replace `encoder_`.
 
         It takes `n_steps_due` steps, or fewer if `stop` ends them, and starts from the weights of
-        the last training, or from initial weights the first time. `numbers` is not read. Returns
-        the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises
-        SettingError for fewer than two traces outside a fold, and at the first training for fewer
-        than 20 traces, or a parameter, network or checkpoint that cannot be used.
+        the last training, or from initial weights the first time. `numbers` is not read, and folds
+        are not checked. Augmentation and randomness are those of `fit_loop`. Returns the points of
+        the traces, float32 (n, d), row i in embedding space ``folds[i]``. Raises the errors of
+        `check_traces`, and SettingError for fewer than two traces outside a fold, and at the first
+        training for fewer than 20 traces, or a parameter, network or checkpoint that cannot be
+        used.
         """
         traces = self._check_and_initialize(X)
         labels = binary_labels(y, len(X), type(self).__name__)
@@ -289,9 +296,9 @@ class TorchReducer(Reducer):
 
         Earlier trainings are discarded; no label is read. The preprocessor averages and scales the
         samples; its scales are computed from the traces. The weights are read from the checkpoint,
-        if one is given, and otherwise drawn. Raises SettingError for a parameter out of its range,
-        fewer than 2 samples, a network that does not give (B, features), or a checkpoint that
-        cannot be used.
+        if one is given, and otherwise drawn from the seed. Raises SettingError for a parameter out
+        of its range, fewer than 2 samples, a network that does not give (B, features), or a
+        checkpoint that cannot be used.
         """
         x = torch.from_numpy(traces)
         self._build(traces.shape[1], traces.shape[2], averaging(x))
@@ -305,11 +312,12 @@ class TorchReducer(Reducer):
     def _build(self, channels: int, samples: int, average: int, seed: int | None = None) -> None:
         """Build preprocessor and networks for traces of this shape, with initial weights.
 
-        Counters and the state of the optimiser are reset. `encoder_` is not set: that is left to
-        the caller. `average` is the number of samples that are averaged to one. Without `seed` the
-        seed comes from `random_state`; torch's global generator keeps its state. Raises
-        SettingError for a parameter out of its range, fewer than 2 samples, or a network that does
-        not give (B, features).
+        Counters and the state of the optimiser are reset, and `is_initialized_` becomes False.
+        Scales, checkpoint, `encoder_` and `is_initialized_` are left to the caller. `average` is
+        the number of samples that are averaged to one. Without `seed` the seed comes from
+        `random_state`; torch's global generator keeps its state. Raises SettingError for a
+        parameter out of its range, fewer than 2 samples, or a network that does not give (B,
+        features).
         """
         self.check()
         if samples < 2:
@@ -346,7 +354,7 @@ class TorchReducer(Reducer):
         of steps that are missing until training is complete. `labels` (n,) are 1 or 0, `folds` (n,)
         the folds; `numbers` is not read. Returns the points of the traces, float32 (n, d), row i in
         embedding space ``folds[i]``. Raises SettingError for fewer than two traces outside a fold;
-        `encoder_` stays then.
+        `encoder_` and the counters stay then.
         """
         with torch.no_grad():
             x: Tensor = self.preprocessor_(torch.from_numpy(traces))
@@ -359,11 +367,13 @@ class TorchReducer(Reducer):
         return self._embed_in_fold_space(x, folds)
 
     def fit_loop(self, x: Tensor, y: Tensor, folds: Ints, stop: StopRule, steps: int) -> None:
-        """Take AdamW steps, copy k of the network on the rows outside fold k.
+        """Take AdamW steps on augmented batches, copy k of the network on the rows outside fold k.
 
-        It changes `members_`, the K copies, and their averages in place, and stores the optimiser's
-        moments. `n_new_steps_` becomes the number of steps taken, by which `n_steps_` grows, and
-        `loss_` their mean loss (NaN if `stop` allows no step). `encoder_`, the module that embeds,
+        It changes `members_`, the K copies, and the running averages of their weights in place,
+        goes on from the optimiser's stored moments, and stores the new ones. `n_new_steps_` becomes
+        the number of steps taken, by which `n_steps_` grows, and `loss_` their mean loss (NaN if no
+        step is taken). Batches, augmentation (`Augmentation`) and dropout follow from `seed_` and
+        `n_steps_`; torch's global generator keeps its state. `encoder_`, the module that embeds,
         stays as it is. Afterwards `members_` is in training mode.
 
         Parameters
@@ -402,9 +412,11 @@ class TorchReducer(Reducer):
     def train_step(self, optimizer: torch.optim.Optimizer, x: Tensor, y: Tensor) -> float:
         """Take one step on traces x (B, K, C', L), labels y (B, K); return the loss, in nats.
 
-        `optimizer` is that of `make_optimizer`. The averaged weights move as well, and `n_steps_`
-        grows by 1. The loss is the one before the step, the mean over the batch and over the K
-        copies of the network.
+        `optimizer` is that of `make_optimizer`. `members_`, with its statistics of batch
+        normalisation, and the averaged weights change in place, and `n_steps_` grows by 1. Dropout
+        draws from torch's global generator, if `members_` is in training mode. The loss is the one
+        before the step, the mean over the batch and over the K copies of the network; each copy
+        moves by the gradient of its own mean loss.
         """
         logits = self.members_(x)  # (B, K)
         loss = F.binary_cross_entropy_with_logits(logits, y)
@@ -420,8 +432,8 @@ class TorchReducer(Reducer):
         """Return a new AdamW for `members_`, with the moments that the last training left.
 
         The moments are the running means of gradients and of their squares. They are not copied: a
-        step of the optimiser changes `optimizer_state_`. Weight decay is for weights only, not for
-        biases and the parameters of batch normalisation.
+        step of the optimiser changes `optimizer_state_`. Weight decay is only for parameters of two
+        dimensions or more whose name ends in "weight", so not for biases and batch normalisation.
         """
         decayed: list[nn.Parameter] = []
         others: list[nn.Parameter] = []
@@ -442,8 +454,8 @@ class TorchReducer(Reducer):
         """Move the parameters of `averaged_members_`, in place, towards those of `members_`.
 
         An averaged parameter becomes `weight_averaging` times itself plus the rest of the trained
-        one; in the first steps the factor is smaller, (1 + n) / (10 + n) after n steps. Statistics
-        of batch normalisation are not averaged.
+        one; in the first steps the factor is smaller, (1 + n) / (10 + n), where n is `n_steps_`.
+        Statistics of batch normalisation are not averaged.
         """
         kept = min(self.weight_averaging, (1 + self.n_steps_) / (10 + self.n_steps_))
         averages = self.averaged_members_.parameters()
@@ -455,9 +467,10 @@ class TorchReducer(Reducer):
         """Estimate the running statistics of batch normalisation anew, for the averaged weights.
 
         This is what `torch.optim.swa_utils.update_bn` does. At most 256 of the preprocessed traces
-        x (n, C', L) are read; which ones depends on n alone. No label is read, so each copy of the
-        network may see all folds. Other buffers are copied from `members_`. Afterwards
-        `averaged_members_` is in evaluation mode.
+        x (n, C', L) are read; they are drawn with the seed n. The statistics are the means of those
+        of batches of at most 64. No label is read, so each copy of the network may see all folds.
+        Other buffers are copied from `members_`. Afterwards `averaged_members_` is in evaluation
+        mode.
         """
         members = self.averaged_members_.eval()
         for buffer, trained in zip(members.buffers(), self.members_.buffers(), strict=True):
@@ -506,8 +519,8 @@ class TorchReducer(Reducer):
         """Embed traces (n, T) or (n, C, T) in every embedding space; return float32 (n, K, d).
 
         The points in space k come from network k, which was trained without the labels of fold k.
-        Raises NotFittedError before there are networks, ValueError for traces of another shape and
-        for values that are not finite.
+        Raises NotFittedError before there are networks, and the errors of `check_traces`, such as
+        ValueError for traces of another shape.
         """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
@@ -550,11 +563,13 @@ class TorchReducer(Reducer):
 
     @property
     def report(self) -> FitReport:
-        """Return the report of the last training: its steps, the missing steps, and a note.
+        """Return the report of the last training: its steps, the steps still missing, and a note.
 
-        The note gives the loss and the number of all steps so far if the last training took a step,
-        and the number of missing steps if there are any. If neither holds, it is "". Raises
-        NotFittedError before a fit.
+        Steps are missing until training is complete (36 and 1.2 for each label, at most
+        `fit_steps`, over all trainings); 0 if the caller limited the steps. The note gives the loss
+        and the number of all steps so far if the last training took a step, and the number of
+        missing steps if there are any. If neither holds, it is "". Raises NotFittedError before a
+        fit.
         """
         check_is_fitted(self, "encoder_")
         note = f"loss {self.loss_:.3f} after {self.n_steps_} steps" if self.n_new_steps_ else ""
@@ -588,10 +603,12 @@ class TorchReducer(Reducer):
     def set_state(self, state: Arrays) -> Self:
         """Restore what `get_state` returned, and return self.
 
-        The constructor's parameters must be the same. Raises StoreError if the sizes are others, or
-        if the network gives other points for a fixed trace than when the state was taken; a state
-        without these points is not checked so. Raises KeyError if an array of counts, shape or loss
-        is missing. After an error do not use the reducer.
+        The constructor's parameters must be the same. A tensor that the state lacks keeps its
+        initial value, since earlier releases stored fewer. Raises StoreError if the sizes are
+        others, or if the network gives points for a fixed trace that differ by more than 0.001 from
+        those when the state was taken; a state without these points is not checked so. Raises
+        KeyError if an array of counts, shape or loss is missing, and SettingError for a parameter
+        or network that cannot be used. After an error do not use the reducer.
         """
         channels, samples = self.restore_shape(state)
         average, seed, n_steps, n_steps_left, n_new_steps = map(int, state["counts"])
@@ -728,9 +745,9 @@ def compile_fault(network: NetworkFactory, channels: int, samples: int) -> str:
 
     A user's network may hold Python that TorchScript does not support. To find out, two copies of
     it for preprocessed traces (channels, samples) are built, compiled and run; any exception counts
-    as a fault, and none is raised. A process keeps the answers for the last 32 networks and shapes,
-    and logs nothing when it gives such an answer again. The state of torch's global random
-    generator does not change.
+    as a fault, and none is raised, but TypeError if `network` is not hashable. A process keeps the
+    answers for the last 32 networks and shapes, and logs nothing when it gives such an answer
+    again. The state of torch's global random generator does not change.
     """
     try:
         with torch.random.fork_rng(devices=[]), torch.inference_mode():

@@ -128,7 +128,8 @@ class UmapEncoder(nn.Module):
 
         A trace starts at the mean of its nearest references' points, weighted by their membership
         strengths. It is then moved five times to the mean of the same points, weighted by how
-        strongly UMAP attracts it to each of them at its current distances.
+        strongly UMAP attracts it to each of them at its current distances (whose squares are raised
+        by 0.001).
         """
         # Half the squared distances, less half the squared norm of each trace.
         half_squared = self.half_norms - frames @ self.references.T
@@ -147,7 +148,8 @@ class UmapEncoder(nn.Module):
         """Distances to the nearest references (B, n_neighbors) -> membership strengths, same shape.
 
         A strength lies between 0 and 1 and is 1 for the nearest reference. The strengths of a row
-        sum to about ``log2(n_neighbors)``; if all distances of a row are equal, all are 1.
+        sum to about ``log2(n_neighbors)``, as far as sigma between 0.001 and 100 times the mean
+        distance beyond the nearest allows; if all distances of a row are equal, all are 1.
         """
         beyond = distances - distances.amin(1, keepdim=True)
         beyond = beyond / (beyond.mean(1, keepdim=True) + 1e-12)
@@ -245,8 +247,9 @@ class UmapReducer(Reducer):
         SettingError
             If a parameter is out of its range, or there are `n_neighbors` or `n_components` traces
             or fewer.
-        TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite.
+        TraceError, ValueError, TypeError
+            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
+            below 1e-12 but not all are 0 (`check_traces`).
         """
         traces = self.check_traces(X, reset=True)
         self.check(len(traces))
@@ -266,10 +269,12 @@ class UmapReducer(Reducer):
 
         `numbers` (n,), those of the labels, increasing, identify the traces from training to
         training; labels and folds are not read. The layout goes on from the last one if at least
-        half of the traces were in it; otherwise, or without `numbers`, it starts anew. `stop` may
-        end the epochs; after its deadline at most ten more are taken. Returns the points of the
-        traces, float32 (n, n_components), which share their memory with `embedding_`. Raises
-        SettingError for a parameter out of its range, or too few traces.
+        half of the traces were in it; otherwise, or without `numbers`, it starts anew; if none of
+        them was in the last search of neighbours, or without `numbers`, the seed and the frames are
+        new as well. `stop` may end the epochs; after its deadline at most ten more are taken.
+        Returns the points of the traces, float32 (n, n_components), which share their memory with
+        `embedding_`. Raises the errors of `check_traces`, and SettingError for a parameter out of
+        its range, or too few traces.
         """
         traces = self.check_traces(X, reset=not self._is_fitted)
         self.check(len(traces))
@@ -295,9 +300,10 @@ class UmapReducer(Reducer):
         """Search the neighbours of traces X (n, C, T), and keep them for the next training.
 
         `train` finds them again by `numbers`, the numbers of the traces' labels; without numbers
-        nothing is done. Before the first training it also sets the shape, draws the seed and sets
-        up the frames, the sums of samples between which distances are measured. Raises SettingError
-        for a parameter out of its range, or too few traces.
+        nothing is done. Before the first training each call also sets the shape, draws the seed and
+        sets up new frames, the sums of samples between which distances are measured. Raises the
+        errors of `check_traces`, and SettingError for a parameter out of its range, or too few
+        traces.
         """
         if numbers is None:
             return
@@ -351,9 +357,11 @@ class UmapReducer(Reducer):
     ) -> None:
         """Train on traces (n, C, T) with their labels' numbers, and make a new `encoder_`.
 
-        It finds neighbours, joins them to a graph, and moves the points for `n_epochs` epochs
-        (None: `n_epochs_due`), or fewer if `stop` ends them. Without numbers all traces count as
-        new. Neighbours, points and encoder are replaced, and the counters of epochs grow.
+        It finds neighbours (from those of `precompute` or of the last training), joins them to a
+        graph, and moves the points for `n_epochs` epochs (None: `n_epochs_due`), or fewer if `stop`
+        ends them. Without numbers all traces count as new. Neighbours, points and encoder are
+        replaced, and the counters of epochs grow. Noise and negative samples follow from `seed_`
+        and `n_steps_`.
         """
         if numbers is None:
             numbers = np.arange(-len(traces), 0)  # numbers that no label has
@@ -381,8 +389,8 @@ class UmapReducer(Reducer):
 
         `neighbors` and `graph` are those of the n traces; `rng` draws the noise. If at least half
         of the traces were in the last training, they start at their last points, and a new trace
-        starts where the last `encoder_` puts it, plus a little noise. Otherwise all start at the
-        points of `spectral_start`, and `n_epochs_` becomes 0.
+        starts where the last `encoder_` puts it, plus noise with a standard deviation of 0.0001.
+        Otherwise all start at the points of `spectral_start`, and `n_epochs_` becomes 0.
         """
         last_rows = self.neighbors_.rows_of(neighbors.numbers)
         is_old = last_rows >= 0
@@ -415,8 +423,8 @@ class UmapReducer(Reducer):
     def embed(self, X: Floats) -> Floats:
         """Embed traces (n, T) or (n, C, T) among the references; return float32 (n, 1, d).
 
-        Raises NotFittedError before a fit, ValueError for traces of another shape and for values
-        that are not finite.
+        Raises NotFittedError before a fit, and the errors of `check_traces`, such as ValueError for
+        traces of another shape.
         """
         check_is_fitted(self, "encoder_")
         traces = torch.from_numpy(self.check_traces(X))
@@ -426,7 +434,7 @@ class UmapReducer(Reducer):
         """Return a module that can be compiled before the training on traces X (n, C, T).
 
         After a first training it is the present `encoder_` itself. Before, it is a new encoder
-        whose references are all 0.
+        whose references are all 0; no parameter is checked for it, and nothing is kept.
         """
         if self._is_fitted:
             return self.encoder_
@@ -486,7 +494,7 @@ class UmapReducer(Reducer):
 
         What `precompute` found is dropped. Raises StoreError if the arrays of `Frames`, the module
         that averages traces, have other sizes than the shape of the traces in `state` asks for,
-        KeyError if another array is missing.
+        KeyError if another array is missing. The parameters are not compared with the state.
         """
         channels, samples = self.restore_shape(state)
         n_frames, seed, n_epochs, n_steps, n_new_steps = (int(value) for value in state["counts"])

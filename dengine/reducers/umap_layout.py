@@ -65,7 +65,8 @@ def spectral_start(
     Returns
     -------
     Tensor of float32, shape (n, n_components)
-        Centred and scaled so that the largest coordinate is 10 or -10, plus a little noise.
+        Centred and scaled so that the largest coordinate is 10 or -10, plus noise with a standard
+        deviation of 0.0001.
 
     References
     ----------
@@ -92,7 +93,8 @@ def leading_eigenvectors(
 
     They belong to the n largest eigenvalues after the very largest. Returns them as columns,
     float64 (n_traces, n), in the order of increasing eigenvalues, or None if the solver does not
-    converge. `rng` draws the vector from which the solver starts.
+    converge. `rng` draws the vector from which the solver starts; up to 200 traces (or 4 n) all
+    eigenvectors are computed instead, without `rng`.
     """
     root = np.sqrt(np.asarray(graph.sum(1), dtype=np.float64)).ravel()
     coordinates = graph.tocoo()
@@ -113,8 +115,8 @@ def leading_eigenvectors(
 def principal_components(frames: Tensor, n: int) -> NDArray[np.float64]:
     """Return the first n principal components of frames (m, F), float64 (m, n).
 
-    The axes are computed from at most 256 of the rows, evenly spaced. If there are fewer than n
-    components, the last columns are 0.
+    The mean of all rows is subtracted; the axes are then computed from at most 256 of the rows,
+    evenly spaced. If there are fewer than n components, the last columns are 0.
     """
     centred = (frames - frames.mean(0)).double()
     sample = centred[:: 1 + len(centred) // PCA_TRACES]
@@ -206,8 +208,9 @@ def attraction(points: Tensor, edges: Edges, a: float, b: float) -> tuple[Tensor
     """Compute the pull of each point towards its neighbours.
 
     An edge pulls with the coefficient ``4 a b d^(2b - 2) / (1 + a d^(2b))`` times its strength,
-    along the offset to the neighbour; this is the negative gradient of the cross entropy. The
-    factor is 4, not 2, since umap-learn moves both ends of an edge and holds each edge twice.
+    along the offset to the neighbour, where d^2 counts as 1e-8 at least; this is the negative
+    gradient of the cross entropy. The factor is 4, not 2, since umap-learn moves both ends of an
+    edge and holds each edge twice.
 
     Parameters
     ----------
@@ -302,8 +305,8 @@ def learning_rates(n_epochs: int, stop: StopRule) -> Iterator[float]:
 
     `stop` is asked before each epoch. If `stop` limits the number of steps, the rate falls within
     that number. After its deadline at most ten more epochs are taken, over which the rate falls
-    quickly: at a high rate the points would stay scattered by the negative samples of the last
-    epoch.
+    quickly, in equal steps towards 0: at a high rate the points would stay scattered by the
+    negative samples of the last epoch.
     """
     if stop.max_steps is not None:
         n_epochs = min(n_epochs, stop.max_steps)
@@ -325,6 +328,9 @@ def optimize_layout(
     generator: torch.Generator,
 ) -> tuple[Tensor, int]:
     """Move points to where attraction and repulsion are in balance.
+
+    Each point has at most 16 negative samples in an epoch. Their mean push is weighed by 5 times
+    the sum of the strengths of the point's edges, relative to the strongest edge.
 
     Parameters
     ----------

@@ -72,9 +72,10 @@ class UmapLearnReducer(Reducer):
         ------
         SettingError
             If there are `n_neighbors` traces or fewer.
-        TraceError, ValueError
-            If X is not of one of these shapes, or a value is not finite. ValueError also for a
-            parameter that umap-learn refuses.
+        TraceError, ValueError, TypeError
+            If X is not of one of these shapes or sparse, a value is not finite, or all samples are
+            below 1e-12 but not all are 0 (`check_traces`). ValueError also for a parameter that
+            umap-learn refuses.
         ImportError
             If umap-learn is not installed.
         """
