@@ -102,7 +102,7 @@ class Drainer:
     def request(self) -> None:
         """Ask that all records so far be written to the journal's disk and the database at once.
 
-        It does not wait, and says nothing of the result.
+        It does not wait, and says nothing of the result. Later records may go with them.
         """
         with self._changed:
             self._wanted = self._recorder.n_recorded
@@ -113,8 +113,9 @@ class Drainer:
 
         If the database has everything, nothing is done. Raise StoreError if this takes longer than
         `limit` seconds, or as soon as there is a `fault`, which is a reason why the store cannot be
-        used now. The records then stay in the journal and are copied later. After a timeout there
-        is a `fault` until the database takes records again.
+        used now; the copying is requested even so. The records then stay in the journal, or in
+        memory if the disk fails, and are copied later. After a timeout there is a `fault` until the
+        database takes records again.
         """
         with self._changed:
             if self.is_drained:
@@ -139,8 +140,8 @@ class Drainer:
         """Return (decision id, label number) of each label that was drained since the last call.
 
         To drain a label is to copy it from the journal to the database. The pairs are in the order
-        in which this was done. A report that repeats a stored label has the number of that label.
-        Without a product the list is empty.
+        in which this was done. A report that repeats a stored label has the number of that label. A
+        label that became a dead letter has no pair. Without a product the list is empty.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -150,8 +151,9 @@ class Drainer:
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """Have this object's thread, which uses the database, make a call; do not wait for it.
 
-        Before the call, the thread copies the records that are on the journal's disk to the
-        database. If this fails, the call is made nevertheless.
+        The calls are made one after another, in their order. Before a call, the thread copies the
+        records that are on the journal's disk to the database. If this fails, the call is made
+        nevertheless.
 
         Returns
         -------
@@ -173,6 +175,8 @@ class Drainer:
 
     def wait_for_result(self, future: Future[T]) -> T:
         """Wait for a submitted call; return its result, or raise what it raised.
+
+        The time limit includes the wait for the calls before it.
 
         Raises
         ------
@@ -231,9 +235,10 @@ class Drainer:
         """Copy the records on the journal's disk to the database, and make submitted calls.
 
         The thread runs this until `stop` is called. Before a call all of these records are copied;
-        if this fails, the call is made nevertheless. An error of the database is logged once and
-        kept for `fault`; a second later the database is tried again. Once stopped, it ends when all
-        submitted calls are made, and the records are copied or the database has failed.
+        if this fails, the call is made nevertheless. Any error of the copying is logged, only the
+        first until it succeeds again, and kept for `fault`; the database is tried again a second
+        later, or sooner if there is a call. Once stopped, it ends when all submitted calls are
+        made, and the records are copied or the copying has failed.
         """
         while True:
             call = self._wait_for_work()
@@ -367,7 +372,8 @@ class Drainer:
         """Make a submitted call; set the future's result or exception. Nothing is raised here.
 
         A call whose future was cancelled before is not made. If the future is cancelled while the
-        call runs, its transaction is rolled back; once the call commits, it cannot be cancelled.
+        call runs, its transaction is rolled back, and its result or exception is lost; from its
+        first commit on, it cannot be cancelled.
         """
 
         def is_wanted() -> bool:
