@@ -236,8 +236,8 @@ def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
     """Return `cell_id` in a list, or if it is None the ids of all cells in any table, sorted.
 
-    Raise StoreError for a cell that no table has. A table that cannot be read is left out, and so
-    are its rows behind the damage.
+    Raise StoreError for a cell that no table has. A table that cannot be read to its end is left
+    out.
     """
     names: set[str] = set()
     for table in METADATA.tables.values():
