@@ -234,10 +234,9 @@ class Corrections:
         saw a forgotten label.
 
         A training under way in the executor is discarded, even if nothing changes, and no other one
-        begins. A reducer like
-        umap-learn, of which not the fit but only the numbers of its traces are stored, is fitted
-        again on the traces of the earlier version, with the labels that they had then. A baseline
-        is fitted on the same traces, with the labels as they count now.
+        begins. A reducer like umap-learn, of which not the fit but only the numbers of its traces
+        are stored, is fitted again on the traces of the earlier version, with the labels that they
+        had then. A baseline is fitted on the same traces, with the labels as they count now.
 
         Parameters
         ----------
@@ -402,10 +401,11 @@ class Corrections:
     def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, and apply it to references, training window and rule.
 
-        A model that cannot change its references is retrained, in this thread. If a safe mode
-        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
-        called. Returns what was done. Raises StoreError if the store does not answer; a change that
-        is stored by then is applied with the next one, or when the store is opened again.
+        The decisions leave the outbox's memory. A model that cannot change its references is
+        retrained, in this thread. If a safe mode begins or ends by this, an event is recorded, and
+        `on_safe_mode`, the user's function, is called. Returns what was done. Raises StoreError if
+        the store does not answer; a change that is stored by then is applied with the next one, or
+        when the store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:

@@ -422,7 +422,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            If a given setting differs from the used store's, is unknown, or is out of range.
+            If a given setting differs from the used store's, is unknown, or is out of range, if an
+            object of yours is missing or is another one than the engine had, and if a stored recipe
+            cannot be read. A store that was opened here is then closed; an `SqlStore` that was
+            passed may be, too.
         StoreError
             If another engine owns the cell, or the store cannot be used.
         ImportRefusedError
@@ -690,7 +693,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         and written later. A retrain that is due is begun or done (`poll`). An exception of the cell
         is raised unchanged, and so are the other errors of `decide`, `report` and `poll`;
         ReportError is raised if the cell returns no label or outcome. Returns the record of the
-        cycle; its `decide_seconds` is the duration of the decision alone.
+        cycle; its `decide_seconds` is the duration of the decision alone, during which Python's
+        garbage collector is off.
         """
         trace = cell.insert()
         with uncollected():

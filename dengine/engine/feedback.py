@@ -106,7 +106,7 @@ class Feedback:
         With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
         "some" they are only counted, as unreported since the last label. For a safe mode that the
         rule is in already, the user's function `on_safe_mode` is not called. Raises StoreError if
-        the store cannot be read.
+        the store cannot be read, or with `stops="all"` the trace of such a part is damaged.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -170,7 +170,8 @@ class Feedback:
         decision has a label already, ReportError is raised, with one exception: a line stop may
         follow the confirmation of a part by the next decision (`Policy(stops="all")`). Such a line
         stop is recorded, and learned later, as a correction. The attribute `remedy` is set if the
-        rule must be rebuilt, which is not done here.
+        rule must be rebuilt, which is not done here. An exception of rule or model is logged, not
+        raised.
         """
         id_ = stored.decision.id
         if self._unsynced.get(id_) is not success:
@@ -221,8 +222,9 @@ class Feedback:
         decision is from before the present rule and so does not update it. A part that was counted
         among them is subtracted from the number that its own label tells, which may make it -1.
 
-        The label takes the next number of the outbox. The label of a trace without a fault enters
-        the training window, in a product once the store has given it a number.
+        The label takes the next number of the outbox. The label of a trace without a fault counts
+        as new and enters the training window; in a product it is read into that from the store,
+        later.
         """
         decision = stored.decision
         version = self._live.version

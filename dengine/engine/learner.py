@@ -120,11 +120,13 @@ class Learner:
         self.labels.count_from(self.live.trained_on.counts_from)
 
     def precompute(self) -> None:
-        """Start a thread that computes in advance what the next training needs; do not wait.
+        """Start a thread that computes in advance what the next training needs; do not wait for it.
 
         These are above all the features of the traces in the training window. They are kept in the
-        model that the training starts from; a failure is logged. Nothing is started if the training
-        window is empty, or if `wait_until_precomputed` has not waited for an earlier thread yet.
+        model that the training starts from, which is first looked for in the store, without a time
+        limit, if labels were corrected (`_choose_start`); a failure is logged. Nothing is started
+        if the training window is empty, or if `wait_until_precomputed` has not waited for an
+        earlier thread yet.
         """
         if self._precomputed is not None or not len(self._window):
             return

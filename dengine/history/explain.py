@@ -264,8 +264,8 @@ def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Flo
 
     Each is measured in the embedding space of the reference, in which one radius means the same for
     every reducer. They are in the order of the version's index of references. The distance to
-    references of the decision's own part is infinite. None if the trace was not embedded or there
-    is no version.
+    references of the decision's own part (without a number, of a trace equal to its trace) is
+    infinite. None if the trace was not embedded or there is no version.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:

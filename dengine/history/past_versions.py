@@ -267,7 +267,7 @@ def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None
     First `observe` gets `outcome.silent`, the number of unreported accepted parts since the
     previous label, and whether this part was novel. Then `update` gets the bounds, the label, the
     action that the model alone would have taken, and the inclusion probability. A safe mode of the
-    rule may begin or end.
+    rule may begin or end. What a user's rule raises is raised.
     """
     rule.observe(outcome.silent, outcome.novel)
     rule.update(

@@ -353,10 +353,10 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
     """Read the status of an engine from its store.
 
-    A damaged label among those since the newest retrain is left out, and an event is written to
-    the store. An event is also written if the arrays of the newest version are read (with
-    `watching`, and if that version is no trained one) and are damaged; then those of the version
-    before it are taken.
+    A damaged label among those since the newest retrain is left out, and an event is written to the
+    store. An event is also written if the arrays of the newest version are read (with `watching`,
+    and if that version is no trained one) and are damaged; then those of the version before it are
+    taken.
 
     Parameters
     ----------
@@ -454,7 +454,8 @@ def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> 
     Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
     properties, like action and reason; `retrains` are all retrains of the cell. The intervals of
     `would_accept` and `would_reject` (how often the model would have been wrong) are at 95 %,
-    whatever the policy's alpha.
+    whatever the policy's alpha, and their basis is "audits", or "checks" if the policy of now has
+    no audit rate.
     """
     outcomes = tally.outcomes
     first = tally.first

@@ -137,12 +137,12 @@ def _connect_sqlite(
     """Return a new SQLite connection; it only reads if the file or its folder cannot be written.
 
     SQLAlchemy calls this with its dialect, its own record of the connection, which is not used, and
-    the arguments and options for `sqlite3.connect`; the first argument is the file. A file that
-    cannot be written and has no `-wal` beside it is opened as immutable. If it has a `-wal`, but no
-    `-shm` and SQLite cannot create that, both files are copied to a temporary folder, which is
-    deleted with the connection, and the copy is opened for reading. A new file and a `file:` URI
-    are opened in the driver's own way. A damaged file raises nothing here, but when the connection
-    is used. Raise sqlite3.Error if the file cannot be opened, and OSError if it cannot be copied.
+    the arguments and options for `sqlite3.connect`; the first argument is the file. Such a file
+    without a `-wal` beside it is opened as immutable. If it has a `-wal`, but no `-shm` and SQLite
+    cannot create that, both files are copied to a temporary folder, which is deleted with the
+    connection, and the copy is opened for reading. A new file and a `file:` URI are opened in the
+    driver's own way. A damaged file raises nothing here, but when the connection is used. Raise
+    sqlite3.Error if the file cannot be opened, and OSError if it cannot be copied.
     """
     name = str(arguments[0])
     file = Path(name)
@@ -407,10 +407,10 @@ class Database:
         """Context manager that opens a read transaction and gives its connection.
 
         First it calls `before_use`, a function that the outbox has set, which writes the records
-        that wait in it, so that they are seen; if the database of a running cell does not take
-        them in time, they are missing. Raise StoreError if the database fails, is closed or was
-        opened before a fork, and in place of a ValueError, TypeError, OverflowError or OSError that
-        the block raises, unless it is dengine's own.
+        that wait in it, so that they are seen; if the database of a running cell does not take them
+        in time, they are missing. Raise StoreError if the database fails, is closed or was opened
+        before a fork, and in place of a ValueError, TypeError, OverflowError or OSError that the
+        block raises, unless it is dengine's own.
         """
         self.check_open()
         self.before_use()
@@ -681,8 +681,8 @@ class Database:
             In a write transaction.
         column : sqlalchemy.Column
             The table's column that takes the numbers. Decisions and events continue the numbers of
-            the cell; labels, versions and corrections those of its product, if it has one, which
-            is then locked until the transaction ends.
+            the cell; labels, versions and corrections those of its product, if it has one, which is
+            then locked until the transaction ends.
         rows : sequence of mapping
             Without `cell_id`. They are not changed.
 

@@ -292,8 +292,9 @@ class Drainer:
 
         They go in chunks of at most DRAIN_CHUNK (500) records. Later records go with them only if
         they still fit into the last chunk. The journal's head, the small file beside it, is synced
-        first. At the end the last error, which `fault` shows, is cleared. Raise StoreError if the
-        database fails: chunks that were committed stay, and the last error is kept.
+        first. At the end, or at once if there are no records, the last error, which `fault` shows,
+        is cleared. Raise StoreError if the database fails: chunks that were committed stay, and the
+        last error is kept.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:
@@ -306,14 +307,14 @@ class Drainer:
         """Commit the oldest records that are on the journal's disk, at most DRAIN_CHUNK (500).
 
         There must be one. A decision is left out if a later record with the same id replaces it.
-        Records that are damaged on disk are taken from memory and reported by an event. If a
-        decision is not in memory either, it is lost, and the kind of that event is DATA_LOST, an
-        alarm. Then the journal's header notes that the database has the records, `n_drained` counts
-        them, and they leave the queue of the recorder and, except for the newest decisions, the
-        `DecisionIndex`, by which decisions are found in memory. In a product the numbers of their
-        labels are kept for `pop_label_numbers`. Raise StoreError if the database fails; nothing of
-        this is done then, and the next call commits the same records again, of which some may be
-        stored already.
+        Records that are damaged on disk are taken from memory and reported by an event, which is
+        also logged. If a decision is not in memory either, it is lost, and the kind of that event
+        is DATA_LOST, an alarm. Then the journal's header notes that the database has the records,
+        `n_drained` counts them, and they leave the queue of the recorder and, except for the newest
+        decisions, the `DecisionIndex`, by which decisions are found in memory. In a product the
+        numbers of their labels are kept for `pop_label_numbers`. Raise StoreError if the database
+        fails; nothing of this is done then, and the next call commits the same records again, of
+        which some may be stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))

@@ -199,8 +199,8 @@ def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLa
     repeats success and source of the first changes nothing. A late stop (`_is_late_stop`) corrects
     the first label; if this was corrected to a failure already, it changes nothing. Any other
     second label is a problem. So is a late stop whose first label was forgotten, and a label whose
-    decision is not stored with the same trace and time. `stored` has, by id, what is stored of the
-    decisions and their labels: the rows of `CorrectionTable.stored_labels`.
+    decision is not stored with the same content hash and time. `stored` has, by id, what is stored
+    of the decisions and their labels: the rows of `CorrectionTable.stored_labels`.
     """
     result = SortedLabels()
     for label in labels:
@@ -224,10 +224,10 @@ def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     """Return in words why the store cannot take a label; "" if it can.
 
     `row` is the stored row of its decision, or None. `first` is the label that the decision has, or
-    None; it is this row or a `NewLabel`. The row must be there, with the same trace and time as the
-    label's decision. A second label is a problem, with two exceptions: it repeats the first, or it
-    is a late stop, a line stop of a part that was confirmed as good before. A late stop is a
-    problem if a person had the first label forgotten.
+    None; it is this row or a `NewLabel`. The row must be there, with the content hash and the time
+    that the label has of its decision. A second label is a problem, with two exceptions: it repeats
+    the first, or it is a late stop, a line stop of a part that was confirmed as good before. A late
+    stop is a problem if a person had the first label forgotten.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"

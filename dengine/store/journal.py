@@ -320,8 +320,9 @@ class Journal:
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, and space is reserved and synced again. Raise
-        StoreError if the file cannot be written.
+        The file is cut off behind its header, which says that the store holds all, and space is
+        reserved and synced again; the head is not written. Raise StoreError if the file cannot be
+        written.
         """
         self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):

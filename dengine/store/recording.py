@@ -282,7 +282,8 @@ class Recorder:
         """Create a new file for a journal whose file was lost; log this, and record an event.
 
         Records that the database lacks are copied into it. `error` is the text of log and event.
-        Raise StoreError if the file cannot be written.
+        Raise StoreError, without an event, if the file cannot be written or another engine has
+        locked it.
         """
         log.error("%s It is created again with what the store lacks.", error)
         with self.changed:  # nobody reads it or writes its header meanwhile
