@@ -938,8 +938,9 @@ def _new_settings(
     For a handed-in `model` without a recipe, the other settings are those of the default recipe,
     but `retrain_every` is that of `Reducer`, not of conv. Raises SettingError if `reducer`, or a
     setting in `given`, has no effect on such a model; those in `recipe` are not refused. Raises it
-    also for settings that are out of range or contradict each other, and if the training window is
-    smaller than the model's `min_traces`.
+    also for settings that are out of range or contradict each other, if the reducer or the rule
+    cannot be made, for a `model` that is none, and if the training window is smaller than the
+    model's `min_traces`.
     """
     if model is not None:
         check_model_settings(reducer, given)

@@ -588,10 +588,11 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
     They are read from the rule that `load_rule` returns. None if that is None, and if the rule has
     no drift detectors: "local" with stops="some", and a user's rule. In a safe mode that novel
     traces began, the three values are 0. The text `recovery` says how many parts since the alarm
-    count as evidence, how many of these were decided wrongly, and after about how many more parts
-    the safe mode ends, or that it does not, if these are more than 10,000; it is "" outside safe
-    mode. `mode` is the newest event at which a safe mode began or ended; without it `recovery` is
-    "". Raises what `load_rule` raises, and may write an event to the store as it does.
+    (10,001 are counted at most) count as evidence, how many of these were decided wrongly, and
+    after about how many more parts the safe mode ends; or that the evidence is enough, or that it
+    does not end, if these are more than 10,000. It is "" outside safe mode. `mode` is the newest
+    event at which a safe mode began or ended; without it `recovery` is "". Raises what `load_rule`
+    raises, and may write an event to the store as it does.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule

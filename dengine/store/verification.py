@@ -461,14 +461,9 @@ class CellCheck:
 def _entry_fault(added: Any, sums: Mapping[str, list[bytes]]) -> str:
     """Return in words why a ledger entry does not fit its rows.
 
-    It compares numbers of rows; if they are equal, it says that the entry or its rows were changed.
-
-    Parameters
-    ----------
-    added : str
-        The entry's column `added`: JSON, number of rows by table. It may be damaged.
-    sums : mapping of str to list of bytes
-        Sums of the rows that are there, by table.
+    It compares the numbers of rows by table; if they are equal, it says that the entry or its rows
+    were changed. `added` is the entry's column of that name, the numbers in JSON; if it is damaged,
+    all are 0. `sums` has the sums of the rows that are there, by table.
     """
     counts: dict[str, int] = {}
     with suppress(TypeError, ValueError):
