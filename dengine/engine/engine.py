@@ -451,11 +451,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer than 5 s is dropped. A second call does nothing, nor does one in
-        a forked process. Records that only the database does not take stay in the journal. Records
-        that the disk does not take are given up, and an error is logged; no call has said that they
-        are on disk. A store in memory stays open. Raises StoreError while another thread uses the
-        engine.
+        A retrain that takes longer than 5 s is dropped. In a product the news of the other cells is
+        taken in before; if the store does not answer then, the retrain is lost. A second call does
+        nothing, nor does one in a forked process. Records that only the database does not take stay
+        in the journal. Records that the disk does not take are given up, and an error is logged; no
+        call has said that they are on disk. A store in memory stays open. Raises StoreError while
+        another thread uses the engine.
         """
         with self._exclusive:
             if self._outbox.is_usable:

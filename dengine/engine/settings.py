@@ -223,10 +223,10 @@ class EngineSettings:
         """Raise SettingError if settings that a program gives are not the settings in force.
 
         `request` holds settings by name, as `DataEngine` takes them; None is a setting that was not
-        given. All settings of a recipe in it are compared. An unknown name is an error, too. For a
-        model that was handed in only settings that have an effect on any model are compared
-        (`LOOP_SETTINGS`: seed, trace, retrain_every, budget, max_steps, window, audit_rate, stops,
-        label_within and force_limits).
+        given. All settings of a recipe or policy in it are compared, its defaults included. An
+        unknown name is an error, too. For a model that was handed in only settings that have an
+        effect on any model are compared (`LOOP_SETTINGS`: seed, trace, retrain_every, budget,
+        max_steps, window, audit_rate, stops, label_within and force_limits).
 
         Not compared are the shadow mode, and force limits that the program leaves out, because an
         operator sets both while the cell runs. Nor is a reducer that is an object, with its
