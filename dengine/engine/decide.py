@@ -179,8 +179,8 @@ class DecisionMaker:
             records wait for the disk. If another thread has recorded a decision for the id
             meanwhile, that decision is returned. Before the first training the decision is VERIFY,
             `Reason.NO_MODEL`, unless the trace has a fault or is outside a force limit. If the
-            model raises, or its bounds are none, that is logged, and the decision is VERIFY,
-            `Reason.MODEL_ERROR`.
+            model raises, or returns bounds that are not 0 <= lower <= upper <= 1, that is logged,
+            and the decision is VERIFY, `Reason.MODEL_ERROR`.
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE

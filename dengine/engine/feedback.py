@@ -279,10 +279,10 @@ class Feedback:
     def _count_overdue(self) -> None:
         """Update the rule with each decision whose check has become overdue, as with a wrong one.
 
-        A check is overdue if it has no report within `Policy.label_within` later decisions; with
-        exactly so many it is. Each decision is counted once; a decision with the bound (0, 1),
-        which says nothing, or from before the present rule began, is not counted. A failed update
-        is logged, and the rule is stale then. `overdue_to` of the model in force is moved on.
+        A check is overdue if `Policy.label_within` or more decisions followed, and it has no report
+        yet. Each decision is counted once; a decision with the bound (0, 1), which says nothing, or
+        from before the present rule began, is not counted. A failed update is logged, and the rule
+        is stale then. `LiveModel.overdue_to` becomes the newest number that was examined.
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within

@@ -233,8 +233,8 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
 def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
     """Return the policy that was in force at a time, in seconds since 1970.
 
-    It is the policy that the first change of policy after this time replaced; an event that does
-    not hold the old policy is passed over. If there was no change since, it is `present`, the
+    It is the policy that the first change of policy after this time replaced; an event without
+    data, which cannot name it, is passed over. If there was no change since, it is `present`, the
     policy in force now. Raises SettingError if the policy of the event is not valid.
     """
     for event in store.events.newest():

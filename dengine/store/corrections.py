@@ -48,7 +48,7 @@ class CorrectionTable(CellTable):
         The change may correct labels, or have them forgotten (they count nowhere any more), store a
         model version, and replace the engine's settings. An accepted version deletes the stored
         arrays of older versions that are not kept any more. If one of these fails, nothing is
-        written. A label that is so already gets a correction all the same.
+        written. A label that already has the new value gets a correction, too.
 
         Raises
         ------

@@ -215,7 +215,7 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         within : int
-            Number of later decisions after which a check is overdue; with exactly so many it is.
+            A check is overdue once so many or more decisions have followed its own.
         since_version : int, default 0
             The model version with which `within` came into force. If the newest decision is by an
             earlier version, or there is none, only the numbers of the labels count.
@@ -251,8 +251,8 @@ class DecisionTable(CellTable):
         since_version : int, default 0
             Only those of them by this version or a later one.
         within : int or None
-            Number of later decisions after which a check without a label is overdue; with exactly
-            so many it is. None: none is.
+            A check without a label is overdue once so many or more decisions have followed its own;
+            None: none is.
 
         Returns
         -------
