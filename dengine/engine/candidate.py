@@ -75,8 +75,8 @@ class Candidate:
         The model takes over the rule of the previous model, which decides until now. Then the
         generator yields before each test, which decides on one trace. If the compiled model gives
         another result than the trained one, or raises, the training is dropped: `model` becomes
-        None, and the report says why. An exception is logged and not raised. If `model` is None
-        already, nothing is done.
+        None, and the report says why. An exception, also one while the rule is taken over, is
+        logged and not raised. If `model` is None already, nothing is done.
         """
         if self.model is None:
             return
@@ -120,7 +120,8 @@ class Candidate:
         If there is a model, the report is also marked as accepted and gets the number `version`,
         and `trained_on`, which names the labels of the training, is set. `corrected_to` is the
         number of the newest correction that the labels of the training had. Without a model the
-        report stays that of a dropped retrain.
+        report stays that of a dropped retrain, with the number of the version in force. Seconds
+        after this call are in no report.
         """
         seconds = self._seconds + self._clock() - self._work_began  # storing it comes on top
         self.report = replace(self.report, seconds=seconds)

@@ -97,9 +97,10 @@ class Corrections:
 
         References, the next retrain, the rule and the certificate take the label as corrected; the
         fold of its trace stays. A baseline, which cannot take a label back, is retrained before
-        this returns. The label as it was reported stays in the store. A training under way in the
-        executor is discarded, and begins again. If a safe mode begins or ends by this,
-        `on_safe_mode`, the user's function, is called.
+        this returns; if it is pinned, it is fitted again as a new version. The label as it was
+        reported stays in the store. A training under way in the executor is discarded, and begins
+        again, even if nothing changes. If a safe mode begins or ends by this, an event is recorded,
+        and `on_safe_mode`, the user's function, is called.
 
         Parameters
         ----------
@@ -120,8 +121,9 @@ class Corrections:
             For an unknown decision, for a decision without a label, and for a `success` that is no
             label.
         StoreError
-            If the store does not answer, the decision's trace is damaged, or the engine is closed
-            or was opened for reading. A change that was stored before the error stays stored.
+            If the store does not answer, the decision's trace is damaged, or the engine is closed,
+            was opened for reading or before a fork. A change that was stored before the error stays
+            stored.
         """
         label = as_success(success)
         (stored,) = self._find_labelled([decision_id])
@@ -141,11 +143,14 @@ class Corrections:
         the store, and so do the versions that were trained with them. The version in force goes on
         until the next retrain, which starts from weights that never saw these labels. If a rollback
         pinned this version, and it was trained with one of these labels, it is released, so that
-        retrains may replace it. A baseline is retrained before this returns. A training under way
-        in the executor is discarded, and begins again. If a safe mode begins or ends by this,
-        `on_safe_mode`, the user's function, is called. A guarantee assumes that the choice of what
-        is forgotten does not depend on the label. The certificate counts a forgotten outcome of a
-        certain decision as wrong, so that forgetting earns nothing.
+        retrains may replace it: it is stored as a new version, before the labels are forgotten. A
+        baseline is retrained before this returns. A training under way in the executor is
+        discarded, and begins again, even if nothing changes. If a safe mode begins or ends by this,
+        an event is recorded, and `on_safe_mode`, the user's function, is called. Without an
+        executor the call also waits until the features for the next training are computed, if that
+        starts from another model now. A guarantee assumes that the choice of what is forgotten does
+        not depend on the label. The certificate counts a forgotten outcome of a certain decision as
+        wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -166,7 +171,8 @@ class Corrections:
             label is forgotten.
         StoreError
             If the store does not answer, the trace of a decision is damaged, or the engine is
-            closed or was opened for reading. A change that was stored before the error stays.
+            closed, was opened for reading or before a fork. A change that was stored before the
+            error stays.
         """
         if not decision_ids:
             raise ReportError(
@@ -209,7 +215,8 @@ class Corrections:
         Raises
         ------
         StoreError
-            If the store does not answer, or the engine is closed or was opened for reading.
+            If the store does not answer, another cell of the product stores a version meanwhile, or
+            the engine is closed, was opened for reading or before a fork.
         """
         self._bring_up_to_date()
         if not self._live.pinned:
@@ -226,16 +233,17 @@ class Corrections:
         label that it was trained with; the next retrain then starts from this version, unless it
         saw a forgotten label.
 
-        A training under way in the executor is discarded, and no other one begins. A reducer like
-        umap-learn, of which not the fit but only the numbers of its traces are stored, is fitted
-        again on the traces of the earlier version, with the labels that they had then. A baseline
-        is fitted on the same traces, with the labels as they count now.
+        A training under way in the executor is discarded, even if nothing changes, and no other one
+        begins. A reducer like umap-learn, of which not the fit but only the numbers of its traces
+        are stored, is fitted again on the traces of the earlier version, with the labels that they
+        had then. A baseline is fitted on the same traces, with the labels as they count now.
 
         Parameters
         ----------
         version : int
             Number of the earlier version. If it is the version in force, this is stored as a new
-            version, too, and pinned. If it is pinned already, nothing changes.
+            version, too, and pinned. If a version is pinned, and this is its number or the number
+            that it had before, nothing changes.
         author : str
             For the record.
 
@@ -250,8 +258,11 @@ class Corrections:
             If `version` is no whole number.
         StoreError
             If the version is not kept (the message names those that are), if traces that it must be
-            fitted on are damaged, if the store does not answer, or if the engine is closed or was
-            opened for reading.
+            fitted on are damaged, if this dengine cannot restore it, if the store does not answer,
+            if another cell of the product stores a version meanwhile, or if the engine is closed,
+            was opened for reading or before a fork.
+        Exception
+            What a model raises that must be fitted again.
         """
         if isinstance(version, bool) or not isinstance(version, int | np.integer):
             raise SettingError(
@@ -314,7 +325,8 @@ class Corrections:
             imported or made. If a model was handed in, and a setting changes other than audit_rate,
             stops, label_within, force_limits and shadow.
         StoreError
-            If the store does not answer, or the engine is closed or was opened for reading.
+            If the store does not answer, another cell of the product stores a version meanwhile, or
+            the engine is closed, was opened for reading or before a fork.
         """
         expect(
             isinstance(policy, Policy),
@@ -361,9 +373,9 @@ class Corrections:
         """Finish what is under way: a correction comes after everything that was known before it.
 
         A trained version is put in force or dropped, and a training that is not done is discarded
-        and begins again later. Labels reach the store, and labels and versions of the product's
-        other cells are taken in. Raises StoreError if the engine is closed or the store does not
-        answer.
+        and begins again later. Labels reach the store, and labels, corrections and versions of the
+        product's other cells are taken in. Raises StoreError if the engine is closed, only reads or
+        was opened before a fork, and if the store does not answer.
         """
         self._outbox.check_usable()
         self._learner.bring_up_to_date()
@@ -389,10 +401,11 @@ class Corrections:
     def _change_labels(self, change: Change) -> Changed:
         """Store a change of labels, and apply it to references, training window and rule.
 
-        A model that cannot change its references is retrained, in this thread. If a safe mode
-        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
-        called. Returns what was done. Raises StoreError if the store does not answer; a change that
-        is stored by then is applied with the next one, or when the store is opened again.
+        The decisions leave the outbox's memory. A model that cannot change its references is
+        retrained, in this thread. If a safe mode begins or ends by this, an event is recorded, and
+        `on_safe_mode`, the user's function, is called. Returns what was done. Raises StoreError if
+        the store does not answer; a change that is stored by then is applied with the next one, or
+        when the store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:
@@ -410,7 +423,8 @@ class Corrections:
 
         `number` is that of the change's event; None means that it is the store's newest event. The
         announcement is an event and a call of `on_safe_mode`, the user's function; if it fails,
-        that is logged. `reason_ended` is the reason that is recorded if a safe mode ended.
+        that is logged. `reason_ended` is the reason that is recorded if a safe mode ended. Raises
+        StoreError if the store must be asked for the number and does not answer.
         """
         if number is None:
             number = self._store.events.newest(1)[0].number

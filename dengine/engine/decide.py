@@ -71,9 +71,9 @@ class DecisionMaker:
         cannot be read, that is logged and `spec` is set.
 
         A change is saved in the store; if the store does not take it, it is saved with a later
-        trace. Raises SettingError if the force limits do not fit the `TraceSpec`; then nothing
-        changes. Saving raises it, too, if another cell of the product has a `TraceSpec` that
-        contradicts this one, which then stays in force here.
+        trace; this is logged. Raises SettingError if the force limits do not fit the `TraceSpec`;
+        then nothing changes. Saving raises it, too, if another cell of the product has settings
+        that contradict these; the new `TraceSpec` then stays in force here.
         """
         store = self._outbox.store
         present = self._settings.now
@@ -99,9 +99,10 @@ class DecisionMaker:
         is trained, the first finite trace makes the untrained model compile its code for this
         shape; a failure of this is logged, too.
 
-        A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`.
-        Raises TraceError for a wrong shape, or too few samples of a first trace, and SettingError
-        for the reasons of `set_trace_spec`.
+        A trace with NaN, or another fault, is returned like any other, but sets no `TraceSpec`. The
+        array that is returned may share its memory with `trace`. Raises TraceError for a wrong
+        shape, for values that are no real numbers, or too few samples of a first trace, and
+        SettingError for the reasons of `set_trace_spec`.
         """
         settings = self._settings.now
         x = as_trace(trace, settings.trace)
@@ -174,11 +175,12 @@ class DecisionMaker:
         Returns
         -------
         StoredDecision
-            The record with its number, which is 0 if it could not be recorded. If another thread
-            has recorded a decision for the id meanwhile, that decision is returned. Before the
-            first training the decision is VERIFY, `Reason.NO_MODEL`, unless the trace has a fault
-            or is outside a force limit. If the model raises, that is logged, and the decision is
-            VERIFY, `Reason.MODEL_ERROR`.
+            The record with its number, which is 0 if it could not be recorded, because too many
+            records wait for the disk. If another thread has recorded a decision for the id
+            meanwhile, that decision is returned. Before the first training the decision is VERIFY,
+            `Reason.NO_MODEL`, unless the trace has a fault or is outside a force limit. If the
+            model raises, or returns bounds that are not 0 <= lower <= upper <= 1, that is logged,
+            and the decision is VERIFY, `Reason.MODEL_ERROR`.
         """
         if self._outbox.verify_all_reason:
             verify_reason = Reason.NO_STORE
@@ -189,9 +191,9 @@ class DecisionMaker:
         """Wait until a decision and all earlier records are on disk; return the valid decision.
 
         If that takes longer than the store's time limit, or a write fails, an ACCEPT or REJECT is
-        replaced by a VERIFY with `Reason.NO_STORE`, which is returned. But if it has reached the
-        disk meanwhile, it stays valid and is returned. A VERIFY is returned as it is. A timeout is
-        not raised.
+        replaced by a VERIFY with `Reason.NO_STORE`, which is returned, and which is not on disk
+        yet. But if the first one has reached the disk meanwhile, it stays valid and is returned. A
+        VERIFY is returned as it is. A timeout is not raised.
         """
         decision = stored.decision
         try:
@@ -215,7 +217,8 @@ class DecisionMaker:
         at: only the thread that uses the engine may do that.
 
         Raises TraceError for an invalid part number, an id that belongs to another trace, and a
-        trace that does not fit the `TraceSpec` in force, and ReportError for an invalid id.
+        trace that does not fit the `TraceSpec` in force, and ReportError for an invalid id. What
+        the outbox does not take is not raised, and rule and model learn nothing of it.
         """
         id_ = as_id(decision_id)
         number = as_part(part)
@@ -304,12 +307,14 @@ def _verify(x: TraceArray, conditions: DecisionConditions, reason: Reason) -> Ve
 def check_same_trace(stored: StoredDecision, trace: Any, spec: TraceSpec | None) -> Decision:
     """Return the decision of a record, if `trace` is the trace that it was made on.
 
+    The samples must be equal as float32; a NaN equals a NaN.
+
     Raises
     ------
     TraceConflictError
         For another trace.
     TraceError
-        For a trace that does not fit `spec`.
+        For a trace that does not fit `spec`, and for values that are no real numbers.
     """
     x = as_trace(trace, spec)
     if not np.array_equal(x, stored.trace, equal_nan=True):

@@ -220,7 +220,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         `template` is the untrained model, and the arguments from `executor` to `on_safe_mode` are
         those of `DataEngine`. From now on the store is closed when the engine is garbage-collected.
         The modules that a retrain imports are loaded: with an executor in a thread that goes on
-        after this returns, without one before this returns, but not for an engine that only reads
+        after this returns; without one before this returns, but not for an engine that only reads
         (`reading`). Limits this thread to one torch thread. Raises SettingError for force limits in
         seconds at an unknown rate, and StoreError if another engine owns the cell or the store
         cannot be used.
@@ -266,7 +266,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         The engine then decides bit for bit as before it was closed. A new cell of a product decides
         by the product's newest version. It is called once, before the first decision, and waits for
         the store without a time limit. If retrains run in the calling thread, it also waits until
-        the first retrain can begin without delay. Raises StoreError if the store cannot be read.
+        the first retrain can begin without delay. Raises StoreError if the store cannot be read,
+        and the other errors of `LiveModel.resume`.
         """
         settings = self._settings.now
         self._learner.resume(settings.recipe.policy.label_within, settings.policy_since)
@@ -317,9 +318,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Open a used store, and go on with the same version and the same decisions, bit for bit.
 
         The engine owns the cell until `close`, unless it only reads, and limits this thread to one
-        torch thread. Without an executor, unless it only reads, the call also waits until a retrain
-        can begin at once. If it raises, a store that it opened is closed; an `SqlStore` that was
-        passed may be closed, too.
+        torch thread. Records that an earlier process left in the journal are written to the store.
+        What in the store is not as it was written is not raised: every part is verified then
+        (`EngineState.integrity_error`). Without an executor, unless it only reads, the call also
+        waits until a retrain can begin at once. If it raises, a store that it opened is closed; an
+        `SqlStore` that was passed may be closed, too.
 
         Parameters
         ----------
@@ -351,11 +354,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         StoreError
-            If the store does not exist, is not used, is damaged or cannot be read, or if another
-            engine owns the cell.
+            If the store does not exist, is not used, is damaged or cannot be read, if another
+            engine owns the cell, or if this dengine cannot restore the newest version (in rare
+            cases KeyError, ValueError or NotImplementedError).
         SettingError
             If an object of yours is missing or is another one than the engine had, if a `model` is
-            given to an engine that has its own, or if `trace` contradicts the stored `TraceSpec`.
+            given to an engine that has its own, if `trace` contradicts the stored `TraceSpec`, if
+            the stored recipe cannot be read, or if its force limits do not fit the traces.
         ImportRefusedError
             A SettingError, if a class would have to be imported that is not allowed.
         """
@@ -417,7 +422,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         Raises
         ------
         SettingError
-            If a given setting differs from the used store's, is unknown, or is out of range.
+            If a given setting differs from the used store's, is unknown, or is out of range, if an
+            object of yours is missing or is another one than the engine had, and if a stored recipe
+            cannot be read. A store that was opened here is then closed; an `SqlStore` that was
+            passed may be, too.
         StoreError
             If another engine owns the cell, or the store cannot be used.
         ImportRefusedError
@@ -443,9 +451,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def close(self) -> None:
         """Finish a retrain under way, within seconds, write everything, and close the store.
 
-        A retrain that takes longer is dropped. A second call does nothing. Records that only the
-        database does not take stay in the journal. Records that the disk does not take are given
-        up, and an error is logged; no call has said that they are on disk. Raises StoreError while
+        A retrain that takes longer than 5 s is dropped. In a product the news of the other cells is
+        taken in before; if the store does not answer then, the retrain is lost. A second call does
+        nothing, nor does one in a forked process. Records that only the database does not take stay
+        in the journal. Records that the disk does not take are given up, and an error is logged; no
+        call has said that they are on disk. A store in memory stays open. Raises StoreError while
         another thread uses the engine.
         """
         with self._exclusive:
@@ -456,10 +466,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def flush(self, wait: float | None = None) -> None:
         """Wait until everything known so far is on disk, and in the store if that answers in time.
 
-        If a part was confirmed as good and then stopped the line, the rule was updated with a wrong
-        outcome; if the store has answered, the rule is put right, too. Raises NotTakenError if the
-        disk takes longer than `wait` seconds; None: the store's own limit. The store is waited for
-        up to its own limit.
+        If a part was confirmed as good and then stopped the line, or a check was reported after it
+        had counted as overdue, the rule was updated with a wrong outcome; if the store has
+        answered, the rule is put right, too. For a line stop a training under way is discarded
+        before, and begins again; a model that cannot take a label back is retrained. Raises
+        NotTakenError if the disk fails or takes longer than `wait` seconds; None: the store's own
+        limit. The store is waited for up to its own limit.
         """
         self._outbox.flush(wait)
         self._learner.catch_up()
@@ -477,10 +489,11 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         """Decide on one trace, and record the decision.
 
         Before that, a version that the executor has trained is taken one step further (the steps
-        are test, store, put in force), and accepted parts without a report are confirmed
-        (`Policy(stops="all")`) or counted as unreported. If a safe mode began or ended, an event is
-        recorded, and `on_safe_mode` is called. For an id that has a decision nothing of this is
-        done, and that decision is returned.
+        are test, store, put in force; in a product all are taken), and accepted parts without a
+        report are confirmed (`Policy(stops="all")`) or counted as unreported. A rule that lacks a
+        correction is put right, as by `flush`. Checks that become overdue update the rule. If a
+        safe mode began or ended, an event is recorded, and `on_safe_mode` is called. For an id that
+        has a decision nothing of this is done, and that decision is returned.
 
         Parameters
         ----------
@@ -515,8 +528,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         ReportError
             For an invalid id, and with `timed_out` for none.
         StoreError
-            For an engine that is closed or was opened for reading, and, unless `timed_out`, for one
-            that is in use by another thread.
+            For an engine that is closed, was opened for reading or before a fork, and, unless
+            `timed_out`, for one that is in use by another thread.
         """
         self._outbox.check_usable()
         if timed_out:
@@ -541,8 +554,7 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         nobody reported are confirmed (with `stops="all"`) or counted, which may change the rule.
         The decision is made and recorded. With an id it must be on disk before the caller acts on
         it; if the disk does not take it, the decision becomes VERIFY. Without an id one is made.
-        Raises TraceError for a wrong trace, and SettingError for a first trace that the force
-        limits do not fit.
+        Raises what `DecisionMaker.convert` raises, before anything else is done.
         """
         x = self._maker.convert(trace)
         self._learner.catch_up()
@@ -554,15 +566,18 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return stored.decision
 
     def report(self, decision_id: str, success: bool) -> RetrainReport | None:
-        """Report the outcome of a decision; the label survives a killed process once this returns.
+        """Report the outcome of a decision; once this returns, the label survives a power failure.
 
-        Before that, a version that the executor has trained is taken one step further (the steps
-        are test, store, put in force). After the label is learned, a safe mode may begin or end (an
-        event is recorded, and `on_safe_mode` is called), and a retrain that is due runs in this
-        thread or begins in the executor. The label of a trace with a fault is stored, but no
-        retrain follows. If the next decision had confirmed the part as good already, the call also
-        waits for the store, so that the rule is corrected now; if the store does not answer, this
-        happens later.
+        (With a store in memory it ends with the process.) Before that, a version that the executor
+        has trained is taken one step further (the steps are test, store, put in force; in a product
+        all are taken). After the label is learned, a safe mode may begin or end (an event is
+        recorded, and `on_safe_mode` is called), and a retrain that is due runs in this thread or
+        begins in the executor. In a product, newer versions and corrections of the other cells may
+        be put in force, too. The label of a trace with a fault is stored; then no retrain follows,
+        and the other cells' news is left for later. If the next decision had confirmed the part as
+        good already, the call also waits for the store, so that the rule is corrected now; if the
+        store does not answer, this happens later. For such a correction a training under way is
+        discarded and begins again, and a baseline is retrained.
 
         Parameters
         ----------
@@ -585,8 +600,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         StoreError
             If it is not certain that the label is on disk (NotTakenError): it is learned all the
             same, and the same report may come again. If the id cannot be looked up: nothing is
-            learned. Also for an engine that is closed, was opened for reading, or is in use by
-            another thread.
+            learned. Also for an engine that is closed, was opened for reading or before a fork, or
+            is in use by another thread.
         """
         label = as_success(success)  # refused before anything is written
         id_ = as_id(decision_id)
@@ -641,8 +656,12 @@ class DataEngine(AbstractContextManager["DataEngine"]):
             If `decide` does not take a trace of the cell.
         ReportError
             If `verify` returns no label, or `proceed` returns no Outcome.
+        StoreError
+            For an engine that is closed, was opened for reading or before a fork, or is in use by
+            another thread.
         NotTakenError
-            At the end, if the disk does not take everything within 10 seconds.
+            At the end, if the disk does not take everything within 10 seconds. A label that the
+            disk does not take meanwhile is logged, and the run goes on.
         """
         check_cell(cell)
         return self._run(cell, cycles)
@@ -675,7 +694,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         and written later. A retrain that is due is begun or done (`poll`). An exception of the cell
         is raised unchanged, and so are the other errors of `decide`, `report` and `poll`;
         ReportError is raised if the cell returns no label or outcome. Returns the record of the
-        cycle; its `decide_seconds` is the duration of the decision alone.
+        cycle; its `decide_seconds` is the duration of the decision alone, during which Python's
+        garbage collector is off.
         """
         trace = cell.insert()
         with uncollected():
@@ -715,10 +735,13 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def retrain(self, wait: bool = True) -> RetrainReport | None:
         """Retrain now, in this thread, and return the report.
 
-        A version that is pinned by a rollback is released first. A retrain that fails, has no label
-        to train on, or cannot be stored, is dropped: the report has `accepted` False then. Raises
-        StoreError if the labels that came before cannot be stored, and for an engine that is
-        closed, was opened for reading, or is in use by another thread.
+        A version that is pinned by a rollback is released first. In a product newer versions,
+        corrections and labels of the other cells are taken in. A retrain that fails, has no label
+        to train on, or cannot be stored, is dropped: the report has `accepted` False then. A safe
+        mode is not announced here, but by the next `decide`, `report` or `poll`. Raises StoreError
+        if the labels that came before cannot be stored, in a product if the store does not answer,
+        and for an engine that is closed, was opened for reading or before a fork, or is in use by
+        another thread.
 
         Parameters
         ----------
@@ -820,9 +843,10 @@ class DataEngine(AbstractContextManager["DataEngine"]):
     def certificate(self) -> Certificate:
         """Return bounds, at confidence 1 - alpha, on the errors of the decisions without a check.
 
-        Before that, everything is written to the disk, and to the store if it answers (`flush`).
-        Decisions since the last change of policy count. Raises NotTakenError if not everything is
-        on disk in time, and StoreError if the store cannot be read.
+        Before that, everything is written to the disk, and to the store if it answers (`flush`);
+        what the store does not take in time does not count. Decisions since the last change of
+        policy count. Raises NotTakenError if not everything is on disk in time, and StoreError if
+        the store cannot be read.
         """
         self.flush()
         policy = self.policy
@@ -891,9 +915,9 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         return as_frame(self.history(last, **where))
 
     def explain(self, decision_id: str, neighbours: int = 10) -> Explanation:
-        """Explain a decision by its nearest references, `neighbours` of them.
+        """Explain a decision by its nearest references, at most `neighbours` of them.
 
-        Raises ReportError for an unknown id.
+        Raises the errors of `history.explain.explain`, for example ReportError for an unknown id.
         """
         return explain(self.store, decision_id, neighbours)
 
@@ -915,8 +939,9 @@ def _new_settings(
     For a handed-in `model` without a recipe, the other settings are those of the default recipe,
     but `retrain_every` is that of `Reducer`, not of conv. Raises SettingError if `reducer`, or a
     setting in `given`, has no effect on such a model; those in `recipe` are not refused. Raises it
-    also for settings that are out of range or contradict each other, and if the training window is
-    smaller than the model's `min_traces`.
+    also for settings that are out of range or contradict each other, if the reducer or the rule
+    cannot be made, for a `model` that is none, and if the training window is smaller than the
+    model's `min_traces`.
     """
     if model is not None:
         check_model_settings(reducer, given)

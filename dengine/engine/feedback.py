@@ -106,7 +106,7 @@ class Feedback:
         With `stops="all"` the accepted parts are kept, so that the next trace confirms them. With
         "some" they are only counted, as unreported since the last label. For a safe mode that the
         rule is in already, the user's function `on_safe_mode` is not called. Raises StoreError if
-        the store cannot be read.
+        the store cannot be read, or with `stops="all"` the trace of such a part is damaged.
         """
         self._safe_mode = self._live.newest.safe_mode
         store = self._outbox.store
@@ -129,8 +129,8 @@ class Feedback:
         A VERIFY of a trace with a fault is not pending, nor is a VERIFY that could not be recorded
         (its number is 0). The rule counts each check that has become overdue as a wrong decision
         (`_count_overdue`). When more than 80 % of the decisions have `Reason.NOVEL`, in a mean that
-        fades over 50 decisions, an event is recorded, and the next such event only after this share
-        has fallen to one half.
+        fades over 50 decisions and begins at 0, an event is recorded, and the next such event only
+        after this share has fallen to one half or less.
         """
         decision = stored.decision
         if decision.action is Action.VERIFY and not stored.quarantined and stored.number:
@@ -150,8 +150,10 @@ class Feedback:
         """Confirm or count the accepted parts without an outcome, because the next trace has come.
 
         With `Policy(stops="all")`, under which a bad part would have stopped the line, each part
-        counts as good: rule and references learn it at once, and its label, CONFIRMED, is recorded.
-        With "some" the parts are only counted, and nothing is learned.
+        counts as good: rule and references learn it now, and its label, CONFIRMED, is recorded
+        without waiting for the disk. An exception of rule or model is logged, not raised, and a
+        part from before the present rule began does not update the rule. With "some" the parts are
+        only counted, and nothing is learned. Either way they wait for an outcome no longer.
         """
         while self._unreported:
             _, stored = self._unreported.popitem(last=False)
@@ -168,7 +170,8 @@ class Feedback:
         decision has a label already, ReportError is raised, with one exception: a line stop may
         follow the confirmation of a part by the next decision (`Policy(stops="all")`). Such a line
         stop is recorded, and learned later, as a correction. The attribute `remedy` is set if the
-        rule must be rebuilt, which is not done here.
+        rule must be rebuilt, which is not done here. An exception of rule or model is logged, not
+        raised.
         """
         id_ = stored.decision.id
         if self._unsynced.get(id_) is not success:
@@ -176,7 +179,10 @@ class Feedback:
         self._unsynced[id_] = success
 
     def note_synced(self, decision_id: str) -> None:
-        """Note that the label of this decision is on disk: another report is now an error."""
+        """Note that the label of this decision is on disk: another report is now an error.
+
+        `take_in` must have taken it; else KeyError is raised.
+        """
         del self._unsynced[decision_id]
 
     def _take_in_new(self, stored: StoredDecision, success: bool) -> None:
@@ -184,8 +190,9 @@ class Feedback:
 
         `stored` is the decision with the label that it has so far. If the next decision had
         confirmed the part as good, a line stop is recorded but not learned yet, and `remedy`, which
-        says what must be done later, is set to CORRECT. It is set to REBUILD_RULE if the rule had
-        counted the part's check as overdue. Raises ReportError if the decision has any other label.
+        says what must be done later, is set to CORRECT. It is set to REBUILD_RULE, unless it is set
+        already, if the rule had counted the part's check as overdue. Raises ReportError if the
+        decision has any other label; then nothing is changed.
         """
         decision = stored.decision
         source = source_of(decision.action, decision.audit, success)
@@ -215,8 +222,9 @@ class Feedback:
         decision is from before the present rule and so does not update it. A part that was counted
         among them is subtracted from the number that its own label tells, which may make it -1.
 
-        The label takes the next number of the outbox. The label of a trace without a fault enters
-        the training window, in a product once the store has given it a number.
+        The label takes the next number of the outbox. The label of a trace without a fault counts
+        as new and enters the training window; in a product it is read into that from the store,
+        later.
         """
         decision = stored.decision
         version = self._live.version
@@ -256,11 +264,12 @@ class Feedback:
         return decision.id not in self._unreported and is_of_policy
 
     def number_labels(self) -> None:
-        """In a product, give this cell's labels the numbers that the store has newly assigned.
+        """In a product, give this cell's references the numbers that their labels got in the store.
 
         A product is several cells whose labels have one sequence of numbers in the store. With or
         without a product, the rule first counts each check that has become overdue as a wrong
-        decision.
+        decision. The store is not asked: these are the numbers that came with the labels drained so
+        far. Nothing is raised.
         """
         self._count_overdue()
         if self._labels.has_provisional:
@@ -270,9 +279,10 @@ class Feedback:
     def _count_overdue(self) -> None:
         """Update the rule with each decision whose check has become overdue, as with a wrong one.
 
-        A check is overdue if it has no report within `Policy.label_within` later decisions. Each
-        decision is counted once; a decision with the bound (0, 1), which says nothing, or from
-        before the present rule began, is not counted.
+        A check is overdue if `Policy.label_within` or more decisions followed, and it has no report
+        yet. Each decision is counted once; a decision with the bound (0, 1), which says nothing, or
+        from before the present rule began, is not counted. A failed update is logged, and the rule
+        is stale then. `LiveModel.overdue_to` becomes the newest number that was examined.
         """
         label_within = self._settings.now.recipe.policy.label_within
         overdue_to = self._outbox.n_decisions - label_within
@@ -296,7 +306,10 @@ class Feedback:
         self.remedy = remedy
 
     def begin_policy(self) -> None:
-        """Drop the accepted parts that wait for an outcome, because another policy begins."""
+        """Drop the accepted parts that wait for an outcome, because another policy begins.
+
+        The count of unreported parts begins again at 0. Pending checks stay.
+        """
         self._unreported.clear()
         self._n_unreported = 0
 

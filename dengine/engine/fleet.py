@@ -88,8 +88,10 @@ class Peers:
     def read_labels(self) -> None:
         """Add the labels of all cells that came since the window's newest to the training window.
 
-        They are read with the corrections that the references of the model in force have. Labels of
-        traces with a fault and forgotten labels are left out. Raises StoreError if the store cannot
+        At most as many as the window holds are read, the newest, with the corrections that the
+        references of the model in force have; a full window loses its oldest. Labels of traces with
+        a fault and forgotten labels are left out, and so are those of damaged traces, for which an
+        event is written to the store. There is no time limit. Raises StoreError if the store cannot
         be read.
         """
         labelled = self._outbox.store.labels.with_traces(
@@ -104,9 +106,12 @@ class Peers:
         """Put a version that another cell of the product stored in force, with this cell's labels.
 
         It gets the present decision rule of this cell: nothing is rebuilt, and the other cell's
-        rule is ignored. If the version is damaged or cannot be restored, that is logged, the
-        present version stays in force, and `look` does not return this number again. Returns
-        whether the version is in force now. Raises StoreError if the store cannot be read.
+        rule is ignored. A failure to take over the rule is logged, and the version is in force all
+        the same. If the version is damaged or cannot be restored, that is logged, the present
+        version stays in force, and `look` does not return this number again. A model like
+        umap-learn is fitted again, and the labels that it is fitted on are checked against the
+        ledger. Returns whether the version is in force now. Raises StoreError if the store cannot
+        be read.
         """
         store = self._outbox.store
         try:

@@ -43,9 +43,10 @@ class CellLabels:
     def add(self, stored: StoredDecision, label: NewLabel) -> None:
         """Add a label, which was learned and recorded, to the training window, and count it as new.
 
-        `stored` is its decision with the trace. In a product the number of the label is provisional
-        (0 or less): then the label is not added, and the number is noted until the store gives the
-        label another.
+        `stored` is its decision with the trace, which must have no fault. In a product the number
+        of the label is provisional (below 0): then the label is counted, but not added, and the
+        number is noted until the store gives the label another. A full window loses its oldest
+        label.
         """
         self.new_labels += 1
         if label.seq > 0:

@@ -99,7 +99,7 @@ class Learner:
         after which a check without a report is overdue, and `policy_since` the first version under
         the policy in force. If there is a version, or at least IMPORTED labels (500), this also
         starts a thread that computes in advance for the next retrain (`precompute`). Raises
-        StoreError if the store cannot be read.
+        StoreError if the store cannot be read, and the other errors of `LiveModel.resume`.
         """
         version = self._store.versions.newest()
         reports = self._store.versions.retrains()
@@ -120,11 +120,13 @@ class Learner:
         self.labels.count_from(self.live.trained_on.counts_from)
 
     def precompute(self) -> None:
-        """Start a thread that computes in advance what the next training needs; do not wait.
+        """Start a thread that computes in advance what the next training needs; do not wait for it.
 
         These are above all the features of the traces in the training window. They are kept in the
-        model that the training starts from; a failure is logged. Nothing is started if the training
-        window is empty, or if `wait_until_precomputed` has not waited for an earlier thread yet.
+        model that the training starts from, which is first looked for in the store, without a time
+        limit, if labels were corrected (`_choose_start`); a failure is logged. Nothing is started
+        if the training window is empty, or if `wait_until_precomputed` has not waited for an
+        earlier thread yet.
         """
         if self._precomputed is not None or not len(self._window):
             return
@@ -143,10 +145,11 @@ class Learner:
 
         The store assigns numbers only in a product. Checks that have become overdue are counted,
         too. The rule must be put right (`Feedback.remedy`) after it learned a wrong outcome: it is
-        rebuilt, or a correction is applied and it is rebuilt. This waits for a later call while the
-        store lacks records or cannot be written. Before a correction a retrain under way is ended
-        (`end_training`); a model that cannot change its references is retrained. If the store fails
-        meanwhile, that is logged and not raised, and a later call tries again.
+        rebuilt, or all corrections that the store has by now are applied and it is rebuilt. This
+        waits for a later call while the store lacks any record or has a fault. Before a correction
+        a retrain under way is ended (`end_training`); a model that cannot change its references is
+        retrained here. If the store fails meanwhile, that is logged and not raised, and a later
+        call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -167,7 +170,8 @@ class Learner:
     def store_labels(self) -> None:
         """Wait until every label is in the store and has its number; then do what `catch_up` does.
 
-        Raises StoreError if the store is unavailable or takes too long.
+        If the store has every label, nothing is waited for. Raises StoreError if it is unavailable
+        or takes too long.
         """
         if self._outbox.request_label_drain():
             self._outbox.drain()
@@ -193,7 +197,8 @@ class Learner:
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
         report is returned all the same. Raises StoreError if the labels before the training cannot
-        be stored, and in a product if the store does not answer.
+        be stored, and in a product if the store does not answer; no training begins then. With
+        `wait` True no training may be under way (`end_training`).
         """
         if not wait:
             if self.is_at_work:
@@ -307,8 +312,9 @@ class Learner:
 
         Taking the outcome is a step; the others test the version, store it and put it in force.
         With `to_the_end` all steps of a training that is done are taken, and the call waits for the
-        store. Nothing happens if no training is under way, or while it is not done. A version that
-        cannot be stored is dropped, and nothing is raised.
+        store. Nothing happens if no training is under way, or while it is not done; but a training
+        that hangs (longer than 60 s), or whose executor died, is given up and dropped. A version
+        that cannot be stored is dropped, and nothing is raised.
 
         `wait` is the number of seconds to wait for a training that is not done; after that it is
         given up, and so is a training that hangs. In a product (cells that share labels and
@@ -338,7 +344,7 @@ class Learner:
 
         It will take over the rule of the model in force. If the training started from another
         model, because labels were forgotten, the reason in its report says from which. Returns the
-        candidate, whose steps (test, store, put in force) `_advance` takes.
+        candidate, whose steps (test, store, put in force) `_advance` takes; none is taken here.
         """
         note = self._start[2] if self._start is not None else ""
         if note:
@@ -352,8 +358,8 @@ class Learner:
 
         Without any correction it is the model in force, or the untrained model before the first
         retrain. Otherwise `find_clean_start` chooses it from the store, and the choice is kept
-        until another version is in force or another correction comes. If the store fails, that is
-        logged, and the training starts from initial weights.
+        until another version is in force or another correction comes. If that raises, whatever it
+        is, it is logged, and the training starts from initial weights.
         """
         live = self.live
         if not live.corrected_to:  # nothing was ever forgotten, so the store need not be read
@@ -387,9 +393,10 @@ class Learner:
         """Bring the candidate, a trained version that is not in force yet, one step further.
 
         With `to_the_end` it takes all steps that are left: test, learn newer labels, store, learn
-        newer labels, put in force. A candidate that cannot be stored is dropped. A candidate that
-        is stored waits for a later call if the newest labels cannot be stored, which is logged. The
-        time that this takes counts as work on the retrain, in its report.
+        newer labels, put in force. No StoreError is raised: a candidate that cannot be stored, or
+        whose labels cannot be stored before it, is dropped. A candidate that is stored waits for a
+        later call if the newest labels cannot be stored, which is logged. The time that this takes
+        before it is stored counts as work on the retrain, in its report.
         """
         candidate.begin_work()
         try:
@@ -457,7 +464,7 @@ class Learner:
         The candidate is a trained version that is not in force yet. Returns a future of the
         version's number: the report's, or a higher one if another cell of the product stored a
         version first. Without a model only the report is stored, and the number is the report's.
-        Raises StoreError if the store is unavailable.
+        Raises StoreError if the store is unavailable. With a store in memory it is kept there.
         """
         report = candidate.complete_report(self.live.next_version, self.live.corrected_to)
         newest_seq = self._window.newest_seq
@@ -486,8 +493,9 @@ class Learner:
     def _drop(self, candidate: Candidate, error: StoreError) -> None:
         """Drop a candidate that could not be stored, and keep a report of this in memory only.
 
-        It is logged, and the previous version stays in force. All labels of its training count as
-        new, so that the next retrain is soon.
+        It is logged, and the previous version stays in force. As many labels as its training had
+        are added to the count of new ones, so that the next retrain is soon. Its reason is added to
+        `dropped`. Missing steps are then no reason for another training (`retrain_if_due`).
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None
@@ -517,8 +525,8 @@ class Learner:
         """Take in what peers stored (`_hear_of_peers`); return whether the store gave an answer.
 
         These are versions and corrections of the product's other cells, and with `with_labels` the
-        labels of all cells. If the store gave no answer, that is logged, once until it answers
-        again, and nothing is raised.
+        labels of all cells. If the store gave no answer, or this cell's labels could not be stored,
+        that is logged, once until it answers again, and nothing is raised.
         """
         failure = None
         try:
@@ -564,7 +572,8 @@ class Learner:
 
         A trained version is put in force or dropped, and a training that is not done is discarded
         and begins again later (`end_training`). News is what the product's other cells stored
-        (`_hear_of_peers`). Raises StoreError if the store is unavailable.
+        (`_hear_of_peers`). A trained version that cannot be stored is dropped. Raises StoreError if
+        the store is unavailable.
         """
         self.end_training()
         self.store_labels()
@@ -578,7 +587,8 @@ class Learner:
         does so. If the next training does not start from the model in force, because labels were
         forgotten, its features are computed in advance (`_precompute_other_start`). The store is
         checked against its ledger; a difference sets the outbox's `integrity_error`, after which
-        every part is verified. Raises StoreError if the store is unavailable.
+        every part is verified. With no new correction the window is read and the rule rebuilt, too;
+        a baseline is then retrained all the same. Raises StoreError if the store is unavailable.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
@@ -616,8 +626,9 @@ class Learner:
     def release(self, author: str) -> Change:
         """Let retrains replace a version again that a rollback pinned, and return the stored event.
 
-        The same model goes on as a new version. If that cannot be stored, StoreError is raised and
-        nothing changes.
+        The same model, with its rule, goes on as a new version. If that cannot be stored, or
+        another cell of the product stored a version meanwhile, StoreError is raised and nothing
+        changes.
         """
         live = self.live
         text = f"version {live.version} is pinned no more: the next retrain may replace it"
@@ -636,7 +647,8 @@ class Learner:
         that was requested before is not begun any more.
 
         Raises StoreError if the version is not kept, if a trace is damaged that the model must be
-        fitted on again, and if the version cannot be stored.
+        fitted on again, and if the version cannot be stored, also because another cell of the
+        product stored one meanwhile; and what `_restore_with_rule_in_force` raises.
         """
         begin = self._clock()
         self._outbox.check_integrity()
@@ -658,7 +670,8 @@ class Learner:
         is fitted on these traces again, with the labels that they had then. A baseline is fitted on
         its traces with the labels as they count now, since it cannot take a label back. The model
         is not put in force. An exception as it takes over the rule is logged. Raises StoreError if
-        one of these traces has changed, or if this dengine cannot restore the version.
+        one of these traces has changed, or if this dengine cannot restore the version (then also
+        the other errors of `restore_model`), and what the fit raises.
         """
         state = without_rule(version.state)
         trained_on = TrainedOn.from_state(version.state)
@@ -680,9 +693,9 @@ class Learner:
 
         The version is stored with `event`. With `policy` the decision rule starts anew and counts
         the decisions that `evidence` names. With None only settings outside the model have changed,
-        and its rule goes on. Before the first retrain only the event is stored. Raises SettingError
-        if the rule cannot be made, and StoreError if the event cannot be stored: then nothing
-        changes.
+        and its rule goes on. Before the first retrain only the event is stored. A failure to make
+        the model with the new rule ready is logged. Raises SettingError if the rule cannot be made,
+        and StoreError if the event cannot be stored: then nothing changes.
         """
         live = self.live
         template = live.template
@@ -702,8 +715,9 @@ class Learner:
     ) -> None:
         """Store a model as the next version, with the event of a person's change; put it in force.
 
-        The newest report is then one of this version: accepted, with `reason` and `seconds`. If the
-        version cannot be stored, StoreError is raised and nothing changes.
+        The newest report is then one of this version: accepted, with `reason` and `seconds`, which
+        empties `dropped`. If the version cannot be stored, also because another cell of the product
+        stored one meanwhile, StoreError is raised and nothing changes.
         """
         n_traces = len(trained_on.seq)
         report = RetrainReport(self.live.next_version, seconds, n_traces, 0, True, reason)

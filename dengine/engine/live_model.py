@@ -114,8 +114,10 @@ class LiveModel:
         began. The outcomes that update the rule are checked against the store's ledger; a
         difference sets the outbox's `integrity_error`, after which every part is verified. Labels
         that came after the version was stored become references. If the version is from before the
-        present rule, its stored rule is not taken. An exception as the model is made ready is
-        logged. `overdue`, `overdue_to` and `corrected_to` are restored, too.
+        present rule, its stored rule is not taken. If the stored rule does not include what it must
+        (`RuleProgress.last_seq`), the rule is rebuilt from all outcomes. An exception as the model
+        is made ready, or as the rule or the references learn, is logged. `overdue`, `overdue_to`
+        and `corrected_to` are restored, too.
 
         Parameters
         ----------
@@ -131,7 +133,10 @@ class LiveModel:
         Raises
         ------
         StoreError
-            If the store cannot be read, or this dengine cannot restore the model.
+            If the store cannot be read, or this dengine cannot restore the model (in rare cases
+            KeyError, ValueError or NotImplementedError).
+        Exception
+            What a model raises that must be trained again.
         """
         store = self.outbox.store
         since = self.evidence.since
@@ -164,8 +169,8 @@ class LiveModel:
         """Put a model in force, as the version of this number; nothing is stored.
 
         `trained_on` names the labels of its training. The attributes `answering`, `version`,
-        `newest_version`, `trained_on` and `lacks_steps` are set. The caller hands the rule in force
-        over to the model (`EngineModel.prepare`), before or after.
+        `newest_version` (unless it is larger already), `trained_on` and `lacks_steps` are set. The
+        caller hands the rule in force over to the model (`EngineModel.prepare`), before or after.
         """
         self.answering = model
         self.version = version
@@ -220,8 +225,10 @@ class LiveModel:
     def count_overdue(self, decision: Decision) -> None:
         """Update the rule as if a decision was wrong, because its check is overdue.
 
-        The decision's id is kept in `overdue`. A failed update is logged. A decision with the bound
-        (0, 1), which says nothing, or from before the present rule began, changes nothing.
+        The decision's id is kept in `overdue`. A failed update is logged, and the rule is stale
+        then. A decision with lower > 0 and upper < 1 updates it twice, as a failure and as a
+        success (`overdue_outcomes`). A decision with the bound (0, 1), which says nothing, or from
+        before the present rule began, changes nothing.
         """
         if decision.model_version < self.evidence.since:  # of an earlier policy, as in `learn`
             return
@@ -245,12 +252,15 @@ class LiveModel:
         return True
 
     def rebuild_rule(self) -> None:
-        """Reset the rule, and update it with all stored outcomes of decisions since it began.
+        """Reset the rule, and update it with the stored outcomes of decisions since it began.
 
-        It is the rule of the model in force, or of the untrained model before the first retrain. It
-        begins in the safe mode that `evidence` names, `began_in`. Overdue checks are among the
-        outcomes, as wrong decisions. Labels that are not in the store yet are not, so the rule
-        loses them: store them before.
+        They are those of `LabelTable.outcomes_since`: this cell's labels as corrected, without
+        forgotten ones, those of quarantined traces and those of inspected rejected parts; overdue
+        checks are among them, as wrong decisions. Labels that are not in the store yet are not, so
+        the rule loses them: store them before. It is the rule of the model in force, or of the
+        untrained model before the first retrain. It begins in the safe mode `began_in` of the
+        attribute `evidence`, the `EvidenceWindow`, which also says since which version decisions
+        count. A rule that never learns is only reset.
 
         An update that fails here is logged and makes the rule stale: every part is then verified
         until the engine is opened again. A rule that was stale before stays so. The store's ledger
@@ -269,7 +279,8 @@ class LiveModel:
         """Reset a model's rule and update it with the outcomes that `read_outcomes` returns.
 
         It starts in the safe mode that `evidence` names (`began_in`). A failed update is logged,
-        and the rule is stale then. A rule that never learns is only reset.
+        and the rule is stale then. A rule that never learns is only reset, and `read_outcomes` is
+        not called. What this raises is raised after the reset.
         """
         model.reset_rule(self.evidence.began_in)
         _update_rule(model, read_outcomes)
@@ -288,10 +299,11 @@ class LiveModel:
         """Apply the store's newest corrections to the references of the model in force.
 
         Returns False if the model must be trained again: always for a baseline (a model that the
-        user handed in), and if it cannot change a reference. The caller must retrain then, because
-        each correction is applied only once. Returns True before the first retrain; `corrected_to`
-        is set in any case. The rule is left to `rebuild_rule`. Raises StoreError if the store is
-        unavailable.
+        user handed in), and if it cannot change a reference; the other references are changed all
+        the same. The caller must retrain then, because each correction is applied only once.
+        Returns True before the first retrain. `corrected_to` is set to the last correction in any
+        case, without any it stays. The rule is left to `rebuild_rule`. Raises StoreError if the
+        store is unavailable, after the corrections before were applied.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None
@@ -306,11 +318,11 @@ class LiveModel:
     ) -> tuple[EngineModel, EngineModel | None]:
         """Return copies of the untrained model and the model in force, under another policy.
 
-        Their rule is that of the policy and has learned nothing; it starts in the safe mode that
-        `evidence` names. The second copy is None before the first retrain; it shares the references
-        of the model in force. A baseline, which has no such rule, is not copied. If it cannot be
-        made ready to predict, that is logged. Neither is put in force. Raises SettingError if the
-        rule cannot be made.
+        Their rule is one object, that of the policy, and has learned nothing; it starts in the safe
+        mode that `evidence` names. The second copy is None before the first retrain; it shares the
+        references of the model in force. A baseline, which has no such rule, is returned itself. If
+        the second cannot be made ready to predict, that is logged. Neither is put in force. Raises
+        SettingError if the rule cannot be made.
         """
         template = self.template.with_policy(policy)
         template.reset_rule(evidence.began_in)
@@ -331,11 +343,11 @@ class LiveModel:
     def get_state(self, model: EngineModel, trained_on: TrainedOn) -> State:
         """Return the arrays by name with which the store can restore a model as a version.
 
-        They hold the model with its rule, the numbers of the labels that it was trained on
-        (`trained_on`), and the numbers of the newest correction that counts and of the newest
-        decision that was examined for an overdue check. If an overdue check counts, they say so
-        (`includes_overdue`): an engine that opens the store then does not take the stored rule, but
-        rebuilds it.
+        They hold the model with its rule (in place of a stale rule `rule_is_stale`; of a baseline
+        nothing), the numbers of the labels that it was trained on (`trained_on`), and the numbers
+        of the newest correction that counts and of the newest decision that was examined for an
+        overdue check. If an overdue check counts, they say so (`includes_overdue`): an engine that
+        opens the store then does not take the stored rule, but rebuilds it. Some arrays are views.
         """
         state = model.get_state() | trained_on.to_state()
         state["corrected_to"] = np.array(self.corrected_to)
@@ -350,8 +362,9 @@ class LiveModel:
 def _update_rule(model: EngineModel, read_outcomes: Callable[[], list[OutcomeRecord]]) -> None:
     """Update a model's rule with outcomes in the order of their labels.
 
-    `read_outcomes` returns the outcomes. An update that fails is logged, and the rule is stale
-    then: every part is verified. For a rule that never learns, `read_outcomes` is not called.
+    `read_outcomes` returns the outcomes; what it raises is raised. An update that fails is logged,
+    and the rule is stale then: every part is verified; the updates after it are made all the same.
+    For a rule that never learns, `read_outcomes` is not called.
     """
     if not model.rule_learns:
         return

@@ -32,8 +32,10 @@ def restore_model(
     `state` holds the arrays of the version by name. A model like umap-learn, of which not the fit
     but only the numbers of its traces are stored, is trained on these traces again (`refit`).
     Returns None if one of these traces is damaged or missing. The new model and the template share
-    one rule, so the template gets the stored rule, too. Raises StoreError for a state that this
-    dengine cannot restore, for a label that is neither 0 nor 1, and if the store cannot be read.
+    one rule, so the template gets the stored rule, too, if `state` holds one. Raises StoreError
+    (KeyError, ValueError or NotImplementedError, if it is of another reducer) for a state that this
+    dengine cannot restore, StoreError for a label that is neither 0 nor 1, and if the store cannot
+    be read, and what the training raises.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -51,8 +53,9 @@ def refit(model: EngineModel, outbox: Outbox, trained_on: TrainedOn) -> bool:
     missing.
 
     Returns False, with the model untrained, if a trace is missing or damaged; an event is written
-    to the store for each damaged trace. Raises StoreError if a label is neither 0 nor 1, if the
-    traces have different shapes, or if the store does not answer.
+    to the store that names the damaged ones. Raises StoreError if a label is neither 0 nor 1, if
+    the traces have different shapes, or if the store does not answer, and what `train` of the model
+    raises.
     """
     store = outbox.store
     first = int(trained_on.seq[0])
@@ -81,10 +84,11 @@ def find_clean_start(
     """Return a model for the next training to start from, which saw no label that is forgotten now.
 
     If `newest`, whose weights learned from the labels that `trained_on` names, saw no such label,
-    it is returned. It is also returned if it begins anew with each training, like a baseline.
-    Otherwise the newest stored version that saw no such label is returned, without its rule;
-    versions that are damaged or not kept are passed over. If there is none, it is `template`, the
-    untrained model with its initial weights.
+    it is returned. It is also returned if it begins anew with each training, like a baseline, or a
+    model of which a stored version does not hold the fit. Otherwise the newest stored version of
+    the cell or its product that saw no such label is returned, as a new model with the rule of
+    `template`; versions that are damaged or not kept are passed over. If there is none, it is
+    `template`, the untrained model with its initial weights.
 
     Returns
     -------
@@ -96,6 +100,8 @@ def find_clean_start(
     ------
     StoreError
         If the store cannot be read.
+    KeyError, ValueError, NotImplementedError
+        For a version of another reducer that cannot be restored.
     """
     corrections = {correction.seq: correction for correction in store.corrections.after()}
 
@@ -137,10 +143,10 @@ def add_labels_since(
     They are the labels of all cells of the product up to number `shared_to`, and after it only this
     cell's own. None stands for the newest label that the version was trained on, or that it got
     with a rollback, so that an engine that opens a store counts what it counted before. At most the
-    `capacity` newest of each of the two kinds are added. Corrections that came since the version
-    was stored are applied between the labels, in the order in which they came, so that the model is
-    the same bit for bit. A baseline (a model that the user handed in), which cannot be corrected,
-    gets the labels as they count now. A label that the model cannot take is logged and skipped; one
+    `capacity` newest of each of the two kinds are read. Corrections that came since the version was
+    stored are applied between the labels, in the order in which they came, so that the model is the
+    same bit for bit. A baseline (a model that the user handed in), which cannot be corrected, gets
+    the labels as they count now. A label that the model cannot take is logged and skipped; one
     whose trace is damaged is skipped, and an event is written to the store. Returns the number of
     the newest correction in the store. Raises StoreError if the store cannot be read.
     """
@@ -183,7 +189,8 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
     """Change the reference of a corrected label: relabel it, remove it or add it again.
 
     If the model cannot take a reference that is added again, the error is logged, and the next
-    version learns the label from the store.
+    version learns the label from the store. If the trace is damaged, an event is written to the
+    store.
 
     Returns
     -------
@@ -191,12 +198,13 @@ def apply_correction(model: EngineModel, store: SqlStore, correction: Correction
         False if the model keeps references and cannot change this one: nothing is changed, and the
         model must be trained again. True in all other cases, even if there was nothing to change:
         the model is a baseline, which keeps no references; the reference has left the model; the
-        trace of the part has a fault; or the trace is damaged and would have to be added again.
+        trace of the part has a fault; the decision is another cell's and its trace is damaged; or
+        the trace is damaged and would have to be added again.
 
     Raises
     ------
     StoreError
-        If the store cannot be read.
+        If the store cannot be read, or the label is neither 0 nor 1.
     """
     if not model.keeps_references:
         return True

@@ -106,8 +106,9 @@ class EngineSettings:
     def to_store(self) -> dict[str, str]:
         """Return the settings as texts by name, as `SqlStore.settings.save` takes them.
 
-        Settings at their defaults are left out, except the recipe and the seed; dengine's own
-        version is added.
+        Settings at their defaults are left out, except the recipe, which is written in full, and
+        the seed; dengine's own version is added. Raises SettingError if a named reducer's class
+        must be imported for a default of the recipe, and cannot be.
         """
         texts = {"recipe": self.recipe.to_toml(), "seed": str(self.seed), "dengine": __version__}
         if self.model is not None:
@@ -153,7 +154,8 @@ class EngineSettings:
         Raises
         ------
         StoreError
-            For an unused store, a damaged number or `TraceSpec`, and a recipe that lacks settings.
+            For an unused store, a number that is negative or no number, a damaged `TraceSpec`, and
+            a recipe that lacks settings.
         SettingError
             If the stored text is no recipe, if an object is missing or differs from the one that
             the engine was made with, or if a `model` is passed to an engine that has its own. Also
@@ -198,9 +200,9 @@ class EngineSettings:
         If a user passed an object in place of a name, the settings are a copy that describes it. A
         `ModelPrediction`, dengine's own kind of model, as `model` also replaces the settings of the
         recipe that it has itself, like the radius; for a baseline the recipe stays, though not all
-        of it has an effect. Without a `model` the recipe's reducer is made, for which a class of
-        the user's is imported. Raises SettingError if that fails, and for a `model` that lacks a
-        method of `Model`.
+        of it has an effect. Without a `model` the recipe's reducer and the rule of its policy are
+        made, for which classes of the user's are imported. Raises SettingError if that fails, and
+        for a `model` that lacks a method of `Model`. These settings are not changed.
         """
         if model is None:
             untrained = ModelPrediction.from_recipe(self.recipe, self.seed)
@@ -221,15 +223,16 @@ class EngineSettings:
         """Raise SettingError if settings that a program gives are not the settings in force.
 
         `request` holds settings by name, as `DataEngine` takes them; None is a setting that was not
-        given. All settings of a recipe in it are compared. An unknown name is an error, too. For a
-        model that was handed in only settings that have an effect on any model are compared
-        (`LOOP_SETTINGS`: seed, trace, retrain_every, budget, max_steps, window, audit_rate, stops,
-        label_within and force_limits).
+        given. All settings of a recipe or policy in it are compared, its defaults included. An
+        unknown name is an error, too. For a model that was handed in only settings that have an
+        effect on any model are compared (`LOOP_SETTINGS`: seed, trace, retrain_every, budget,
+        max_steps, window, audit_rate, stops, label_within and force_limits).
 
         Not compared are the shadow mode, and force limits that the program leaves out, because an
         operator sets both while the cell runs. Nor is a reducer that is an object, with its
         parameters. A `trace` is compared only if a `TraceSpec` is in force; a rate, units and
-        columns that it leaves out are not compared.
+        columns that it leaves out are not compared. A recipe that cannot be read, or that names
+        another reducer than the request's, is a SettingError, too.
         """
         given = {name: value for name, value in request.items() if value is not None}
         reducer = given.pop("reducer", None)
@@ -314,7 +317,7 @@ def _check_description(texts: Mapping[str, str], name: str, description: str) ->
     """Raise SettingError if an object that is handed in again has other settings than before.
 
     `description` is that of the object. It is compared with the setting "described" of the store,
-    among `texts`, if there is one.
+    among `texts`, if there is one; if there is none, nothing is compared.
     """
     made_with = texts.get("described")
     if made_with is not None and description != made_with:
@@ -350,8 +353,9 @@ def named_classes(
     """Return each `module:Class` that a caller names in settings, as `DataEngine` takes them.
 
     A name may stand in reducer, recipe (whose file is read) or policy; the class of a reducer
-    object counts, too. Other settings, and classes of dengine, are ignored. Nothing is imported.
-    Raises SettingError if no recipe can be read from one of these.
+    object counts, too. Other settings, and classes of dengine, are ignored. A class that is named
+    twice may be returned twice. Nothing is imported. Raises SettingError if no recipe can be read
+    from one of these.
     """
     recipes = [Recipe.load(source) for source in (reducer, recipe) if source is not None]
     recipes.append(Recipe(policy=policy or Policy()))
@@ -404,9 +408,9 @@ def fill_from_peers(
     A peer is another cell of the store's product; the first peer that has settings is taken. Its
     seed is taken if `request` has none (0 without a peer), and its recipe if `request` names
     neither reducer, recipe nor model. The recipe is not taken if the peer was given an object that
-    has no name. Raises ImportRefusedError if the recipe names a class that may not be imported: any
-    class may be with `allow_import` True, none with False, else those that it names. Raises
-    SettingError if the recipe cannot be read.
+    has no name. Nothing is imported. Raises ImportRefusedError if the recipe names a class that may
+    not be imported: any class may be with `allow_import` True, none with False, else those that it
+    names. Raises SettingError if the recipe, and ValueError if the seed cannot be read.
     """
     peer = next(iter(store.settings.of_peers().values()), {})
     filled = dict(request)
@@ -479,7 +483,7 @@ class SettingsInForce:
         """Use other settings from now on, without saving them.
 
         `conditions`, what a decision depends on beside the model, are made of them. They are None
-        if the settings have no `TraceSpec`.
+        if the settings have no `TraceSpec`. `is_unsaved` stays as it is.
         """
         policy = settings.recipe.policy
         self.now = settings
@@ -492,9 +496,10 @@ class SettingsInForce:
     def save(self) -> None:
         """Write the settings to the store; wait for it at most as long as its time limit.
 
-        If the store does not take them, the error is logged and `is_unsaved` is set, which a later
-        success clears. Raises SettingError if another cell of the product has settings that
-        contradict these; then nothing is written.
+        If the store does not take them, or does not answer in time, the error is logged and
+        `is_unsaved` is set, which a later success clears. Raises SettingError if another cell of
+        the product has settings that contradict these; then nothing is written, and `is_unsaved`
+        stays as it is.
         """
         texts = self.now.to_store()
         try:

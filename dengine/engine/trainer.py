@@ -71,7 +71,8 @@ class TrainingWindow:
         """Add one labelled trace, shape (channels, samples); a full window loses its oldest one.
 
         `label` is 1 or 0, `hash_` the content hash, and `seq` the label's number, which must be
-        larger than any before; this is not checked.
+        larger than any before; this is not checked. All traces must have one shape. The trace is
+        copied.
         """
         if self._end == len(self._block[0]):
             self._enlarge(trace.shape)
@@ -105,7 +106,7 @@ class TrainingWindow:
         """Replace the whole window by the newest of these labelled traces.
 
         They must be ordered by the numbers of their labels. Their arrays become those of the window
-        and are not copied.
+        and are not copied. Without any the window is empty.
         """
         self._block = [labelled.seq, labelled.traces, labelled.labels, labelled.hashes]
         self._end = len(labelled.seq)
@@ -307,8 +308,9 @@ class Retrainer:
         A successor starts from the weights of the current model, or from scratch; it is trained on
         the training window as it is now. `begin` is when work on the retrain began, in seconds by
         the clock. The current model is not changed. If the training fails, the outcome has no
-        model, and nothing is raised. How long the training worked after its last step is
-        remembered, and reserved in the time budget of the next.
+        model, and nothing is raised. How long the training took for its last step and the work
+        after it is remembered: the longest of the newest 20 is reserved in the time budget of the
+        next. This thread then has one torch thread.
         """
         data = self.window.snapshot()
         trained = train_candidate(current.successor(), data, self._limits(), self.clock)
@@ -320,8 +322,9 @@ class Retrainer:
 
         A successor starts from the weights of the current model, or from scratch. `collect` returns
         the outcome; no other training may be under way. Returns False, and begins nothing, if there
-        is no executor, if it refuses work, or while it still works on a discarded training. An
-        executor that refuses work is started again or given up, and that is logged.
+        is no executor, if it refuses work, or while it still works on a discarded training (also if
+        this is done by now, until `is_occupied` was read). An executor that refuses work is started
+        again or given up, and that is logged.
         """
         executor = self.executor
         if executor is None or self._left is not None:
@@ -393,8 +396,8 @@ class Retrainer:
         a training that hangs, or whose executor died. The outcome of a training that was given up
         or failed has no model and says why. An executor that died or hangs is started again if it
         can be, or not used. `begin` of the outcome is now minus the duration of the training. How
-        long the training worked after its last step is remembered, and reserved in the budget of
-        the next.
+        long the training took for its last step and the work after it is remembered: the longest of
+        the newest 20 is reserved in the budget of the next.
         """
         future = self.future
         left = self._count_seconds_left()
@@ -458,7 +461,8 @@ def train_candidate(
     of the labels. `successor` is the model, which this changes in place. Any exception, a window
     without traces, and a defect of the trained model give an outcome without a model, whose reason
     begins with "dropped: ". A training that reaches a limit ends early and is accepted; its reason
-    says so if the time budget ended it. `clock` returns seconds. Sets the present thread to one
+    says so if the time budget ended it before its last step, and has the note of the model's report
+    if there is one. `clock` returns seconds. Nothing is logged. Sets the present thread to one
     torch thread. It is a plain function, so that any executor can run it.
     """
     torch.set_num_threads(1)  # it holds for the present thread only

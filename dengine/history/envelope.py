@@ -48,8 +48,9 @@ def envelope_of(successes: TraceArray, trace: TraceArray) -> Envelope | None:
     Returns
     -------
     Envelope or None
-        Lower edge, median and upper edge at each sample, and the share. None for fewer than 20
-        successes, or if their shape is not the trace's.
+        Lower edge, median and upper edge at each sample (quantiles 0.025, 0.5 and 0.975, linearly
+        interpolated), and the share, of all channels together; a sample at an edge is inside. None
+        for fewer than 20 successes, or if their shape is not the trace's.
     """
     if len(successes) < MIN_SUCCESSES or successes.shape[1:] != trace.shape:
         return None

@@ -164,10 +164,10 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
     ----------
     store : SqlStore
     decision_id : str
-        Id of the decision; or the number of its part, if no decision has this id (see
+        Id of the decision; or the number of its part, if this cell has no decision of this id (see
         `find_decision_id`).
     neighbours : int, default 10
-        Number of nearest references at most.
+        Number of nearest references at most. Those of the decision's own part are left out.
 
     Returns
     -------
@@ -181,10 +181,11 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         For a decision that the store does not hold (UnknownDecisionError), and for a part with
         several decisions (ReportConflictError).
     StoreError
-        For a store that no engine has used, and for a damaged trace of the decision or of a
-        neighbour.
+        For a store that no engine has used, for a stored recipe that lacks settings, for a damaged
+        `TraceSpec`, and for a damaged trace of the decision or of a neighbour.
     SettingError
-        For a stored recipe that cannot be read.
+        For a stored recipe or policy that cannot be read, and if an object of the user's class of
+        rule cannot be made.
     """
     settings = store.settings.read()
     if "recipe" not in settings:
@@ -232,8 +233,9 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
 def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
     """Return the policy that was in force at a time, in seconds since 1970.
 
-    It is the policy that the first change of policy after this time replaced. If there was no
-    change since, or no event holds the old policy, it is `present`, the policy in force now.
+    It is the policy that the first change of policy after this time replaced; an event without
+    data, which cannot name it, is passed over. If there was no change since, it is `present`, the
+    policy in force now. Raises SettingError if the policy of the event is not valid.
     """
     for event in store.events.newest():
         if event.kind in POLICY_KINDS and event.time > time and event.data is not None:
@@ -244,8 +246,8 @@ def _find_policy(store: SqlStore, time: float, present: Policy) -> Policy:
 def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     """Return why the safe mode in which a decision was made had begun.
 
-    It is the text of the last event before the decision that began a safe mode. "" if the reason of
-    the decision is not `Reason.SAFE_MODE`, or if there is no such event.
+    It is the text of the last event that began a safe mode, at the time of the decision or before.
+    "" if the reason of the decision is not `Reason.SAFE_MODE`, or if there is no such event.
     """
     if item.decision.reason is not Reason.SAFE_MODE:
         return ""
@@ -262,8 +264,8 @@ def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Flo
 
     Each is measured in the embedding space of the reference, in which one radius means the same for
     every reducer. They are in the order of the version's index of references. The distance to
-    references of the decision's own part is infinite. None if the trace was not embedded or there
-    is no version.
+    references of the decision's own part (without a number, of a trace equal to its trace) is
+    infinite. None if the trace was not embedded or there is no version.
     """
     embedding = item.decision.embedding  # (K, d)
     if version is None or embedding is None:
@@ -285,8 +287,9 @@ def _find_neighbours(
 
     `distances` are those of `_measure_distances`, one for each reference. Nothing is yielded if
     `version` or `distances` is None. A neighbour may lie outside of the radius, which only says
-    what its field `inside` is. If the decision behind a reference is unknown (another cell made
-    it), its id, part, source and trace are None. Raises StoreError for a damaged trace.
+    what its field `inside` is. If the decision behind a reference is unknown (another cell made it,
+    or its label is damaged), its id, part, source and trace are None. Label and source are those
+    that the version had, without later corrections. Raises StoreError for a damaged trace.
     """
     if distances is None or version is None:
         return
@@ -333,8 +336,8 @@ def _find_envelope(
 def _note_of(item: StoredDecision, has_neighbours: bool) -> str:
     """Return a sentence that says which version's references the neighbours are.
 
-    Without neighbours it says why: the trace is quarantined or was not embedded, or the version is
-    not kept.
+    Without neighbours it says why, and names the first of these: the trace is quarantined, was not
+    embedded, or the version is not kept, which stands for all other reasons.
     """
     decision = item.decision
     version = f"version {decision.model_version}, which answered,"

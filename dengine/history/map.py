@@ -97,6 +97,13 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
         longer kept. The newest parts are those of the cell's newest 10 decisions that this version
         made and for which it embedded the trace, with corrected labels. A part that is both appears
         once, as a newest part.
+
+    Raises
+    ------
+    SettingError
+        For an unknown reducer, and if an object of the user's class of rule cannot be made.
+    StoreError
+        If the store cannot be read.
     """
     recent = store.decisions.select(HistoryFilter(), N_NAMED)
     newest = list(_newest_marks(recent[-N_NEWEST:], version))
@@ -126,9 +133,10 @@ def _known_marks(
 ) -> list[Mark]:
     """Return a `Mark`, a point of the map, for each of a version's newest references, oldest first.
 
-    There are at most N_KNOWN (250). References whose label this cell did not record are left out.
-    [] if the version's references are not kept. `parts` maps decision ids to the parts' numbers;
-    the mark of an id that is missing there has no number.
+    There are at most N_KNOWN (250). References whose label this cell did not record, or is damaged,
+    are left out. [] if the version's references are not kept. `parts` maps decision ids to the
+    parts' numbers; the mark of an id that is missing there has no number. Marks of known parts have
+    no action.
     """
     past = load_past_version(store, version, recipe, None)
     if past is None:

@@ -66,8 +66,9 @@ def load_past_version(
 
     Its references and its rule include this cell's labels that had come by then, as they were
     reported: later corrections are not applied. Of the labels that came after the version was
-    trained, only the first MAX_LABELS (100,000) are read. A damaged label is left out, and an event
-    is written to the store.
+    trained, only those until the next version of this cell, and at most MAX_LABELS (100,000), are
+    read; they become references if this version was in force when they came. A damaged label is
+    left out, and an event is written to the store.
 
     Parameters
     ----------
@@ -86,6 +87,13 @@ def load_past_version(
         The references with their labels, the thresholds of the rule, and how novel the trace of the
         decision was. None if no such version was put in force, if its state is damaged or no longer
         kept, or if it has no references (a baseline, a model that the user handed in).
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read.
+    SettingError
+        If an object of the user's class of rule cannot be made.
     """
     try:
         stored = store.versions.load(version)
@@ -125,8 +133,8 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 
     A label without a point (the embedding of its trace) is left out. An index is full if older
     references have been removed from it for lack of room; each added reference then replaces the
-    oldest. Otherwise there is room for the recipe's training window. The fold of a label is
-    computed from the content hash.
+    oldest. Otherwise there is room for as many as the recipe's training window holds, after which
+    the oldest are replaced, too. The fold of a label is computed from the content hash.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])
@@ -146,7 +154,7 @@ def _score_novelty(stored: ModelVersion, item: StoredDecision | None) -> Novelty
     The gate calls a trace novel by its distance from the traces of the training. The result has
     four numbers (level, texture, distortion, gaps), of which at least one is above 1 for a novel
     trace. Returns None without a decision, if the decision's reason is not `Reason.NOVEL`, and if
-    the gate cannot be restored.
+    the gate cannot be restored, because it was switched off or is of another release.
     """
     if item is None or item.decision.reason is not Reason.NOVEL:
         return None
@@ -167,7 +175,7 @@ def _restore_rule(stored: ModelVersion, policy: Policy) -> DecisionRule | None:
     is another cell's), or the rule was stale (it had missed an update). Also None if the rule is a
     user's class whose module is not imported yet, since nothing is imported here. A rule that
     learns nothing needs no state. Raises SettingError if an object of the user's class cannot be
-    made.
+    made; an error of its constructor other than TypeError is raised as it is.
     """
     if policy.guarantee not in RULES and policy.guarantee.partition(":")[0] not in sys.modules:
         # Nothing is imported because a store names it; a running engine has imported it.
@@ -209,8 +217,10 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
 
     If a label was corrected or a check is overdue, the stored rule cannot be continued, and a fresh
     one is updated with all outcomes (for all such cases see `RuleProgress.last_seq`). The updates
-    may begin or end a safe mode of the returned rule. Nothing is written to the store, except an
-    event if the arrays of a version are damaged; then the version before it is taken.
+    may begin or end a safe mode of the returned rule; a fresh rule starts in the safe mode in which
+    it began before (`EvidenceWindow.began_in`). Nothing is written to the store, except an event if
+    the arrays of a version are damaged; then the version before it is taken. The store's ledger is
+    not checked.
 
     Parameters
     ----------
@@ -232,6 +242,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
         If the store cannot be read.
     SettingError
         If an object of the user's class of rule cannot be made.
+    ValueError
+        For a stored setting that must be a number and is none.
     """
     stored = store.versions.newest()
     settings = store.settings.read()
@@ -255,7 +267,7 @@ def _update_rule(rule: DecisionRule, outcome: PastLabel | OutcomeRecord) -> None
     First `observe` gets `outcome.silent`, the number of unreported accepted parts since the
     previous label, and whether this part was novel. Then `update` gets the bounds, the label, the
     action that the model alone would have taken, and the inclusion probability. A safe mode of the
-    rule may begin or end.
+    rule may begin or end. What a user's rule raises is raised.
     """
     rule.observe(outcome.silent, outcome.novel)
     rule.update(

@@ -87,9 +87,10 @@ class Circumstances:
 def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """Return a decision's bounds with the thresholds that they had to reach.
 
-    `circumstances` are the settings of the engine, and the thresholds of its rule, at the decision.
-    Returns None if no bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and
-    SAFE_MODE.
+    The result also has the counts of labels, and says in words where the thresholds come from. A
+    threshold is None if it is unknown, or if nothing could reach it. `circumstances` are the
+    settings of the engine, and the thresholds of its rule, at the decision. Returns None if no
+    bound was computed: for every reason but CERTAIN, UNCERTAIN, AUDIT and SAFE_MODE.
     """
     if decision.reason not in BOUNDED:
         return None
@@ -110,10 +111,10 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
 
     `circumstances` are the settings of the engine, and the thresholds of its rule, at a decision. A
     part was accepted if lower >= the first, rejected if upper <= the second. Under the guarantee
-    "local", outside safe mode, they are LB and 1 - LB; else those of the version's rule at that
-    time. Both are None if they are unknown: they are not kept, a user's rule decided, or a
-    handed-in model decided by its own method. One of them is None if nothing could be accepted, or
-    nothing rejected.
+    "local", outside safe mode (or if its reason is not kept), they are LB and 1 - LB; else those of
+    the version's rule at that time. Both are None if they are unknown: they are not kept, a user's
+    rule decided, or a handed-in model decided by its own method. Otherwise the first is None if
+    nothing could be accepted, the second if nothing could be rejected; both may be.
     """
     policy = circumstances.recipe.policy
     if circumstances.baseline or policy.guarantee not in RULES:
@@ -146,7 +147,7 @@ def explain_in_words(
 
     `circumstances` are the settings and the state of the engine at the decision. If `bound` is
     None, the sentences on bounds are left out. The outcome is the label as corrected by now, or
-    that nothing was reported.
+    that nothing was reported, which it also says of a forgotten label.
     """
     decision = item.decision
     reason = WHY[decision.reason](decision, item.trace, circumstances)
@@ -164,8 +165,8 @@ def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circu
     """Return the end of the sentence on a trace outside the force limits: which limits it leaves.
 
     The sentence begins with what was done, like "Rejected". The force limits of the policy of that
-    time are checked again, one by one. If none is left now, the sentence says that they are
-    unknown.
+    time are checked again, one by one. If the trace leaves none of them now, the sentence says that
+    it is not known which. Raises SettingError for a force limit that does not fit the trace.
     """
     x = torch.from_numpy(trace)
     left = [
@@ -223,7 +224,8 @@ def _bound_sentences(
 
     `circumstances` are the settings of the engine at the decision. If nothing could be accepted or
     rejected, or the thresholds are unknown, the sentences say so. For a handed-in model that
-    decides by its own method there is one sentence, with its counts and bounds.
+    decides by its own method there is one sentence, with its counts and bounds. An interval is
+    rounded outward to three decimals.
     """
     n = decision.n_success + decision.n_failure
     interval = "{:.3f} to {:.3f}".format(*outward(decision.lower, decision.upper, 3))

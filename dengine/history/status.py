@@ -270,12 +270,14 @@ class Status:
         """The most urgent thing that somebody should look at, in a sentence; "" if there is none.
 
         The first of these that applies: a fault of the store, lost data, safe mode, too many bad
-        parts among the accepted, too many good parts among the rejected, 3 or more dropped retrains
-        in a row, traces that nearly repeat another, in shadow mode too many bad parts among those
-        that the model would have accepted, mostly novel traces, mostly parts outside the force
-        limits, errors of the model. "Too many" means that the confidence interval of their share
-        lies above the tolerance, "mostly" means more than half. Parts are counted over the newest
-        decisions alone.
+        parts among the accepted, too many good parts among the rejected, the last 3 or more
+        retrains dropped, in the newest training that was accepted traces that nearly repeat
+        another, in shadow mode too many bad parts among those that the model would have accepted,
+        mostly novel traces, mostly parts outside the force limits, any error of the model. "Too
+        many" means that the confidence interval of their share lies above the tolerance: at the
+        policy's alpha for accepted parts (`bad_accepts`), at 95 % for the others, where a rejected
+        part of unknown outcome counts as bad. "Mostly" means more than half. Parts are counted over
+        the newest decisions alone.
         """
         newest = self.newest
         accepts = newest.bad_accepts
@@ -327,6 +329,8 @@ class Status:
 def retrain_fault(dropped: Sequence[str], version: int) -> str:
     """Return an alarm in words if the last 3 or more retrains were dropped, else "".
 
+    It has the reason of the last one.
+
     Parameters
     ----------
     dropped : sequence of str
@@ -349,9 +353,10 @@ def retrain_fault(dropped: Sequence[str], version: int) -> str:
 def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Status:
     """Read the status of an engine from its store.
 
-    A damaged label among those since the newest retrain is left out, and an event is written to
-    the store. An event is also written if the arrays of the newest version are read and are
-    damaged; then those of the version before it are taken.
+    A damaged label among those since the newest retrain is left out, and an event is written to the
+    store. An event is also written if the arrays of the newest version are read (with `watching`,
+    and if that version is no trained one) and are damaged; then those of the version before it are
+    taken.
 
     Parameters
     ----------
@@ -371,9 +376,11 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
     Raises
     ------
     StoreError
-        For a store that no engine has used, and if the database fails.
+        For a store that no engine has used, for a damaged `TraceSpec` or a recipe that lacks
+        settings, and if the database fails.
     SettingError
-        For a stored recipe that cannot be read.
+        For a stored recipe that cannot be read; with `watching` also if an object of the user's
+        class of rule cannot be made.
     """
     settings = store.settings.read()
     if "recipe" not in settings:
@@ -447,7 +454,8 @@ def _count_span(tally: Tally, retrains: list[StoredVersion], policy: Policy) -> 
     Without decisions no retrain counts. A `Tally` holds how many decisions have each combination of
     properties, like action and reason; `retrains` are all retrains of the cell. The intervals of
     `would_accept` and `would_reject` (how often the model would have been wrong) are at 95 %,
-    whatever the policy's alpha.
+    whatever the policy's alpha, and their basis is "audits", or "checks" if the policy of now has
+    no audit rate.
     """
     outcomes = tally.outcomes
     first = tally.first
@@ -505,7 +513,7 @@ def _estimate_error(
     `n_known`. The bounds are the two-sided Wilson interval at error level `alpha`, and the verdict
     says whether it is below `tolerance` ("kept"), above ("broken"), or neither ("open"). `basis`
     says in a word where the outcomes come from. If `n_known` is 0, the bounds are 0 and 1, and the
-    basis is "".
+    basis is "", and the verdict is "open" for any tolerance below 1.
     """
     low, high = wilson_interval(n_known - n_wrong, n_wrong, alpha)
     lower = 1.0 - high
@@ -580,9 +588,11 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
     They are read from the rule that `load_rule` returns. None if that is None, and if the rule has
     no drift detectors: "local" with stops="some", and a user's rule. In a safe mode that novel
     traces began, the three values are 0. The text `recovery` says how many parts since the alarm
-    count as evidence, and after about how many more parts the safe mode ends; it is "" outside safe
-    mode. `mode` is the newest event at which a safe mode began or ended; without it `recovery` is
-    "".
+    (10,001 are counted at most) count as evidence, how many of these were decided wrongly, and
+    after about how many more parts the safe mode ends; or that the evidence is enough, or that it
+    does not end, if these are more than 10,000. It is "" outside safe mode. `mode` is the newest
+    event at which a safe mode began or ended; without it `recovery` is "". Raises what `load_rule`
+    raises, and may write an event to the store as it does.
     """
     from ..decision.member_rules import MemberRule  # torch
     from .past_versions import load_rule
@@ -682,7 +692,7 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     store : SqlStore
     last : int or None
         Number of newest decisions of the selection; all of these are read by this call. None: all
-        decisions, which are read in pages during the iteration.
+        decisions of the selection, which are read in pages during the iteration.
     **where
         The selection: action, reason, label, since, until, predicted or part, the fields of
         `HistoryFilter`.
@@ -731,7 +741,7 @@ def iterate_decisions(
         Decisions read at a time.
     start_after : str or None
         Id of a decision: the iteration starts with the next decision in its direction. For an id
-        that the cell does not have nothing is yielded.
+        that the cell does not have nothing is yielded. None: it starts with the newest or oldest.
     newest_first : bool, default True
         False: oldest first.
 
@@ -756,7 +766,8 @@ def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:
     -------
     pandas.DataFrame
         A row for each decision, indexed by its id. The columns are the other fields of `Decision`
-        without the embedding, `time` in UTC, and `label`, which is "good", "bad" or None.
+        without the embedding, `time` in UTC, and `label`, which is "good", "bad" or None, if there
+        is none or it was forgotten. Actions and reasons are texts.
     """
     import pandas as pd
 

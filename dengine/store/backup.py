@@ -53,10 +53,10 @@ class BackupReport:
 def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     """Copy an SQLite store into a new file, and add to the copy what the cells' journals hold.
 
-    Engines may run meanwhile: every decision and label that was on disk when this was called is in
-    the copy. Damaged records of a journal are left out, and a record that contradicts the copy
-    becomes an event of kind "dead letter" there. The copy is written in full or not at all. The
-    store and the journals are only read.
+    Engines may run meanwhile: every decision, label and event that was on disk when this was called
+    is in the copy. Damaged records of a journal are left out, and a record that contradicts the
+    copy, or that its database refuses, becomes an event of kind "dead letter" there, which is also
+    logged. The copy is written in full or not at all. The store and the journals are only read.
 
     Parameters
     ----------
@@ -75,10 +75,12 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
     ------
     StoreError
         If `url` is no store or cannot be read, if it is a PostgreSQL store (pg_dump copies that),
-        and if a journal cannot be read. If a journal holds records, and the ledger of its cell was
-        begun with another key than the one in the file that DENGINE_LEDGER_KEY names.
+        and if a journal cannot be read. If a journal holds records, also if the ledger of its cell
+        was begun with another key than the one in the file that DENGINE_LEDGER_KEY names, if that
+        file cannot be read, or if the records cannot be written to the copy.
     OutputError
-        If `out` exists, or cannot be written, for example on a full disk.
+        If `out` exists, or cannot be written, for example on a full disk. Also if SQLite finds
+        damage in the store while it copies it or counts the rows of the copy.
     """
     with reading(os.fspath(url)) as connection:
         dialect = connection.dialect.name
@@ -115,11 +117,11 @@ def backup_store(url: FilePath, out: FilePath) -> BackupReport:
 def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     """Copy a backup into a new file `store`, and make a journal beside it for each cell.
 
-    The journal names the newest ledger entry of its cell, so that the engine that opens the cell
-    next can tell that nothing is missing. A journal that is already beside `store` is not changed:
-    the next engine of its cell takes the records from it that the copy lacks. If the journal names
-    a ledger entry that the copy lacks, this engine also records an alarm. Records of journals that
-    are beside `copy` are added, as by `backup_store`.
+    The journal names the newest ledger entry that its cell has in `copy`, so that the engine that
+    opens the cell next can tell that nothing is missing. A journal that is already beside `store`
+    is not changed: the next engine of its cell takes the records from it that the copy lacks. If
+    the journal names a ledger entry that the copy lacks, this engine also records an alarm. Records
+    of journals that are beside `copy` are added, as by `backup_store`.
 
     Parameters
     ----------
@@ -137,9 +139,9 @@ def restore_store(copy: FilePath, store: FilePath) -> tuple[CellHistory, ...]:
     Raises
     ------
     StoreError
-        If `copy` is no store, if its history is not as it was written, and if a ledger was begun
-        with another key than the one in the file that DENGINE_LEDGER_KEY names. If a journal
-        cannot be made: the store has been copied by then, and stays.
+        If `copy` is no store, if `verify_history` finds any fault in it, also data that were lost
+        and that nobody has acknowledged, and for the other reasons of `verify_history` and
+        `backup_store`. If a journal cannot be made: the store has been copied by then, and stays.
     OutputError
         If `store` exists, or cannot be written, for example on a full disk.
     """
@@ -186,7 +188,8 @@ def _add_records(file: Path, cell: str, records: list[Record]) -> None:
 def _fold_wal_and_count(file: Path) -> tuple[int, int]:
     """Turn off SQLite's write-ahead log in a store's file, so that everything is in this one file.
 
-    Return the numbers of its decisions and labels, over all cells.
+    Return the numbers of its decisions and labels, over all cells. Raise sqlite3.Error if the file
+    cannot be read or written.
     """
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")

@@ -47,8 +47,9 @@ BUSY_SECONDS = 10.0  # wait for another process that writes to the same SQLite f
 def make_engine(url: str | None) -> sa.Engine:
     """Return a new SQLAlchemy engine for a store's database; it does not connect yet.
 
-    Its connections to SQLite sync each commit to the disk, and set a store's file to WAL mode.
-    Connections to PostgreSQL use psycopg, unless the URL names another driver.
+    Its connections to SQLite sync each commit to the disk, and set the file of a store, or an empty
+    one, to WAL mode; a file that cannot be written is only read. In memory all threads share one
+    connection. Connections to PostgreSQL use psycopg, unless the URL names another driver.
 
     Parameters
     ----------
@@ -136,12 +137,12 @@ def _connect_sqlite(
     """Return a new SQLite connection; it only reads if the file or its folder cannot be written.
 
     SQLAlchemy calls this with its dialect, its own record of the connection, which is not used, and
-    the arguments and options for `sqlite3.connect`; the first argument is the file. A file that
-    cannot be written and has no `-wal` beside it is opened as immutable. If it has a `-wal`, but no
-    `-shm` and SQLite cannot create that, both files are copied to a temporary folder, which is
-    deleted with the connection, and the copy is opened for reading. A new file and a `file:` URI
-    are opened in the driver's own way. A damaged file raises nothing here, but when the connection
-    is used. Raise sqlite3.Error if the file cannot be opened, and OSError if it cannot be copied.
+    the arguments and options for `sqlite3.connect`; the first argument is the file. Such a file
+    without a `-wal` beside it is opened as immutable. If it has a `-wal`, but no `-shm` and SQLite
+    cannot create that, both files are copied to a temporary folder, which is deleted with the
+    connection, and the copy is opened for reading. A new file and a `file:` URI are opened in the
+    driver's own way. A damaged file raises nothing here, but when the connection is used. Raise
+    sqlite3.Error if the file cannot be opened, and OSError if it cannot be copied.
     """
     name = str(arguments[0])
     file = Path(name)
@@ -184,8 +185,8 @@ def _set_pragmas(connection: Any, record: Any) -> None:
     The file of a store, or an empty one, is set to WAL mode, and an empty one to pages of 16 KiB.
     Another program's file is not changed, and a file that cannot be written keeps its mode. The
     driver begins no transactions by itself any more. `record` is SQLAlchemy's own record of the
-    connection, which is not used. Raise sqlite3.DatabaseError for a file that is damaged or no
-    database.
+    connection, which is not used. Raise sqlite3.DatabaseError for a file that is damaged, locked or
+    no database.
     """
     connection.isolation_level = None  # `_begin_transaction` starts transactions, not the driver
     try:
@@ -207,8 +208,8 @@ def _set_pragmas(connection: Any, record: Any) -> None:
 def _begin_transaction(connection: sa.Connection) -> None:
     """Begin an SQLite transaction; with the option `dengine_write` it takes the write lock at once.
 
-    It then waits for other writers, at most BUSY_SECONDS, which a read transaction that becomes a
-    write would not do.
+    It then waits for other writers, at most BUSY_SECONDS (10 s; after that SQLite's error is
+    raised), which a read transaction that becomes a write would not do. In memory nothing waits.
     """
     write = connection.get_execution_options().get("dengine_write", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if write else "BEGIN")
@@ -251,8 +252,9 @@ def _store_errors(verb: str, name: str) -> Iterator[None]:
 def reading(url: str) -> Iterator[sa.Connection]:
     """Context manager that opens a store for reading; the block sees one snapshot of the database.
 
-    No store is created and no row is changed, and the connection is closed after the block. In
-    SQLite, text with damaged bytes is read with escapes instead of an error.
+    No store is created and no row is changed, and the connection is closed after the block; but the
+    file of a store that was not in WAL mode is set to it. In SQLite, text with damaged bytes is
+    read with escapes instead of an error.
 
     Parameters
     ----------
@@ -296,8 +298,8 @@ def reading(url: str) -> Iterator[sa.Connection]:
 def run_integrity_check(connection: sa.Connection, table: str = "") -> list[str]:
     """Run SQLite's integrity check on the whole file, or on one table.
 
-    Return its findings as texts, at most 100, [] if all is well. A database error is a finding,
-    too, and not raised.
+    Return its findings as texts, at most 100, [] if all is well. A database error is the only
+    finding then, and not raised.
     """
     try:
         lines = connection.execute(
@@ -405,9 +407,10 @@ class Database:
         """Context manager that opens a read transaction and gives its connection.
 
         First it calls `before_use`, a function that the outbox has set, which writes the records
-        that wait in it, so that they are seen. Raise StoreError if the database fails or is closed,
-        and in place of a ValueError, TypeError, OverflowError or OSError that the block raises,
-        unless it is dengine's own.
+        that wait in it, so that they are seen; if the database of a running cell does not take them
+        in time, they are missing. Raise StoreError if the database fails, is closed or was opened
+        before a fork, and in place of a ValueError, TypeError, OverflowError or OSError that the
+        block raises, unless it is dengine's own.
         """
         self.check_open()
         self.before_use()
@@ -464,8 +467,8 @@ class Database:
     def commit_if(self, is_wanted: Callable[[], bool]) -> Iterator[None]:
         """Context manager in which this thread commits a transaction only if `is_wanted()` is true.
 
-        `is_wanted` is called just before each commit. If it returns False, the transaction is
-        rolled back, and `write` raises StoreError.
+        `is_wanted` is called just before each commit of `write`. If it returns False, the
+        transaction is rolled back, and `write` raises StoreError. Such blocks must not be nested.
         """
         self._commits.is_wanted = is_wanted
         try:
@@ -487,8 +490,9 @@ class Database:
 
         These are the settings, corrections, labels and model versions of this cell, and of the
         other cells of its product. Of the labels only the newest are checked. The rest is checked
-        in full, except for the arrays of the versions. A ledger with another key than the one with
-        which the store was opened counts as a difference, too.
+        in full, except for the arrays of the versions; of each ledger itself only the newest entry.
+        A ledger with another key than the one with which the store was opened counts as a
+        difference, too.
 
         Parameters
         ----------
@@ -501,7 +505,8 @@ class Database:
         Returns
         -------
         str
-            The first difference, in words; "" if there is none.
+            The first difference, in words, of this cell or else of another, which is then named; ""
+            if there is none.
 
         Raises
         ------
@@ -518,8 +523,8 @@ class Database:
     def check_pages(self) -> str:
         """Run SQLite's integrity check on the tables that engines read, all but traces and events.
 
-        Return its first finding, or the text of the error if the check fails; "" if all is well.
-        PostgreSQL and a store in memory are not checked: "".
+        Return its first finding, or the text of the error if the check fails, which also happens
+        after `close`; "" if all is well. PostgreSQL and a store in memory are not checked: "".
         """
         for name in CHECKED_TABLES if self._file is not None else ():
             try:
@@ -533,7 +538,7 @@ class Database:
     def check_writable(self) -> None:
         """Raise a StoreError if the database cannot be written; an update of no row shows this.
 
-        The records that wait in the outbox are written first.
+        The records that wait in the outbox are written first. Nothing is added to the ledger.
         """
         self.write(
             lambda connection: connection.exec_driver_sql(
@@ -545,8 +550,9 @@ class Database:
         """Lock the cell on a PostgreSQL server, and write from now on through that one connection.
 
         Only one engine has the lock of a cell (the lease). It lasts as long as the connection; if
-        that is lost, the next connection locks again. Raise StoreError if another engine has the
-        lock, or the database fails; this `Database` can then still be used, without it.
+        that is lost, the next connection locks again, and if another engine has the lock by then,
+        `write` raises StoreError. Raise StoreError if another engine has the lock now, or the
+        database fails; this `Database` can then still be used, without it.
         """
         # The name is shown to an engine that finds the cell locked.
         options = TIMEOUTS | {"application_name": f"dengine {describe_process()}"[:63]}
@@ -602,8 +608,11 @@ class Database:
         """Call `add_rows` in a write transaction, commit it, and return what `add_rows` returned.
 
         First `before_use` is called, a function that the outbox has set, so that the records that
-        wait in the outbox are written before these rows. This waits until another transaction has
-        ended. If rows were added or settings changed, the commit includes a ledger entry for them.
+        wait in the outbox are written before these rows, if the database takes them in time. The
+        call waits until another write transaction of this object has ended, and for the lock of the
+        SQLite file, or of the cell on a server. If rows were added or settings changed, the commit
+        includes a ledger entry for them; then `newest_entry` is set to this entry, and `on_entry`,
+        a function that the outbox has set, is called.
 
         Parameters
         ----------
@@ -613,11 +622,12 @@ class Database:
         Raises
         ------
         StoreError
-            If the database fails or is closed, and in place of a ValueError, TypeError,
-            OverflowError or OSError that `add_rows` raised; dengine's own errors and all others
-            pass unchanged. After an error nothing is written, with two exceptions: if the SQLite
-            file was replaced meanwhile, the old file may have the rows; and if the connection to a
-            server broke during the commit, the server may have them.
+            If the database fails, is closed or was opened before a fork, if the function given to
+            `commit_if` returns False, and in place of a ValueError, TypeError, OverflowError or
+            OSError that `add_rows` raised; dengine's own errors and all others pass unchanged.
+            After an error nothing is written, with two exceptions: if the SQLite file was replaced
+            meanwhile, the old file may have the rows; and if the connection to a server broke
+            during the commit, the server may have them.
         """
         self.check_open()
         self.before_use()  # before the lock is taken: it may write
@@ -632,8 +642,8 @@ class Database:
     def read(self, query: sa.Select[Any]) -> Sequence[Any]:
         """Run a query in a read transaction of its own, and return all its rows.
 
-        The records that wait in the outbox are written first. Raise StoreError if the database
-        fails or is closed.
+        The records that wait in the outbox are written first, if the database takes them in time.
+        Raise StoreError if the database fails, is closed or was opened before a fork.
         """
         with self.reading() as connection:
             return connection.execute(query).all()
@@ -642,7 +652,7 @@ class Database:
         """Disconnect from the database; later calls raise StoreError.
 
         If another thread is writing: with `waiting` this waits until it has finished; without, it
-        returns at once, and that thread disconnects when it has finished.
+        returns at once, and that thread disconnects when it has finished. SQLite in memory is lost.
         """
         self._closed = True
         if self._writing.acquire(blocking=waiting):
@@ -671,7 +681,8 @@ class Database:
             In a write transaction.
         column : sqlalchemy.Column
             The table's column that takes the numbers. Decisions and events continue the numbers of
-            the cell; labels, versions and corrections those of its product, if it has one.
+            the cell; labels, versions and corrections those of its product, if it has one, which is
+            then locked until the transaction ends.
         rows : sequence of mapping
             Without `cell_id`. They are not changed.
 
@@ -700,8 +711,8 @@ class Database:
     ) -> dict[str, Any]:
         """Run a query over decisions for the given ids of this cell, at most CHUNK (500) at a time.
 
-        `query` selects from the table `decision`, its column `id` included. Return the rows by id;
-        ids without a row are left out.
+        `query` selects from the table `decision`, its column `id` included, and is limited to this
+        cell here. Return the rows by id; ids without a row are left out. Without ids no query runs.
         """
         query = query.where(DECISION.c.cell_id == self.cell_id)
         return {

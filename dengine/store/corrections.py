@@ -46,19 +46,22 @@ class CorrectionTable(CellTable):
         """Commit a person's change and its event in one transaction; return the event's number.
 
         The change may correct labels, or have them forgotten (they count nowhere any more), store a
-        model version, and replace the engine's settings. A new version deletes the stored arrays of
-        older versions that are not kept any more. If one of these fails, nothing is written.
+        model version, and replace the engine's settings. An accepted version deletes the stored
+        arrays of older versions that are not kept any more. If one of these fails, nothing is
+        written. A label that already has the new value gets a correction, too.
 
         Raises
         ------
         ReportError
             For a decision that is unknown or has no label.
         SettingError
-            If the settings of another cell of the product contradict the new ones.
+            If the settings of another cell of the product contradict the new ones, or the recipe of
+            either cannot be read.
         StoreError
             For data of the event that JSON does not have, for a setting that only the store itself
-            may write (`schema.RESERVED`), for an accepted version without arrays, if another cell
-            of the product stored a version meanwhile, and if the database fails.
+            may write (`schema.RESERVED`), for an accepted version without arrays, for an array of
+            Python objects, if another cell of the product stored a version meanwhile, and if the
+            database fails.
         """
         now = float(self._database.clock())
         event = new_event(change.kind, change.text, now, change.data, change.author)
@@ -114,7 +117,8 @@ class CorrectionTable(CellTable):
         Returns
         -------
         list of Correction
-            Of all cells of the product.
+            Of the cell, or of all cells of its product; each with the number of the label, as
+            `seq`.
         """
         query = (
             sa.select(*CORRECTION.c, LABEL.c.seq)
@@ -136,6 +140,7 @@ class CorrectionTable(CellTable):
         """Insert an event, and a correction for each decision in `labels`; nothing is committed.
 
         The labels themselves stay as they were reported. Without labels only the event is inserted.
+        With labels the cell's product is locked until the transaction ends.
 
         Parameters
         ----------

@@ -45,7 +45,8 @@ class DecisionTable(CellTable):
         Returns
         -------
         StoredDecision or None
-            None for an unknown id, also for the id of another cell's decision.
+            None for an unknown id, also for the id of another cell's decision. If a confirmation
+            was corrected to bad, the source is `Source.STOP`.
 
         Raises
         ------
@@ -70,7 +71,8 @@ class DecisionTable(CellTable):
     def ids(self) -> Iterator[Sequence[str]]:
         """Yield the ids of all decisions of the cell, in any order, in lists of at most 500.
 
-        A read transaction stays open meanwhile.
+        A read transaction stays open until the last list, or until the iterator is closed. Raise
+        StoreError, also between two lists, if the database fails.
         """
         query = sa.select(DECISION.c.id).where(self._own(DECISION))
         with self._database.reading() as connection:
@@ -99,7 +101,7 @@ class DecisionTable(CellTable):
             Number of decisions at most.
         start_after : str or None
             Id of a decision, for the next page: only decisions before it are returned; with
-            `newest=False` only those after it.
+            `newest=False` only those after it. It need not be in the selection.
         newest : bool, default True
             False: the oldest.
 
@@ -107,6 +109,11 @@ class DecisionTable(CellTable):
         -------
         list of StoredDecision
             With corrected labels, without their traces. Empty for an unknown `start_after`.
+
+        Raises
+        ------
+        StoreError
+            For a stored value that cannot be read.
         """
         conditions = [
             column == str(value)
@@ -168,7 +175,7 @@ class DecisionTable(CellTable):
         -------
         list of StoredDecision
             Without their traces. Decisions on quarantined traces (stored, but never used in
-            training) are left out.
+            training) are left out. A decision whose label was forgotten has a label.
         """
         return [
             read_decision(row)
@@ -180,7 +187,8 @@ class DecisionTable(CellTable):
     ) -> sa.Select[Any]:
         """Return the query for the cell's decisions of an action that have no label, oldest first.
 
-        Decisions on quarantined traces, and by a version before `since_version`, are left out.
+        A forgotten label is a label here. Decisions on quarantined traces, and by a version before
+        `since_version`, are left out.
         """
         return (
             sa.select(*columns)
@@ -207,7 +215,7 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         within : int
-            Number of later decisions after which a check is overdue.
+            A check is overdue once so many or more decisions have followed its own.
         since_version : int, default 0
             The model version with which `within` came into force. If the newest decision is by an
             earlier version, or there is none, only the numbers of the labels count.
@@ -241,15 +249,16 @@ class DecisionTable(CellTable):
         last : int or None
             Number of newest decisions that are counted; None: all.
         since_version : int, default 0
-            Only decisions by this version or a later one.
+            Only those of them by this version or a later one.
         within : int or None
-            Number of later decisions after which a check without a label is overdue; None: none is.
+            A check without a label is overdue once so many or more decisions have followed its own;
+            None: none is.
 
         Returns
         -------
         Tally
-            The groups, in no order, with the number of decisions in each; the times of the oldest
-            and newest of these decisions and of their newest label.
+            The groups, in no order, with the number of decisions in each; the smallest and the
+            largest time of these decisions, and the largest of their labels, None without any.
         """
         newest = n_decisions(self._database.cell_id)
         aged = (sa.false() if within is None else newest - DECISION.c.number >= within).label(
@@ -292,7 +301,7 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         n : int, default 1
-            Number of stretches of decisions at most; without effect on periods of time.
+            Number of stretches of decisions at most, 1 or more; without effect on periods of time.
         **by
             For periods of time: `seconds`, the length of a period, and `start`, a time in seconds
             since 1970 at which a period begins (0.0 by default).
@@ -311,16 +320,18 @@ class DecisionTable(CellTable):
         Parameters
         ----------
         tally : Tally or None
-            What `tally()` returned, if it was called already; None: it is called here.
+            What `tally`, over all decisions, returned, if it was called already; None: it is called
+            here.
 
         Returns
         -------
         dict
             decisions, labels: numbers; quarantined: number of decisions whose trace is kept out of
-            training; corrected, forgotten: numbers of decisions whose label was corrected or
-            forgotten; actions, reasons: numbers of decisions by value, and sources: numbers of
-            labels by value, each a dict that includes values with 0. Forgotten labels are not among
-            labels, sources and corrected.
+            training; corrected: number of decisions whose label was ever corrected or forgotten,
+            and is not forgotten now; forgotten: number of those whose label is forgotten now;
+            actions, reasons: numbers of decisions by value, and sources: numbers of labels by
+            value, each a dict that includes values with 0. Forgotten labels are not among labels
+            and sources.
         """
         tally = tally or self.tally()
         actions = tally.by("action")

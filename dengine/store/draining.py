@@ -102,7 +102,7 @@ class Drainer:
     def request(self) -> None:
         """Ask that all records so far be written to the journal's disk and the database at once.
 
-        It does not wait, and says nothing of the result.
+        It does not wait, and says nothing of the result. Later records may go with them.
         """
         with self._changed:
             self._wanted = self._recorder.n_recorded
@@ -113,8 +113,9 @@ class Drainer:
 
         If the database has everything, nothing is done. Raise StoreError if this takes longer than
         `limit` seconds, or as soon as there is a `fault`, which is a reason why the store cannot be
-        used now. The records then stay in the journal and are copied later. After a timeout there
-        is a `fault` until the database takes records again.
+        used now; the copying is requested even so. The records then stay in the journal, or in
+        memory if the disk fails, and are copied later. After a timeout there is a `fault` until the
+        database takes records again.
         """
         with self._changed:
             if self.is_drained:
@@ -139,8 +140,8 @@ class Drainer:
         """Return (decision id, label number) of each label that was drained since the last call.
 
         To drain a label is to copy it from the journal to the database. The pairs are in the order
-        in which this was done. A report that repeats a stored label has the number of that label.
-        Without a product the list is empty.
+        in which this was done. A report that repeats a stored label has the number of that label. A
+        label that became a dead letter has no pair. Without a product the list is empty.
         """
         with self._changed:
             numbers = self._label_numbers
@@ -150,8 +151,9 @@ class Drainer:
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """Have this object's thread, which uses the database, make a call; do not wait for it.
 
-        Before the call, the thread copies the records that are on the journal's disk to the
-        database. If this fails, the call is made nevertheless.
+        The calls are made one after another, in their order. Before a call, the thread copies the
+        records that are on the journal's disk to the database. If this fails, the call is made
+        nevertheless.
 
         Returns
         -------
@@ -173,6 +175,8 @@ class Drainer:
 
     def wait_for_result(self, future: Future[T]) -> T:
         """Wait for a submitted call; return its result, or raise what it raised.
+
+        The time limit includes the wait for the calls before it.
 
         Raises
         ------
@@ -231,9 +235,10 @@ class Drainer:
         """Copy the records on the journal's disk to the database, and make submitted calls.
 
         The thread runs this until `stop` is called. Before a call all of these records are copied;
-        if this fails, the call is made nevertheless. An error of the database is logged once and
-        kept for `fault`; a second later the database is tried again. Once stopped, it ends when all
-        submitted calls are made, and the records are copied or the database has failed.
+        if this fails, the call is made nevertheless. Any error of the copying is logged, only the
+        first until it succeeds again, and kept for `fault`; the database is tried again a second
+        later, or sooner if there is a call. Once stopped, it ends when all submitted calls are
+        made, and the records are copied or the copying has failed.
         """
         while True:
             call = self._wait_for_work()
@@ -287,8 +292,9 @@ class Drainer:
 
         They go in chunks of at most DRAIN_CHUNK (500) records. Later records go with them only if
         they still fit into the last chunk. The journal's head, the small file beside it, is synced
-        first. At the end the last error, which `fault` shows, is cleared. Raise StoreError if the
-        database fails: chunks that were committed stay, and the last error is kept.
+        first. At the end, or at once if there are no records, the last error, which `fault` shows,
+        is cleared. Raise StoreError if the database fails: chunks that were committed stay, and the
+        last error is kept.
         """
         synced_to = self._recorder.n_synced
         if self.n_drained < synced_to:
@@ -301,14 +307,14 @@ class Drainer:
         """Commit the oldest records that are on the journal's disk, at most DRAIN_CHUNK (500).
 
         There must be one. A decision is left out if a later record with the same id replaces it.
-        Records that are damaged on disk are taken from memory and reported by an event. If a
-        decision is not in memory either, it is lost, and the kind of that event is DATA_LOST, an
-        alarm. Then the journal's header notes that the database has the records, `n_drained` counts
-        them, and they leave the queue of the recorder and, except for the newest decisions, the
-        `DecisionIndex`, by which decisions are found in memory. In a product the numbers of their
-        labels are kept for `pop_label_numbers`. Raise StoreError if the database fails; nothing of
-        this is done then, and the next call commits the same records again, of which some may be
-        stored already.
+        Records that are damaged on disk are taken from memory and reported by an event, which is
+        also logged. If a decision is not in memory either, it is lost, and the kind of that event
+        is DATA_LOST, an alarm. Then the journal's header notes that the database has the records,
+        `n_drained` counts them, and they leave the queue of the recorder and, except for the newest
+        decisions, the `DecisionIndex`, by which decisions are found in memory. In a product the
+        numbers of their labels are kept for `pop_label_numbers`. Raise StoreError if the database
+        fails; nothing of this is done then, and the next call commits the same records again, of
+        which some may be stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))
@@ -367,7 +373,8 @@ class Drainer:
         """Make a submitted call; set the future's result or exception. Nothing is raised here.
 
         A call whose future was cancelled before is not made. If the future is cancelled while the
-        call runs, its transaction is rolled back; once the call commits, it cannot be cancelled.
+        call runs, its transaction is rolled back, and its result or exception is lost; from its
+        first commit on, it cannot be cancelled.
         """
 
         def is_wanted() -> bool:

@@ -32,6 +32,8 @@ class EventTable(CellTable):
     ) -> int:
         """Commit an event with the present time, and return its number.
 
+        In `kind`, `text` and `author` a NUL and half a surrogate pair become escapes.
+
         Parameters
         ----------
         kind : str
@@ -42,6 +44,10 @@ class EventTable(CellTable):
             The same for machines, with values that JSON has.
         author : str, default ""
             Who did it; "" for the engine itself.
+
+        Returns
+        -------
+        int
 
         Raises
         ------

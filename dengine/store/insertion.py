@@ -68,11 +68,13 @@ class RecordInsertion:
     def commit(self, records: Sequence[Record]) -> LabelNumbers:
         """Commit records in one transaction; return (decision id, label number) of their labels.
 
-        A record that is stored already changes nothing. A record that contradicts the store becomes
-        a dead letter, an event that says what was in it. If the database refuses a value, the
-        records are halved, each half in a transaction of its own, until the refused record is
-        alone; it becomes a dead letter, too. A label that became a dead letter has no pair. Raise
-        StoreError if the database fails in another way; halves that were committed before stay.
+        A record that is stored already changes nothing, except that a label has its pair. A record
+        that contradicts the store becomes a dead letter, an event that says what was in it, and is
+        logged. A late stop (`_is_late_stop`) corrects the label of its part. If the database
+        refuses a value, the records are halved, each half in a transaction of its own, until the
+        refused record is alone; it becomes a dead letter, too. A label that became a dead letter
+        has no pair. Raise StoreError if the database fails in another way; halves that were
+        committed before stay.
         """
         try:
             return self._database.write(lambda connection: self._insert(connection, records))
@@ -113,8 +115,8 @@ class RecordInsertion:
     ) -> list[str]:
         """Insert the decisions that are not stored yet, with their traces; nothing is committed.
 
-        Return a text for each decision whose id is stored with other values. The stored values are
-        not changed.
+        Return a text for each decision whose id is stored with other values, in columns or trace.
+        The stored values are not changed. No two of the decisions may have one id.
         """
         trace_columns = TRACE.c["decision_id", "channels", "samples", "data"]
         query = sa.select(*DECISION.c, *trace_columns).select_from(WITH_TRACES)
@@ -144,7 +146,8 @@ class RecordInsertion:
 
         `stored` has a row for each decision of the new labels (`CorrectionTable.stored_labels`),
         with the number `seq` of the label that it has, or None, and `quarantined`. A label is
-        quarantined (kept out of training) if its decision is. Nothing is committed.
+        quarantined (kept out of training) if its decision is. Of a new label with a positive number
+        that is still free the number is kept (`Database.insert`). Nothing is committed.
         """
         rows = [
             to_row(label) | {"quarantined": stored[label.decision_id].quarantined}
@@ -159,8 +162,8 @@ class RecordInsertion:
     ) -> None:
         """Insert events, and one "dead letter" for each problem, which is also logged as an error.
 
-        An event is left out if the cell has one with the same time, kind and text. Nothing is
-        committed.
+        An event is left out if the cell has one with the same time, kind and text; a "dead letter",
+        which has the present time, is not. Nothing is committed.
         """
         new = []
         if events:
@@ -196,8 +199,8 @@ def _sort_labels(labels: Sequence[NewLabel], stored: dict[str, Any]) -> SortedLa
     repeats success and source of the first changes nothing. A late stop (`_is_late_stop`) corrects
     the first label; if this was corrected to a failure already, it changes nothing. Any other
     second label is a problem. So is a late stop whose first label was forgotten, and a label whose
-    decision is not stored with the same trace and time. `stored` has, by id, what is stored of the
-    decisions and their labels: the rows of `CorrectionTable.stored_labels`.
+    decision is not stored with the same content hash and time. `stored` has, by id, what is stored
+    of the decisions and their labels: the rows of `CorrectionTable.stored_labels`.
     """
     result = SortedLabels()
     for label in labels:
@@ -221,10 +224,10 @@ def _find_problem(label: NewLabel, row: Any, first: Any) -> str:
     """Return in words why the store cannot take a label; "" if it can.
 
     `row` is the stored row of its decision, or None. `first` is the label that the decision has, or
-    None; it is this row or a `NewLabel`. The row must be there, with the same trace and time as the
-    label's decision. A second label is a problem, with two exceptions: it repeats the first, or it
-    is a late stop, a line stop of a part that was confirmed as good before. A late stop is a
-    problem if a person had the first label forgotten.
+    None; it is this row or a `NewLabel`. The row must be there, with the content hash and the time
+    that the label has of its decision. A second label is a problem, with two exceptions: it repeats
+    the first, or it is a late stop, a line stop of a part that was confirmed as good before. A late
+    stop is a problem if a person had the first label forgotten.
     """
     if row is None:
         return f"{_describe(label)}, which the store does not hold"
@@ -246,7 +249,10 @@ def _is_late_stop(label: NewLabel, first: Any) -> bool:
 
 
 def _differences(item: StoredDecision, row: Any) -> list[str]:
-    """Return the names of the columns in which a decision and its stored row differ."""
+    """Return the names of the columns in which a decision and its stored row differ.
+
+    The row must have the columns of the decision and of its trace. The number is not compared.
+    """
     given = decision_row(item) | trace_row(item)
     return [name for name, value in given.items() if row._mapping[name] != value]
 

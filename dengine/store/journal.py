@@ -258,8 +258,8 @@ class Journal:
     def read(self, offset: int) -> bytes:
         """Return the encoded record at an offset that `append` returned.
 
-        `decode_record` decodes it. Raise StoreError if no intact record begins there, or if the
-        disk cannot be read.
+        `decode_record` decodes it. Raise StoreError if no intact record, one whose CRC-32 fits,
+        begins there, or if the disk cannot be read.
         """
         with _os_errors(self.path):
             record = self._read_record(offset)
@@ -274,7 +274,8 @@ class Journal:
         """Yield (offset, end, encoded record) of the records that the store lacks, oldest first.
 
         A record takes the bytes of the file from `offset` to before `end`. Damaged records are
-        skipped: the search goes on at the next record.
+        skipped: the search goes on at the next mark of a record. Raise OSError, and no StoreError,
+        if the disk cannot be read.
         """
         begin = self.drained_to
         while begin < self.end:
@@ -319,8 +320,9 @@ class Journal:
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, and space is reserved and synced again. Raise
-        StoreError if the file cannot be written.
+        The file is cut off behind its header, which says that the store holds all, and space is
+        reserved and synced again; the head is not written. Raise StoreError if the file cannot be
+        written.
         """
         self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):
@@ -343,8 +345,9 @@ class Journal:
         """Create a new file at the path of a journal that was deleted, moved or replaced.
 
         The records that the store lacks are copied to the same offsets from the lost file, which is
-        still open and is then closed. Raise StoreError if the new file cannot be written, or
-        another engine has locked it; the journal then still uses the lost one.
+        still open and is then closed. A file that is at the path by now is taken, and written over.
+        Raise StoreError if it cannot be written, or another engine has locked it, or the lost file
+        cannot be read; the journal then still uses the lost one.
         """
         lost = self._file
         self._file = _open_file(self.path)
@@ -366,7 +369,8 @@ class Journal:
         With `waiting=False` the file is not synced, and the records stay even if the store has all.
 
         The header stays in the file, so that the next engine can compare it with the ledger. A
-        journal that was opened for reading is only closed, and so is a journal whose disk fails.
+        journal that was opened for reading is only closed, and so is a journal whose disk fails:
+        nothing is raised. A second call does nothing.
         """
         if self._owning and not self._file.closed:
             with suppress(OSError):
@@ -403,7 +407,8 @@ class Journal:
 
         With a damaged header the store counts as lacking every record. Records that are damaged or
         missing are described in `loss`, and the bytes of an unfinished record counted in `dropped`;
-        they are not raised. Nothing is written. Raise StoreError if the file is no journal.
+        they are not raised. Nothing is written. Raise StoreError if the file is no journal, and
+        OSError if it cannot be read. An empty file is a journal without records.
         """
         head = self.head
         fields: dict[str, Any] = {"newest": None, "n_drained": head.n_drained}
@@ -490,8 +495,9 @@ def _os_errors(path: Path, owning: bool = True) -> AbstractContextManager[None]:
 def _open_file(path: Path, owning: bool = True) -> OwnedFile:
     """Open a journal's file: locked, for writing, and created if need be; or only for reading.
 
-    If `owning` is False, it is only read, and not locked. Raise StoreError if the system refuses,
-    or if another engine has locked it; the message then names that engine's process.
+    If `owning` is False, it is only read, not locked, and must exist. Raise StoreError if the
+    system refuses, for a symbolic link, or if another engine has locked it; the message then names
+    that engine's process, if the header can be read.
     """
     with _os_errors(path, owning):
         try:
@@ -557,8 +563,9 @@ def read_undrained(path: Path) -> tuple[list[Record], Journal]:
 
     The records are oldest first. If several decisions have one id, only the last is returned.
     Damaged records are left out; the journal's attribute `loss` says so. Nothing is locked or
-    changed, so an engine may be using the journal. Raise StoreError if the file cannot be read or
-    is no journal, and for a record that another release of dengine wrote.
+    changed, so an engine may be using the journal. Raise StoreError if the file cannot be opened or
+    is no journal, and for an intact record that cannot be decoded, like that of another release of
+    dengine. If the disk fails later, while the records are read, OSError is raised.
     """
     journal = Journal(path, owning=False)
     try:
@@ -575,7 +582,10 @@ def read_undrained(path: Path) -> tuple[list[Record], Journal]:
 
 
 def read_head(journal: Path) -> Head:
-    """Return the content of the head beside a journal; an empty one if it is missing or damaged."""
+    """Return the content of the head beside a journal; an empty one if it is missing or damaged.
+
+    The same is returned if the file cannot be read, or has fields that `Head` does not have.
+    """
     with suppress(OSError, *DAMAGES):
         return Head(**_unpack_fields(head_path(journal).read_bytes()))
     return Head()

@@ -86,9 +86,9 @@ class JournalledStore(Outbox):
 
         The head is a small file beside the journal. If an entry is missing, the store was cut off
         or restored from an older copy: an event DATA_LOST (an alarm) is stored, and all records of
-        the journal will be copied to the database again. An event that is no alarm is stored if the
-        journal or its head is new or damaged though the store is not new. Raise StoreError only if
-        the database cannot be read or written.
+        the journal will be copied to the database again. Otherwise an event that is no alarm is
+        stored if the journal or its head is new or damaged though the store is not new. Either is
+        logged as an error. Raise StoreError only if the database cannot be read or written.
         """
         journal = self._journal
         database = self.store.database
@@ -113,9 +113,9 @@ class JournalledStore(Outbox):
 
         If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
         alarm until a person acknowledges it. Otherwise, if a killed process left an unfinished
-        record, which was cut off, an event that is no alarm says so. Raise StoreError if the
-        database fails, or another release wrote a record; the records that were not copied then
-        stay in the journal.
+        record, which was cut off, an event that is no alarm says so. Either is logged as an error.
+        Raise StoreError if the database fails, or another release wrote a record; the records that
+        were not copied then stay in the journal.
         """
         newest = self.store.decisions.select(HistoryFilter(), limit=1)
         since = "".join(
@@ -176,7 +176,8 @@ class JournalledStore(Outbox):
 
         The number is the cell's next one. If its id has a decision in memory, that decision is
         returned, and nothing is recorded. If 10,000 records wait for the disk, nothing is recorded
-        either: `item` is returned unchanged, and `find_decision` raises StoreError for its id.
+        either: `item` is returned unchanged, and `find_decision` raises StoreError for its id until
+        a decision is recorded for it. That a new id has no decision in the database is not checked.
         """
         id_ = item.decision.id
         with self._changed:
@@ -235,7 +236,7 @@ class JournalledStore(Outbox):
     def request_label_drain(self) -> bool:
         """Return whether the database still lacks a label; if so, have all records copied there.
 
-        A thread copies them at once, and is not waited for.
+        Threads write them to the disk and copy them, and are not waited for.
         """
         with self._changed:
             if self._index.has_undrained_labels:
@@ -250,9 +251,10 @@ class JournalledStore(Outbox):
     def find_decision(self, decision_id: str, unsynced: bool = False) -> StoredDecision | None:
         """Return a decision with its label from memory, journal or database, or None if unknown.
 
-        A label that is not on disk yet is left out, unless `unsynced` is True. Raise StoreError if
-        the database is needed and does not answer within `limit` seconds, or if the stored trace is
-        damaged. Raise it also for an id whose last decision was VERIFY and was not recorded,
+        A label that is not on disk yet is left out, unless `unsynced` is True. A label from memory
+        comes without number and time. Raise StoreError if the database is needed and has a fault or
+        does not answer within `limit` seconds, or if the stored trace, or the journal where the
+        decision stands, is damaged. Raise it also for an id whose last decision was not recorded,
         because the id could not be looked up or the disk hung.
         """
         with self._changed:
@@ -288,8 +290,8 @@ class JournalledStore(Outbox):
         """Read the ids of all decisions from the database into a Bloom filter in memory.
 
         By the filter most new ids are recognized without the database. It takes about a second for
-        a million ids; other calls to this outbox may go on meanwhile. Once all are loaded, another
-        call does nothing. Raise StoreError if the database cannot be read.
+        a million ids, without a time limit; other calls to this outbox may go on meanwhile. Once
+        all are loaded, another call does nothing. Raise StoreError if the database cannot be read.
         """
         if self._index.has_all_ids:
             return
@@ -366,7 +368,8 @@ class JournalledStore(Outbox):
         """Log that the journal holds records that the database lacks, and why.
 
         If `can_close` (the disk answers), disconnect and close the journal without waiting, so that
-        another engine can own the cell. If not, both stay open until the process ends.
+        another engine can own the cell; a lease on a server ends when its connection is closed. If
+        not, both stay open until the process ends.
         """
         log.warning(
             "the store was left, its journal %s holds what it lacks: %s",

@@ -71,8 +71,9 @@ class LabelTable(CellTable):
         """Return labelled traces for training, with corrected labels, oldest first.
 
         Labels that a person had forgotten are left out, and so are labels of quarantined traces,
-        which are stored but never used in training. A trace that is not as it was stored is left
-        out, too, and an event with the id of its decision is written to the store.
+        which are stored but never used in training. A trace that is missing or not as it was stored
+        is left out, too, and an event with the ids of such decisions is written to the store, or
+        logged if the store cannot be written.
 
         Parameters
         ----------
@@ -88,13 +89,14 @@ class LabelTable(CellTable):
         Returns
         -------
         LabelledTraces
-            Numbers of the labels, traces, labels (1 or 0) and content hashes, as arrays.
+            Numbers of the labels, traces, labels (1 or 0) and content hashes, as arrays; empty if
+            there are none.
 
         Raises
         ------
         StoreError
             If the traces have different shapes, or a label is not 0 or 1; other damage of a label
-            is not noticed here.
+            is not noticed here. If the database fails.
         """
         scope = Scope(self._database.cell_id) if cell_only else self._scope
         query = training_query(scope, corrected_to).order_by(LABEL.c.seq.desc()).limit(limit)
@@ -172,9 +174,9 @@ class LabelTable(CellTable):
     def past(self, after: int, upto: int | None = None) -> list[PastLabel]:
         """Return this cell's labels as they were recorded, oldest first.
 
-        Labels of quarantined traces, which no version is trained on, are included. A label that is
-        not as it was stored is left out, and an event with the id of its decision is written to the
-        store.
+        Labels of quarantined traces, which no version is trained on, are included, and so are
+        forgotten ones. A label that is not as it was stored is left out, and an event with the id
+        of its decision is written to the store, or logged if the store cannot be written.
 
         Parameters
         ----------
@@ -188,6 +190,11 @@ class LabelTable(CellTable):
         list of PastLabel
             Each label with the bounds of its decision and what else a rule is updated with.
             Corrections are not applied.
+
+        Raises
+        ------
+        StoreError
+            For a stored value that cannot be read, and if the database fails.
         """
         query = (
             sa.select(*LABEL.c, *DECISION.c["lower", "upper", "reason"], *audit_columns())
@@ -224,7 +231,7 @@ class LabelTable(CellTable):
             `seq` is: each adds an outcome "failure" if the lower bound of its decision is above 0,
             and an outcome "success" if the upper bound is below 1 (`overdue_outcomes`). These
             outcomes stand where the running engine updated the rule with them: before the first
-            label that came when this check was overdue already, else at the end.
+            returned label that came when this check was overdue already, else at the end.
 
         Returns
         -------
@@ -296,9 +303,10 @@ class LabelTable(CellTable):
     def _record_left_out(self, damaged: Sequence[str], part: str) -> None:
         """Write an event to the store that says that some traces or labels were left out.
 
-        `damaged` has the ids of their decisions, and `part` says what is damaged, "trace" or
-        "label". Nothing is written without ids, or if the cell has the same event already. If the
-        store cannot be written, this is logged instead.
+        `damaged` has the ids of their decisions, of which the event names eight and counts the
+        others; `part` says what is damaged, "trace" or "label". Nothing is written without ids, or
+        if the cell has the same event already. If the store cannot be written, this is logged
+        instead.
         """
         if damaged:
             self._events.record_damage(

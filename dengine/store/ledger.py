@@ -71,7 +71,7 @@ def row_sum(table: str, row: Row) -> bytes:
     Raises
     ------
     TypeError
-        For a value of another type.
+        For a value of another type, a subclass of these included.
     """
     pieces = [table.encode(), b"\n"]
     for name, begin in _summed_columns(
@@ -124,7 +124,7 @@ def state_sum(state: bytes | None) -> bytes | None:
 def ledger_key() -> bytes:
     """Return the key from the file that DENGINE_LEDGER_KEY names; b"" if the variable is not set.
 
-    Raise StoreError if the file cannot be read or holds no key.
+    Raise StoreError if the file cannot be read or holds fewer than 16 bytes.
     """
     file = os.environ.get(KEY_VARIABLE)
     return read_key(file, StoreError) if file else b""
@@ -275,7 +275,7 @@ class LedgerEntry:
         """Add the checksums of rows, which are about to be inserted into a table, to this entry.
 
         Return copies of the rows with two more columns: `entry`, the number of this entry, and
-        `sum`, the checksum (`row_sum`).
+        `sum`, the checksum (`row_sum`). Raise TypeError for a value that `row_sum` refuses.
         """
         chained = [{**row, "entry": self._number} for row in rows]
         for row in chained:
@@ -294,8 +294,8 @@ class LedgerEntry:
         Returns
         -------
         (int, str) or None
-            Number and hexadecimal digest of the entry. None if no rows were added and no settings
-            changed; then no entry is inserted.
+            Number and hexadecimal digest of the entry. None if no rows were added and no statement
+            wrote to the settings; then no entry is inserted.
         """
         if not (self._sums or self.settings):
             return None
@@ -336,8 +336,8 @@ def find_settings_faults(connection: sa.Connection, cell_id: str) -> dict[str, s
     """Compare a cell's settings with the newest copy of them in the ledger.
 
     Return a text for each key that differs: "is not chained" if only the store has it, "is missing"
-    if only the ledger has it, else "was changed". {} if all are equal. A damaged copy counts as
-    empty.
+    if only the ledger has it, else "was changed". {} if all are equal. A damaged or missing copy
+    counts as empty. The settings of the store itself (`RESERVED`) are not compared.
     """
     stored = read_settings(connection, cell_id)
     chained: dict[str, str] = {}
@@ -360,7 +360,7 @@ def find_integrity_error(connection: sa.Connection, cell_id: str, key: bytes, fi
     """Compare the rows of a cell that an engine reads with the cell's ledger.
 
     These are the settings, corrections, versions and newest labels. Of the ledger itself only the
-    newest entry is checked.
+    newest entry is checked. A cell without any entry must have none of these.
 
     Parameters
     ----------

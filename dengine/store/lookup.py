@@ -95,8 +95,9 @@ class DecisionIndex:
     def add(self, record: Record, entry: Entry) -> None:
         """Add a record that was just recorded; an event, which has no id, changes nothing.
 
-        `entry` says where the record is, in memory or in the journal. If there are more than
-        N_RECENT decisions (1,000) in memory, the oldest is dropped from memory.
+        `entry` says where the record is, in memory or in the journal. It replaces an earlier
+        decision of that id, or an earlier label of that decision. If there are more than N_RECENT
+        decisions (1,000) in memory, the oldest is dropped from memory.
         """
         if isinstance(record, StoredDecision):
             id_ = record.decision.id
@@ -116,7 +117,8 @@ class DecisionIndex:
         """Remove a record that the database has now, or that is lost.
 
         `entry` says which record. The newest N_RECENT decisions (1,000) stay in memory. If the
-        record is a label, its decision there is replaced by a copy with the label.
+        record is a label, its decision there is replaced by a copy with the label. Raise KeyError
+        for a label that was not added.
         """
         if not self.is_replaced(entry):
             self._decisions.pop(entry.decision_id, None)
@@ -138,8 +140,8 @@ class DecisionIndex:
         -------
         decision : StoredDecision or None
             From the newest N_RECENT decisions (1,000) in memory, or from the journal if the
-            database lacks it; otherwise None. In memory it has its label, if the database has the
-            label.
+            database lacks it; otherwise None. In memory it has its label, if the database got the
+            label while it was there.
         label : NewLabel or None
             The label of the decision, if the database lacks it. None if there is none, or if it is
             not on disk yet and `unsynced` is False.

@@ -52,8 +52,9 @@ class MemoryStore(Outbox):
     def _write(self) -> None:
         """Write the model versions and the records that wait in memory to the database.
 
-        It is called before each use of the store, and when 40 versions wait. Raise StoreError if
-        the database cannot be written; what was not written by then is lost.
+        It is called before each use of the store, and when 40 versions wait. The versions are
+        written first. Raise StoreError if the database cannot be written; what was not written by
+        then is lost.
         """
         versions = self._versions
         records = self._unwritten
@@ -83,8 +84,8 @@ class MemoryStore(Outbox):
     def record_labels(self, labels: Iterable[tuple[StoredDecision, NewLabel]]) -> None:
         """Keep copies of labels in memory; `labels` holds pairs of a decision and its label.
 
-        Each copy gets the present time, and the content hash and time of its decision. A decision
-        that is still in memory is replaced by a copy with the label.
+        Each copy gets the present time, and the content hash and time of its decision. If the
+        decision is still in memory, a copy of the passed one with the label takes its place.
         """
         for item, label in labels:
             label = self._completed(item, label)
@@ -105,7 +106,8 @@ class MemoryStore(Outbox):
         """Return a decision with its label, from memory or else from the database; None if unknown.
 
         Before it asks the database, everything that waits in memory is written there. A label
-        counts as soon as it is recorded, so `unsynced` has no effect.
+        counts as soon as it is recorded, so `unsynced` has no effect. Raise StoreError if the
+        database fails or the stored trace is damaged.
         """
         return self._decisions.get(decision_id) or self.store.decisions.get(decision_id)
 

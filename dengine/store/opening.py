@@ -58,7 +58,9 @@ def open_store(
     ------
     StoreError
         For an argument of another type, a database that cannot be used or is another program's, a
-        ledger with another key, a cell of another product, and a time limit that is not above 0.
+        ledger with another key than the one in the file that DENGINE_LEDGER_KEY names, if that file
+        cannot be read, a cell of another product, a product for a cell that has worked without one,
+        and a time limit that is not above 0 or not finite.
     """
     from .peers import check_cell_exists  # SQLAlchemy is imported where it is used
     from .sql import SqlStore
@@ -86,7 +88,7 @@ def opening(
     """Context manager that opens a store by `open_store`, with the same arguments, and yields it.
 
     The store stays open after the block. Only if the block raises, a store that was opened here is
-    closed; a store that was passed open is never closed.
+    closed; a store that was passed open is never closed. Raises what `open_store` raises.
     """
     opened = open_store(store, must_exist=must_exist, wait=wait)
     try:

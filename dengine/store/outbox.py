@@ -77,7 +77,8 @@ class Outbox(ABC):
     def check_usable(self) -> None:
         """Raise a StoreError if the engine is closed, only reads, or was opened before a fork.
 
-        To use what was opened before a fork is an error only in the child process.
+        To use what was opened before a fork is an error only in the child process. Faults of the
+        store and integrity errors are not raised.
         """
         if os.getpid() != self._pid:
             raise forked_error(self._pid, "the engine")
@@ -105,7 +106,8 @@ class Outbox(ABC):
     def _note_integrity(self, error: str) -> None:
         """Set `integrity_error` to what in the store is not as it was written, and log it.
 
-        If it is set already, or `error` is "", nothing changes.
+        If it is set already, or `error` is "", nothing changes, and nothing is logged. Advice for
+        the user is added to the text.
 
         From then on every part must be verified, until the store is opened again.
         """
@@ -281,7 +283,8 @@ class Outbox(ABC):
         """Return (decision id, label number) of each label that was drained since the last call.
 
         They are in the order in which they were drained. A report that repeats a stored label has
-        the number of that label. Without a product the list is empty.
+        the number of that label. A label that the store refused has no pair. Without a product the
+        list is empty.
         """
         return []
 
@@ -309,8 +312,9 @@ class Outbox(ABC):
         Raises
         ------
         StoreError
-            If the database is needed and unavailable. Also if the last decision for this id was
-            VERIFY and was not recorded, because the disk hung or the id could not be looked up.
+            If the database is needed and unavailable, and if the stored trace is damaged. Also if
+            the last decision for this id was not recorded, because the disk hung or the id could
+            not be looked up.
         """
 
     def find_earlier(self, decision_id: str) -> StoredDecision | None:

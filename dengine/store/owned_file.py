@@ -124,7 +124,10 @@ class OwnedFile:
         return os.fstat(self._fd).st_size
 
     def in_place(self) -> bool:
-        """Return whether this open file is still the one at its path; on Windows always True."""
+        """Return whether this open file is still the one at its path; on Windows always True.
+
+        Raise OSError if the system refuses to look, except that there is no file, which is False.
+        """
         if os.name == "nt":  # there an open file cannot be deleted, moved or replaced
             return True
         try:
@@ -135,7 +138,8 @@ class OwnedFile:
     def read(self, size: int, offset: int) -> bytes:
         """Return `size` bytes from an offset in bytes, or fewer at the end of the file.
 
-        Threads may call this at the same time.
+        Threads may call this at the same time. Raise OSError if the file is closed or cannot be
+        read.
         """
         if hasattr(os, "pread"):
             return os.pread(self._fd, size, offset)

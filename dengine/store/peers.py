@@ -102,7 +102,10 @@ def _embedding_settings(settings: Mapping[str, str]) -> dict[str, Any]:
 
 
 def check_cell_exists(url: str, cell_id: str) -> None:
-    """Raise a StoreError if a database has no such cell, or is no store."""
+    """Raise a StoreError if a database has no such cell, is not there, or is no store.
+
+    `url` is a file, or a URL of SQLite or PostgreSQL.
+    """
     with reading(url) as connection:
         names = sorted(connection.execute(sa.select(SETTING.c.cell_id).distinct()).scalars())
     if cell_id not in names:
@@ -117,8 +120,9 @@ def list_cells(url: str) -> list[CellSummary]:
     """Return a summary of every cell of a database, sorted by cell_id.
 
     It has the cell's product, its numbers of decisions and labels, the newest version that was put
-    in force in the cell or its product, and the time of the newest decision or label. Raise
-    StoreError if the database is no store. Nothing is written.
+    in force in the cell or its product, and the time of the newest decision or label. Forgotten
+    labels and those of quarantined traces count; records that are only in a journal do not. Raise
+    StoreError if the database is not there or is no store. Nothing is written.
     """
     accepted = (
         sa.select(VERSION.c.cell_id, sa.func.max(VERSION.c.version))

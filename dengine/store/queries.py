@@ -136,8 +136,9 @@ def newest_of(
 def join_product(connection: sa.Connection, cell_id: str, product: str | None) -> str | None:
     """Return a cell's product, or None; make a new cell a cell of `product`.
 
-    Such a cell gets a new row in the table `setting`; the product is locked until the transaction
-    ends, and nothing is committed.
+    Such a cell gets a new row in the table `setting`, and the product is locked until the
+    transaction ends; nothing is committed. Of a cell that has its product already nothing is
+    changed.
 
     Parameters
     ----------
@@ -248,8 +249,8 @@ def past_query(cell_id: str) -> sa.Select[Any]:
     """Return the query for a cell's decisions with their corrected labels; it is not run.
 
     `read_decision` reads its rows: all columns of a decision, and of its label success (None if it
-    was forgotten), source, number and time. Decisions without a label are included; traces are not.
-    The rows are in no order.
+    was forgotten), source ("stop" if it was "confirmed" and was corrected to bad), number and time.
+    Decisions without a label are included; traces are not. The rows are in no order.
     """
     labels = (
         SUCCESS.label("success"),
@@ -307,8 +308,9 @@ def stretches_query(
     -------
     sqlalchemy.Select
         With the columns of `Stretch`, in their order: the number of decisions, the time of the
-        newest, and how many were verified, novel, accepted, accepted and bad, rejected by the
-        model, and decided by a force limit. Stretches are sorted by their newest decision.
+        newest, and how many were verified, novel, accepted, accepted and bad (as corrected),
+        rejected by the model, and verified or rejected for a force limit. Stretches are sorted by
+        their newest decision. If `seconds` is not 0, `length` has no effect.
     """
     number = sa.func.row_number().over(order_by=DECISION.c.number) - 1
     columns = (*DECISION.c["cell_id", "id", "time", "action", "reason"], number.label("number"))

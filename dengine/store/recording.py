@@ -132,7 +132,9 @@ class Recorder:
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it to the journal.
 
-        Return at once the record's `Entry`, which will say where it stands in the journal.
+        Return at once the record's `Entry`, which will say where it stands in the journal. The
+        thread writes it within about BATCH_SECONDS (0.05 s), together with others. There is no
+        limit to the number of records that wait.
         """
         id_ = record.decision.id if isinstance(record, StoredDecision) else ""
         entry = Entry(record, id_)
@@ -151,7 +153,8 @@ class Recorder:
         """Add a record that an earlier process left in the journal; it counts as synced.
 
         It takes the bytes of the journal from `offset` to before `end`. Return its `Entry`, which
-        has these. The thread must not have been started.
+        has these, and drops a decision from memory. The thread must not have been started, and no
+        other record may wait.
         """
         entry = self.record(record)
         entry.place(offset, end)
@@ -168,9 +171,9 @@ class Recorder:
     def sync(self, seconds: float | None = None) -> None:
         """Wait until everything recorded so far is on the disk, at most `seconds`.
 
-        None: `limit` seconds, an argument of `Recorder`. Raise NotTakenError if that takes longer,
-        or a write fails meanwhile. The records are not lost then: the thread tries to write them
-        again.
+        None: `limit` seconds, an argument of `Recorder`. The records are written at once. Raise
+        NotTakenError if that takes longer, or a write fails meanwhile. The records are not lost
+        then: the thread, unless it was stopped, tries to write them again.
         """
         limit = self._limit if seconds is None else seconds
         with self.changed:
@@ -203,7 +206,7 @@ class Recorder:
         """End the thread, wait for it, and return whether it ended within these seconds.
 
         Before it ends, the thread tries once to write the records that wait. If this fails, they
-        stay unwritten, and nothing is raised.
+        stay unwritten, and nothing is raised. The thread must have been started.
         """
         with self.changed:
             self._stopped = True
@@ -214,10 +217,11 @@ class Recorder:
     def _run(self, kept: object) -> None:
         """Write and sync new records in batches until stopped.
 
-        The thread runs this; `kept` is only kept alive by it. Before it ends, it writes the records
-        that wait. After an error, which is kept for `fault`, it wakes those who wait in `sync`, and
-        tries the same records again a second later, unless it was stopped: they then stay
-        unwritten.
+        The thread runs this; `kept` is only kept alive by it. A batch begins BATCH_SECONDS (0.05 s)
+        after its first record, or at once if somebody waits for the disk or the thread is stopped.
+        Before it ends, it writes the records that wait. After an error, which is kept for `fault`
+        and not logged, it wakes those who wait in `sync`, and tries the records again a second
+        later or sooner, unless it was stopped: they then stay unwritten.
         """
         while True:
             with self.changed:
@@ -244,12 +248,11 @@ class Recorder:
     def _write(self, batch: Sequence[Entry]) -> None:
         """Append a batch of records to the journal, sync it, move them to the queue `synced`.
 
-        They are the oldest of the queue `unwritten`, and leave it.
-
+        They are the oldest of the queue `unwritten`, and leave it; then the last error is cleared.
         A journal of more than 8 MiB is cleared first, if the `Drainer` copies its last records to
         the database within BATCH_SECONDS (0.05 s). If the journal's file was deleted, moved or
-        replaced, it is created again, and an event says so. Raise StoreError if the disk fails; the
-        entries then stay in `unwritten`.
+        replaced, it is created again, which is logged, and an event says so. Raise StoreError if
+        the disk fails; the entries then stay in `unwritten`.
         """
         if self._journal.end > LONG:  # a cell that never pauses would fill the disk
             with self.changed:
@@ -279,7 +282,8 @@ class Recorder:
         """Create a new file for a journal whose file was lost; log this, and record an event.
 
         Records that the database lacks are copied into it. `error` is the text of log and event.
-        Raise StoreError if the file cannot be written.
+        Raise StoreError, without an event, if the file cannot be written or another engine has
+        locked it.
         """
         log.error("%s It is created again with what the store lacks.", error)
         with self.changed:  # nobody reads it or writes its header meanwhile

@@ -82,6 +82,8 @@ def already_reported(
 ) -> ReportConflictError:
     """Return the error for a second label of a decision; it names both labels.
 
+    If both have the same success, its advice is that nothing more needs reporting.
+
     Parameters
     ----------
     decision_id : str
@@ -119,8 +121,8 @@ def nothing_to_correct(decision_id: str) -> ReportError:
 def as_data(data: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """Return an event's data in a new dict, as if it was written to JSON and read; None for None.
 
-    A tuple becomes a list, and a key that is a number a text. Raise StoreError for values that JSON
-    does not have, NaN and infinity included.
+    A tuple becomes a list, and a key that is a number, a bool or None a text. Raise StoreError for
+    values that JSON does not have, NaN and infinity included.
     """
     with instead(
         StoreError,
@@ -312,10 +314,12 @@ def overdue_outcomes(decision: Decision) -> list[OutcomeRecord]:
 
     A check is overdue if no report has come within `Policy.label_within` decisions. Until it comes
     the rule counts what is worst. If the part had evidence for success (lower > 0), there is an
-    outcome "failure", with upper bound 1; its `predicted` is ACCEPT if the model alone would have
-    accepted the part. If the part had evidence for failure (upper < 1), there is then an outcome
-    "success", with lower bound 0; its `predicted` is REJECT if the model alone would have rejected
-    the part. Otherwise `predicted` is VERIFY. So there are none, one or two, all with `seq` 0.
+    outcome "failure", with the decision's lower bound, and 1 as the upper one; its `predicted` is
+    ACCEPT if the model alone would have accepted the part. If the part had evidence for failure
+    (upper < 1), there is then an outcome "success", with 0 as the lower bound, and the decision's
+    upper one; its `predicted` is REJECT if the model alone would have rejected the part. Otherwise
+    `predicted` is VERIFY. So there are none, one or two, all with `seq` 0, not novel, with `silent`
+    0 and the inclusion probability of the decision.
     """
     accepts = int(decision.predicted is Action.ACCEPT)
     rejects = 2 * int(decision.predicted is Action.REJECT)
@@ -511,7 +515,8 @@ def columns(record_type: Any) -> dict[str, tuple[type, bool]]:
     """Return, by name, the type of each field of a record class, and whether it may be None.
 
     A record class is a dataclass or NamedTuple with type hints. The type is a plain one: that of
-    `dict[str, int]` is `dict`. The result is cached; do not change it.
+    `dict[str, int]` is `dict`, and of a union, which must be one with None, it is the first that is
+    not None. The result is cached; do not change it.
     """
     fields: dict[str, tuple[type, bool]] = {}
     for name, hint in get_type_hints(record_type).items():
@@ -584,7 +589,8 @@ def from_row(record_type: Callable[..., T], row: Mapping[str, Any], **given: Any
 def _to_column(value: Any, type_: type) -> Any:
     """Return the value of a field for its column: a text, number, JSON text or packed float32.
 
-    None stays None. `type_` is the type of the field.
+    None stays None. `type_` is the type of the field. A value of another type is converted to it;
+    ValueError or TypeError is raised if it cannot be.
     """
     if value is None:
         return None
@@ -632,9 +638,9 @@ def trace_row(item: StoredDecision) -> Row:
 def read_decision(row: Any) -> StoredDecision:
     """Return the decision of a row of the table `decision`, with its label and trace if selected.
 
-    Without the trace's columns its trace has shape (0, 0). Raise StoreError for a field that cannot
-    be read. That the trace is as it was stored must have been checked (`is_intact`): another error
-    is raised for damaged bytes.
+    Without the trace's columns its trace has shape (0, 0), without the label's columns it has no
+    label. Raise StoreError for a field that cannot be read. That the trace is as it was stored must
+    have been checked (`is_intact`): ValueError or TypeError is raised for damaged bytes.
     """
     values = row._mapping
     trace = unpack(row.data).reshape(row.channels, row.samples) if "data" in values else NO_TRACE
@@ -659,8 +665,8 @@ def chunks(rows: Sequence[T]) -> Iterator[Sequence[T]]:
 def to_npz(state: Arrays) -> bytes:
     """Return arrays as the bytes of an npz file; unlike `np.savez` it takes any name.
 
-    Arrays of integers are compressed, because they repeat many values. Others, like weights, are
-    not, because they would hardly get smaller. Raise ValueError for an array of Python objects.
+    Arrays of integers are compressed, because they repeat many values. Others, like weights or
+    booleans, are not. Raise ValueError for an array of Python objects.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -676,8 +682,8 @@ def to_npz(state: Arrays) -> bytes:
 def from_npz(blob: bytes, name: str) -> State:
     """Return the arrays that `to_npz` wrote, by name.
 
-    Raise StoreError for anything else and for a pickle; `name` is the name of the store, for the
-    message.
+    Raise StoreError for anything else, for a pickle, and for arrays that need too much memory
+    (`check_size`); `name` is the name of the store, for the message.
     """
     with instead(
         StoreError,
@@ -724,10 +730,10 @@ class StoredVersion:
 def keeps_state(version: int, newest: int, keep: int | None) -> bool:
     """Return whether a version keeps its state when `newest` is the newest version.
 
-    The first version and the `keep` newest keep it (None: all do). Of older versions ever fewer do:
-    of the newest hundred those whose number is divisible by 10, of the newest thousand those whose
-    number is divisible by 100, and so on. So the number of states grows with the logarithm of the
-    number of versions.
+    The first version, number 1, and the `keep` newest keep it (None: all do). Of older versions
+    ever fewer do: of the newest hundred those whose number is divisible by 10, of the other ones of
+    the newest thousand those whose number is divisible by 100, and so on. So the number of states
+    grows with the logarithm of the number of versions.
     """
     age = newest - version
     if keep is None or version == 1 or age < keep:

@@ -54,7 +54,8 @@ def read_rule_progress(
     since_version : int
         The rule counts only decisions made by this version or a later one.
     within : int
-        Number of later decisions after which a check without a label is overdue.
+        Number of later decisions after which a check without a label is overdue. A check that the
+        version or a stored label counted as overdue stays so, whatever `within` is.
     policy_since : int
         The version with which the present policy came into force. If the newest decision is by an
         earlier version, no further check becomes overdue by `within`.
@@ -62,9 +63,9 @@ def read_rule_progress(
     Returns
     -------
     RuleProgress
-        The newest label that the rule includes, and which decisions count as overdue. `last_seq` is
-        0 if there is no version, or if the rule must be rebuilt from all outcomes (see
-        `RuleProgress`).
+        The newest label that the rule includes, and which decisions count as overdue; of these only
+        those whose bounds say something (`overdue_outcomes`). `last_seq` is 0 if there is no
+        version, or if the rule must be rebuilt from all outcomes (see `RuleProgress`).
     """
     state = {} if version is None else version.state
     overdue_to = max(

@@ -169,8 +169,8 @@ def prepare_tables(connection: sa.Connection, cell_id: str, name: str) -> None:
     Raises
     ------
     StoreError
-        For an SQLite file of another program, for another version of the schema, and if a table or
-        any other column is missing.
+        For an SQLite file of another program, for another version of the schema, if a table or any
+        other column is missing, and if there are the tables of a store, but no cell.
     """
     lock(connection, TABLES)  # two cells may create them at the same moment
     tables = set(sa.inspect(connection).get_table_names())
@@ -206,8 +206,9 @@ def _add_columns(connection: sa.Connection) -> None:
 def check_schema(connection: sa.Connection, name: str) -> None:
     """Raise a StoreError unless a database holds a store of this schema with all columns.
 
-    The schema has a version, which each cell's settings name. Columns that a later dengine added to
-    the schema (ADDED) may be missing. `name` is the name of the database, for the error.
+    The schema has a version, which each cell's settings name; a store without any cell is refused,
+    too. Columns that a later dengine added to the schema (ADDED) may be missing, and others may be
+    there. `name` is the name of the database, for the error.
     """
     inspector = sa.inspect(connection)
     is_complete = True

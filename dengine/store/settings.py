@@ -37,7 +37,8 @@ class SettingTable(CellTable):
 
         `settings` holds texts by name. The settings that the store itself keeps (`RESERVED`) stay;
         raise StoreError if `settings` has one of them. Raise SettingError if another cell of the
-        product would embed traces differently. The product stays locked until the transaction ends.
+        product would embed traces differently, or its recipe or the new one cannot be read. The
+        product stays locked until the transaction ends.
         """
         for key in sorted(settings.keys() & set(RESERVED)):
             raise StoreError(

@@ -151,8 +151,9 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         Raises
         ------
         StoreError
-            If another engine owns the cell, or the store or its journal cannot be written; nothing
-            stays claimed.
+            If another engine owns the cell, if the file of its journal is no journal, or if the
+            store or its journal cannot be written; nothing stays claimed. Records that are missing
+            or damaged in the journal are not raised: `Journal.loss` has them.
         """
         in_file = self.database.url.get_backend_name() == "sqlite"
         if in_file:
@@ -175,6 +176,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
         id, a label without its decision, and any other second label become an event, "dead letter":
         the store never guesses which of two is right. A record that the database refuses becomes a
         dead letter, too.
+
+        Each dead letter is also logged as an error.
 
         Returns
         -------
@@ -206,7 +209,8 @@ class SqlStore(AbstractContextManager["SqlStore"]):
 def _checked_wait(wait: float | None) -> float:
     """Return a store's time limit in seconds; raise StoreError unless it is above 0 and finite.
 
-    It is `wait`, or if that is None the environment's DENGINE_STORE_WAIT, or 0.4.
+    It is `wait`, or if that is None the environment's DENGINE_STORE_WAIT, or 0.4 if that is not set
+    or empty. A text that is no number is refused like 0.
     """
     value = (os.environ.get(WAIT_VARIABLE) or WAIT) if wait is None else wait
     seconds = math.nan

@@ -142,10 +142,12 @@ def verify_history(
     """Check every row of a store's history; nothing is written, and engines may run meanwhile.
 
     What is wrong is returned as faults, not raised: a row or setting that was changed, added or
-    removed, a damaged SQLite file, damaged or missing records of a journal, a ledger entry that a
-    cell's journal names and the store lacks, lost data that nobody has acknowledged, and an
-    `expect` that no entry has. A journal that is missing or cannot be read is no fault: `waiting`
-    of the cell is None then. Takes about 80 bytes of memory per row.
+    removed, a decision without its trace or a trace or label without its decision, a damaged SQLite
+    file, damaged or missing records of a journal, a ledger entry that a cell's journal names and
+    the store lacks, lost data that nobody has acknowledged, and an `expect` that no entry of the
+    checked cells has. Of missing entries and of SQLite's findings only the first 20 and 100 are
+    returned. A journal that is missing or cannot be read is no fault: `waiting` of the cell is None
+    then. Takes about 80 bytes of memory per row.
 
     Parameters
     ----------
@@ -156,7 +158,8 @@ def verify_history(
     expect : str or None
         A digest of an earlier check, or its first 8 digits or more, that the history must contain.
     on_rows : callable, optional
-        Called with the number of rows that were just read, for a progress bar.
+        Called with the number of rows that were just read, for a progress bar: after each 500, and
+        at the end of each cell with the rest, which may be 0.
 
     Returns
     -------
@@ -233,7 +236,8 @@ def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
 def _selected_cells(connection: sa.Connection, cell_id: str | None) -> list[str]:
     """Return `cell_id` in a list, or if it is None the ids of all cells in any table, sorted.
 
-    Raise StoreError for a cell that no table has. A table that cannot be read is left out.
+    Raise StoreError for a cell that no table has. A table that cannot be read to its end is left
+    out.
     """
     names: set[str] = set()
     for table in METADATA.tables.values():
@@ -375,9 +379,10 @@ class CellCheck:
         """Yield a fault for each ledger entry that was changed or is missing; fill `digests`.
 
         `digests` gets the digest of each entry, hexadecimal, oldest first. An entry must fit the
-        digest of the entry before, and the sums of its rows, which `_check_rows` has read. After an
-        entry that was changed, only this entry is a fault. Only the first 20 missing entries are
-        yielded.
+        digest of the entry before, and the sums of its rows, either as stored or as computed by
+        `_check_rows`: a changed row is a fault of its own. After an entry that was changed, only
+        this entry is a fault. Only the first 20 missing entries are yielded; those behind the
+        newest that an entry or a row names cannot be noticed.
         """
         sums = {table: np.frombuffer(packed, SUMS) for table, packed in self._sums.items()}
         sums = {
@@ -456,14 +461,9 @@ class CellCheck:
 def _entry_fault(added: Any, sums: Mapping[str, list[bytes]]) -> str:
     """Return in words why a ledger entry does not fit its rows.
 
-    It compares numbers of rows; if they are equal, it says that the entry or its rows were changed.
-
-    Parameters
-    ----------
-    added : str
-        The entry's column `added`: JSON, number of rows by table. It may be damaged.
-    sums : mapping of str to list of bytes
-        Sums of the rows that are there, by table.
+    It compares the numbers of rows by table; if they are equal, it says that the entry or its rows
+    were changed. `added` is the entry's column of that name, the numbers in JSON; if it is damaged,
+    all are 0. `sums` has the sums of the rows that are there, by table.
     """
     counts: dict[str, int] = {}
     with suppress(TypeError, ValueError):

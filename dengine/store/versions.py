@@ -57,7 +57,7 @@ class VersionTable(CellTable):
         """Commit a retrain; if its version is accepted, delete states that are no longer kept.
 
         A state is the stored arrays of a version; `keeps_state` says which older versions keep
-        theirs.
+        theirs. In a product the states of all its cells are meant.
 
         Parameters
         ----------
@@ -73,7 +73,8 @@ class VersionTable(CellTable):
         -------
         int
             The version's number. It is the number in the report, unless `report.accepted` is True
-            and another cell of the product stored a version meanwhile: then it is the next number.
+            and another cell of the product stored a version of this or a larger number meanwhile:
+            then it is the next number.
 
         Raises
         ------
@@ -111,8 +112,8 @@ class VersionTable(CellTable):
 
         If the version is not put in force (`accepted` of the row is False), it keeps its number and
         nothing else is done. Otherwise it gets the next number if another cell of the product has
-        taken its number, and the states of older versions that `keeps_state` does not keep are
-        deleted.
+        taken its number, and the states of older versions of cell and product that `keeps_state`
+        does not keep are deleted. The product is then locked until the transaction ends.
         """
         number: int = row["version"]
         if (
@@ -147,8 +148,9 @@ class VersionTable(CellTable):
     def newest(self) -> ModelVersion | None:
         """Return the newest version that was put in force in the cell or its product.
 
-        It comes with its arrays. If they are damaged, an event is written to the store, and the
-        next older version whose arrays are kept and intact is returned.
+        It comes with its arrays. If they are missing or damaged, an event is written to the store,
+        or logged if the store cannot be written, and the next older version whose arrays are kept
+        and intact is returned.
 
         Returns
         -------
@@ -232,7 +234,13 @@ class VersionTable(CellTable):
         Returns
         -------
         list of StoredVersion
-            Each with the report, the time, and whether the arrays of its version are kept.
+            Each with the report, the time, and whether the arrays of its version are kept; whether
+            these are intact is not checked.
+
+        Raises
+        ------
+        StoreError
+            For a stored value that cannot be read, and if the database fails.
         """
         kept = VERSION.c.state.is_not(None).label("kept")
         n_bytes = sa.func.coalesce(sa.func.length(VERSION.c.state), 0).label("n_bytes")

@@ -133,8 +133,9 @@ class DecisionGroup:
         """The corrected label in a word: good, bad, forgotten, overdue or none.
 
         "overdue": a check was asked for, there is no label, and so many decisions followed that the
-        check is overdue. "none": there is no label and the check is not overdue, or none was asked
-        for. A check of a quarantined trace (stored, but never used in training) is never overdue.
+        check is overdue (`aged`, which is False if the tally was made without `within`). "none":
+        there is no label and the check is not overdue, or none was asked for. A check of a
+        quarantined trace (stored, but never used in training) is never overdue.
         """
         if self.source is not None:
             if self.success is None:
@@ -172,7 +173,8 @@ class Tally:
     def by(self, field: str) -> Counter[Any]:
         """Return the number of decisions for each value of a field of `DecisionGroup`.
 
-        `field` is the name of a field or property, like "action" or "label".
+        `field` is the name of a field or property, like "action" or "label". A value that no
+        decision has counts 0, as always in a `Counter`.
         """
         counts: Counter[Any] = Counter()
         for group in self.groups:
@@ -184,8 +186,10 @@ class Tally:
         """Counts of accepted, rejected and audited parts by corrected label, for the certificate.
 
         An audited part is counted by what the model alone would have done, in the fields of audits
-        alone and not among the accepted and rejected parts. Nor are parts counted as rejected that
-        an operator's limits rejected (`Reason.OUTSIDE`).
+        alone and not among the accepted and rejected parts: `audited_accepts` and `audited_rejects`
+        are those with a label that counts; forgotten and overdue ones have fields of their own, and
+        an audit without a label that is not overdue is in no field. Nor are parts counted as
+        rejected, or as false rejects, that an operator's limits rejected (`Reason.OUTSIDE`).
         """
         by_action = Counter[tuple[Action, str]]()
         audited = Counter[tuple[Action, str]]()  # by what the model alone would have done
