@@ -31,7 +31,7 @@ from asyncua.server.user_managers import UserManager
 from asyncua.ua import VariantType
 from asyncua.ua.status_codes import StatusCodes
 
-from ..errors import DengineError, SettingError, TraceError, as_options, log
+from ..errors import DengineError, SettingError, TraceError, as_options, instead, log
 from ..files import FilePath
 from .auth import host_in_url, is_loopback
 from .robot_calls import RobotCalls, one_line
@@ -113,6 +113,21 @@ class TokenUsers(UserManager):
         return None
 
 
+async def _load_identity(server: Server, cert: FilePath, key: FilePath) -> None:
+    """Load the server's certificate and key, both in PEM.
+
+    Raises SettingError if a file cannot be read, holds no such thing, or needs a password.
+    """
+    with instead(
+        SettingError,
+        f"Cannot use {cert} and {key} for OPC UA",
+        *(OSError, ValueError, TypeError),
+        do="use PEM files, and a key without a password",
+    ):
+        await server.load_certificate(os.fspath(cert), "pem")
+        await server.load_private_key(os.fspath(key), format="pem")
+
+
 @asynccontextmanager
 async def opcua_server(
     service: CellService,
@@ -135,8 +150,8 @@ async def opcua_server(
     tokens : collection of str, optional
         Passwords of the user `dengine`; None: everybody may read and call.
     cert, key : path, optional
-        Files in PEM if their name ends in .pem, otherwise in DER. With them the server speaks only
-        Basic256Sha256, signed and encrypted; without them it encrypts nothing.
+        Files in PEM. With them the server speaks only Basic256Sha256, signed and encrypted; without
+        them it encrypts nothing.
 
     Yields
     ------
@@ -147,11 +162,10 @@ async def opcua_server(
     ------
     SettingError
         For an address that other machines can reach, unless there are tokens, a certificate and a
-        key; for a certificate without its key, or a key alone.
+        key; for a certificate without its key, or a key alone; for a file that cannot be read, or
+        that holds no certificate, or no key without a password.
     OSError
-        For a port in use, and a file that cannot be read.
-    ValueError
-        For a file that holds no certificate, or no key without a password.
+        For a port in use.
     """
     if (cert is None) != (key is None):
         raise SettingError("Expected a certificate and its key together, got one of them.")
@@ -181,8 +195,7 @@ async def opcua_server(
         policy = ua.SecurityPolicyType.NoSecurity
     server.set_security_policy([policy])
     if cert is not None and key is not None:
-        await server.load_certificate(os.fspath(cert))
-        await server.load_private_key(os.fspath(key))
+        await _load_identity(server, cert, key)
     space = AddressSpace(server, service)
     await space.build()
     async with server:
