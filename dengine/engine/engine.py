@@ -808,22 +808,26 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     def correct(self, decision_id: str, success: bool, author: str = "") -> Changed:
         """Correct a wrong label, or let a forgotten one count again; see `Corrections.correct`."""
-        return self._corrections.correct(decision_id, success, author)
+        with self._exclusive:
+            return self._corrections.correct(decision_id, success, author)
 
     def forget(self, *decision_ids: str, author: str = "", reason: str = "") -> Changed:
         """Leave labels out of all that is learned and counted from now on.
 
         See `Corrections.forget`.
         """
-        return self._corrections.forget(*decision_ids, author=author, reason=reason)
+        with self._exclusive:
+            return self._corrections.forget(*decision_ids, author=author, reason=reason)
 
     def rollback(self, version: int, author: str = "") -> Changed:
         """Put an earlier version in force again until `release`; see `Corrections.rollback`."""
-        return self._corrections.rollback(version, author)
+        with self._exclusive:
+            return self._corrections.rollback(version, author)
 
     def release(self, author: str = "") -> Changed:
         """Let retrains replace a pinned version again; see `Corrections.release`."""
-        return self._corrections.release(author)
+        with self._exclusive:
+            return self._corrections.release(author)
 
     # Policy
 
@@ -834,7 +838,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
 
     def set_policy(self, policy: Policy, author: str = "") -> Changed:
         """Decide by another policy from the next decision on; see `Corrections.set_policy`."""
-        return self._corrections.set_policy(policy, author)
+        with self._exclusive:
+            return self._corrections.set_policy(policy, author)
 
     def set_shadow(self, on: bool, author: str = "") -> Changed:
         """Begin or end the shadow mode, in which every part is verified; see `set_policy`."""
