@@ -65,8 +65,9 @@ class Corrections:
 
     Every method first finishes what is under way: it stores the labels that wait for the store, and
     reads what peers have stored. So it waits for the store, and raises StoreError if the store does
-    not answer; `DataEngine` also raises it while another thread uses the engine. A training that is under way in an executor is discarded, and another one begins
-    afterwards, except after a rollback.
+    not answer; `DataEngine` also raises it while another thread uses the engine. A training that is
+    under way in an executor is discarded, and another one begins afterwards, except after a
+    rollback.
 
     Parameters
     ----------
