@@ -3,7 +3,6 @@ afterwards.
 """
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,8 +16,6 @@ def add(window: TrainingWindow, *seqs: int) -> None:
 
 
 def seqs_of(labelled: LabelledTraces) -> list[int]:
-    n = len(labelled.seq)
-    assert labelled.traces.shape == ((n, 1, 3) if n else (0, 1, 1))
     assert labelled.traces[:, 0, 0].tolist() == labelled.seq.tolist()
     assert labelled.labels.tolist() == [seq % 2 for seq in labelled.seq]
     assert labelled.hashes.tolist() == [100 + seq for seq in labelled.seq]
@@ -41,9 +38,8 @@ def test_every_snapshot_is_of_the_newest_then_and_never_changes(
         assert seqs_of(snapshot) == expected
 
 
-@pytest.mark.parametrize("capacity", [4, 100])
-def test_what_is_newer_than_a_label_is_found_with_its_trace(capacity: int) -> None:
-    window = TrainingWindow(capacity)
+def test_what_is_newer_than_a_label_is_found_with_its_trace() -> None:
+    window = TrainingWindow(4)
     add(window, 2, 3, 5, 8, 9)
     assert (window.newer(5), window.newer(9)) == ([8, 9], [])
     trace, label, hash_ = window.row(8)
