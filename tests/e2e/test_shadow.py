@@ -1,24 +1,23 @@
 """Decisions with the caller's own ids, and the shadow mode."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 
-from dengine import Action, DataEngine, Dataset
+from dengine import Action, DataEngine
 from dengine.errors import ReportError
 from tests.support.driving import RECIPE, drive
 
 
 @pytest.mark.parametrize("name", ["", "two\nlines", 7, "x" * 1000])
-def test_what_is_no_id_is_refused(name: object, stream: Dataset) -> None:
+def test_what_is_no_id_is_refused(name, stream):
     with DataEngine(recipe=RECIPE) as engine, pytest.raises(ReportError, match="Expected the id"):
         engine.decide(stream.X[0], decision_id=name)
 
 
 def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(
-    stream: Dataset,
-) -> None:
+    stream,
+):
     with DataEngine(recipe=RECIPE) as engine:
         first = engine.decide(stream.X[0], part="P1", decision_id="order-7")
         assert (first.id, first.action) == ("order-7", Action.VERIFY)
@@ -28,9 +27,7 @@ def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_s
         assert engine.store.decisions.counts()["decisions"] == 100
 
 
-def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(
-    stream: Dataset, tmp_path: Path
-) -> None:
+def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(stream, tmp_path):
     (tmp_path / "cell").mkdir()
     with DataEngine(recipe=RECIPE, store=tmp_path / "cell" / "engine.db") as engine:
         answers = [engine.decide(x, decision_id=f"order-{i}") for i, x in enumerate(stream.X[:20])]

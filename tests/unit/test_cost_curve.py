@@ -4,10 +4,9 @@ its picture and its verb.
 
 import math
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -66,20 +65,20 @@ def curve(
     return curve_of(groups, COSTS)
 
 
-def test_a_parts_cost_is_its_check_or_its_wrong_decision() -> None:
+def test_a_parts_cost_is_its_check_or_its_wrong_decision():
     action = ["verify", "verify", "accept", "accept", "reject", "reject"]
     costs = part_costs(replay_of(action, [1, 0] * 3), COSTS)
     assert costs.tolist() == [5, 5, 0, 100, 20, 0]
 
 
-def test_a_part_that_an_operators_limits_reject_was_not_checked_and_pays_for_no_policy() -> None:
+def test_a_part_that_an_operators_limits_reject_was_not_checked_and_pays_for_no_policy():
     reason = np.array(["certain"] * 80 + ["outside"] * 20)
     (replays,) = four(LAX, 60, 15, 0, 25).values()
     (row,) = curve_of({LAX: [replace(item, reason=reason) for item in replays]}, COSTS).rows
     assert (row.verified, row.cost) == pytest.approx((0.6, 5 * 0.8))
 
 
-def test_no_row_is_cheaper_than_the_marked_one_unless_a_sentence_says_that_this_is_chance() -> None:
+def test_no_row_is_cheaper_than_the_marked_one_unless_a_sentence_says_that_this_is_chance():
     result = curve(lax=[(40, 0), (50, 0), (50, 0), (60, 0)], strict=[(90, 0), (80, 0)] * 2)
     assert (result.policy, result.marked.cost) == (LAX, 2.5)
     assert "beyond chance" not in result.sentence
@@ -89,7 +88,7 @@ def test_no_row_is_cheaper_than_the_marked_one_unless_a_sentence_says_that_this_
     assert "alpha 0.5, LB 80 % costs 2, which is not cheaper beyond chance" in close.sentence
 
 
-def test_the_interval_moves_the_errors_to_their_ends_and_adds_the_luck_of_the_order() -> None:
+def test_the_interval_moves_the_errors_to_their_ends_and_adds_the_luck_of_the_order():
     row = curve([(50, 0), (50, 0), (50, 1), (50, 0)]).rows[0]
     assert (row.bad.decided, row.bad.wrong) == (200, 1)
     assert row.lower < row.cost < row.upper
@@ -101,9 +100,7 @@ def test_the_interval_moves_the_errors_to_their_ends_and_adds_the_luck_of_the_or
 @pytest.mark.parametrize(
     ("counts", "verdict"), [((100, 2900, 10), "pays"), ((50, 50, 0), "may pay")]
 )
-def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everything(
-    counts: tuple[int, ...], verdict: str
-) -> None:
+def test_a_policy_pays_only_where_its_whole_interval_is_below_verifying_everything(counts, verdict):
     assert curve_of(four(LAX, *counts), COSTS).verdict == verdict
 
 
@@ -119,9 +116,7 @@ def alone(
     [(50, 0, 0), (50, 1, 0), (5, 0, 20)],
     ids=["no error", "an error", "rejects"],
 )
-def test_as_many_parts_as_are_missing_turn_may_pay_into_pays(
-    accepted: int, bad: int, rejected: int
-) -> None:
+def test_as_many_parts_as_are_missing_turn_may_pay_into_pays(accepted, bad, rejected):
     def times(n: int) -> CostCurve:
         return alone(accepted * n, 50 * n, bad * n, rejected * n)
 
@@ -132,20 +127,15 @@ def test_as_many_parts_as_are_missing_turn_may_pay_into_pays(
     assert result.missing.accepted == pytest.approx(accepted * scale, rel=0.03, abs=1)
 
 
-def test_what_is_missing_is_stated_in_parts_recordings_and_production() -> None:
-    result = alone(50)
-    missing = result.missing
+def test_what_audits_alone_tell_takes_as_many_more_parts_as_they_are_rare():
+    watched, audited = (alone(50, stops=stops).missing for stops in ("all", "some"))
     # Wilson's end z^2 / (n + z^2) of no bad one among n parts is 5 % at n = 19 z^2, z = 2.2414.
-    assert (missing.accepted, missing.seen) == (math.ceil(19 * 2.241403**2), 50)
-    assert (missing.recordings, missing.production, missing.audit_rate) == (91, 191, 1.0)
-    assert "91 more recordings, or 191 parts of production" in result.sentence
-    by_audits = alone(50, stops="some")
-    assert (by_audits.missing.production, by_audits.missing.audit_rate) == (191 * 20, 0.05)
-    assert "parts of production at an audit rate of 5 %" in by_audits.sentence
+    assert (watched.accepted, watched.recordings) == (math.ceil(19 * 2.241403**2), 91)
+    assert (watched.production, audited.production) == (191, 191 * 20)
 
 
 @pytest.mark.parametrize("lax", [(50, 5), (100, 0)])
-def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: tuple[int, int]) -> None:
+def test_where_nothing_pays_it_says_so_and_names_no_policy(lax):
     result = curve([lax] * 4)
     assert (result.verdict, result.policy) == ("does not pay", None)
     assert result.sentence.startswith("Nothing pays: verifying everything costs 5 a part")
@@ -153,22 +143,12 @@ def test_where_nothing_pays_it_says_so_and_names_no_policy(lax: tuple[int, int])
 
 
 @pytest.mark.parametrize(("escape", "verdict"), [(25, "does not pay"), (15, "may pay")])
-def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear(
-    escape: int, verdict: str
-) -> None:
+def test_a_few_accepts_without_an_error_do_not_look_free_where_an_error_is_dear(escape, verdict):
     result = curve_of(four(LAX, 99, 1, 0), replace(COSTS, escape=escape))
     assert (result.marked.cost, result.verdict) == (4.95, verdict)
 
 
-def test_it_says_which_price_would_change_the_choice() -> None:
-    result = curve_of(four(LAX, 200, 800, 12) | four(STRICT, 600, 400, 0), COSTS)
-    assert result.policy == LAX  # 2.2, where the stricter one costs 3.0
-    assert "with escape at 200, alpha 0.05, LB 95 %" in result.price_changes
-    assert "escape at 50," not in result.price_sentence
-    assert "the choice stays" in curve(lax=[(20, 0)] * 4).price_sentence
-
-
-def test_needed_neighbours_are_those_of_the_interval_and_needed_members_those_of_the_bet() -> None:
+def test_needed_neighbours_are_those_of_the_interval_and_needed_members_those_of_the_bet():
     assert needed_parts(Policy(0.1, 0.9)) == 25
     assert needed_parts(Policy(0.05, 0.95, interval="clopper_pearson")) == 72
     pooled = Policy(0.05, 0.95, guarantee="pooled", stops="all")
@@ -180,26 +160,12 @@ def test_needed_neighbours_are_those_of_the_interval_and_needed_members_those_of
     assert needed_parts(Policy(prices=(5, 120, 47.5))) == 0
 
 
-def test_candidates_lie_around_break_even_and_have_the_audits_that_they_need() -> None:
-    costs = Costs(0.5, 200, 5)
-    changes = list(candidates(Contender.load("pca"), costs, (), ()))
+def test_candidates_lie_around_break_even_and_have_the_audits_that_they_need():
+    changes = list(candidates(Contender.load("pca"), Costs(0.5, 200, 5), (), ()))
     levels = [change["lower_bound"] for change in changes if change["guarantee"] == "local"]
     assert levels == [0.96, 0.98, 0.99, 0.995, 0.9975, 0.9987]  # break-even is 99.75 %
     assert {change.get("audit_rate", 0.05) for change in changes} == {0.05}
     assert changes[-1] == {"guarantee": "cost", "prices": (0.5, 200, 5), "audit_rate": 0.05}
-    confirmed = list(candidates(Contender.load(RECIPE), costs, (), ()))
-    assert confirmed[-1]["audit_rate"] == 0.0
-    of_baseline = list(candidates(Contender.load("knn"), costs, (0.2, 0.05), (0.9,)))
-    assert [change["alpha"] for change in of_baseline] == [0.2, 0.05]
-
-
-def test_a_policy_that_the_recordings_cannot_support_is_named_with_what_it_needs(data) -> None:
-    search, n_good = PolicySearch(data, "pca", Costs(0.5, 200, 0.9)), int(data.y.sum())
-    needed = needed_parts(Policy(0.1, 0.9975))
-    note = f"alpha 0.1, LB 99.75 % needs {needed:,} good neighbours, {n_good} good parts are played"
-    assert note in search.out_of_reach
-    assert any("errors above two checks" in text for text in search.out_of_reach)
-    assert all(needed_parts(item.recipe.policy) <= n_good for item in search.remaining)
 
 
 @pytest.mark.parametrize(
@@ -214,9 +180,7 @@ def test_a_policy_that_the_recordings_cannot_support_is_named_with_what_it_needs
         ("data", np.ones(30), r"good and bad recordings, got .* good and"),
     ],
 )
-def test_what_decides_nothing_is_refused(
-    name: str, value: Any, text: str, make_data: Callable[..., Dataset]
-) -> None:
+def test_what_decides_nothing_is_refused(name, value, text, make_data):
     data, settings = make_data(30), PRICES | {"false_reject": 6}  # no guarantee by cost
     if name == "data":
         data = replace(data, y=value)
@@ -239,28 +203,30 @@ BOUNDS = (0.6, 0.7, 0.8, 0.85, 0.88, 0.9)
 
 
 def test_the_cheaper_half_plays_on_and_the_last_two_report_on_shuffles_that_chose_nothing(
-    data: Dataset,
-) -> None:
-    rounds = []
+    data,
+):
+    seeds = []
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
-        policies = {task.contender.recipe.policy for task in tasks}
-        rounds.append((len(policies), sorted({task.seed for task in tasks})))
+        seeds.append([task.seed for task in tasks])
         return cheaper_by_level(tasks)
 
     search = PolicySearch(data, "knn", COSTS, lower_bounds=BOUNDS, alphas=(0.2,), repeats=3, seed=7)
     search.run(play)
-    assert rounds == [(6, [7, 8]), (3, [9, 10]), (2, [11, 12, 13])]
+    assert [(len(item), {*item}) for item in seeds] == [
+        (12, {7, 8}),
+        (6, {9, 10}),
+        (6, {11, 12, 13}),
+    ]
     result = search.curve()
     assert [row.policy.lower_bound for row in result.rows] == [0.6, 0.7]
-    assert {row.policy.lower_bound for row in result.left_behind} == {0.8, 0.85, 0.88, 0.9}
+    assert len(result.left_behind) == 4
     assert (result.shuffles, result.fresh) == (3, True)
-    frame = result.to_frame()
-    assert (frame["reported"].sum(), frame["chosen"].sum()) == (2, 1)
+    assert result.to_frame()["reported"].sum() == 2
 
 
 @pytest.mark.parametrize("n_rounds", [1, 2])
-def test_a_search_that_is_interrupted_shows_what_was_finished(n_rounds: int, data: Dataset) -> None:
+def test_a_search_that_is_interrupted_shows_what_was_finished(n_rounds, data):
     rounds = []
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
@@ -283,8 +249,8 @@ def test_a_search_that_is_interrupted_shows_what_was_finished(n_rounds: int, dat
     ids=policy_name,
 )
 def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejected(
-    policy: Policy, make_data: Callable[..., Dataset]
-) -> None:
+    policy, make_data
+):
     data, recipe = make_data(110), Recipe("rocket", {"kernels": 6, "width": 8}, retrain_every=40)
     scores = replay(data, replace(recipe, policy=Policy(shadow=True)), 3)
     shared, whole = replay_policy(scores, policy), replay(data, replace(recipe, policy=policy), 3)
@@ -294,7 +260,7 @@ def test_a_policy_on_shared_scores_decides_like_a_replay_until_a_part_is_rejecte
     assert shared.recipe.policy == policy
 
 
-def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data) -> None:
+def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data):
     data, options = make_data(120), {"alphas": (0.5,), "lower_bounds": (0.8,)}
     result = cost_curve(data, recipe=RECIPE, cycles=90, repeats=2, **options, **PRICES)
     for row in result.rows:  # the first two shuffles chose
@@ -315,7 +281,7 @@ def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data
     ],
     ids=policy_name,
 )
-def test_the_lines_that_are_shown_set_the_policy(policy: Policy) -> None:
+def test_the_lines_that_are_shown_set_the_policy(policy):
     assert Policy(**settings_of(policy)) == policy
 
 
@@ -326,13 +292,13 @@ WORDS = shlex.split(
 
 
 @pytest.fixture
-def recordings(data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def recordings(data: Dataset, tmp_path: Path, monkeypatch) -> Path:
     np.savez(tmp_path / "mine.npz", X=data.X, y=data.y)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_the_verb_shows_a_table_and_writes_the_curve(recordings: Path) -> None:
+def test_the_verb_shows_a_table_and_writes_the_curve(recordings):
     shown = " ".join(succeed(*WORDS, "--out", "out").split())
     assert (recordings / "out" / "costs.png").stat().st_size > 10_000
     lines = (recordings / "out" / "costs.csv").read_text(encoding="utf-8").splitlines()
@@ -347,16 +313,7 @@ def test_the_verb_shows_a_table_and_writes_the_curve(recordings: Path) -> None:
     assert again["costs"]["escape"] == 21
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "text"),
-    [
-        ("--check", "0.5 EUR", "'0.5 EUR' is not a valid float"),
-        ("--alpha", "0.1", "but a list is tried here: use --alphas"),
-    ],
-)
-def test_the_verb_names_a_value_that_it_cannot_use(
-    option: str, value: str, text: str, recordings: Path
-) -> None:
-    result = dengine(*WORDS, option, value)
+def test_the_verb_names_an_option_that_takes_a_list(recordings):
+    result = dengine(*WORDS, "--alpha", "0.1")
     assert result.exit_code == 2
-    assert text in " ".join(result.output.split())
+    assert "use --alphas" in result.output

@@ -54,7 +54,7 @@ GOLDEN = {  # (hash, toss, fold of 2, fold of 5): a store, a controller and an e
 
 
 @pytest.mark.parametrize("name", GOLDEN)
-def test_the_hash_of_a_trace_never_changes(name: str) -> None:
+def test_the_hash_of_a_trace_never_changes(name):
     x = np.atleast_2d(golden_traces()[name])
     h = content_hash(x[None])
     assert (*h, *toss(h), *fold_of(h, 2), *fold_of(h, 5)) == GOLDEN[name]
@@ -62,13 +62,13 @@ def test_the_hash_of_a_trace_never_changes(name: str) -> None:
     assert gate(torch.from_numpy(x))[1] == h[0]  # compiled, as in an exported file
 
 
-def test_the_compiled_decider_tosses_as_numpy_does() -> None:
+def test_the_compiled_decider_tosses_as_numpy_does():
     decider = script(Decider(VerifyAll(Reason.NO_MODEL), DecisionConditions(TraceSpec(20))))
     hashes = content_hash(noise(200, 20))
     assert [decider.toss(int(h)) for h in hashes] == toss(hashes).tolist()
 
 
-def test_a_hash_depends_on_the_values_of_its_trace_alone() -> None:
+def test_a_hash_depends_on_the_values_of_its_trace_alone():
     X = np.round(noise(20)).astype(np.int16)
     hashes = content_hash(X)
     for same in (X.astype(np.float64), np.asfortranarray(X), X[:, None, :]):
@@ -76,39 +76,32 @@ def test_a_hash_depends_on_the_values_of_its_trace_alone() -> None:
     np.testing.assert_array_equal(content_hash(X[::-3]), hashes[::-3])
 
 
-def test_one_sample_more_or_less_or_moved_is_another_hash() -> None:
-    x = noise(1)[0]
-    shifted, changed = np.roll(x, 1), x.copy()
-    changed[20] += 0.01
-    hashes = {int(content_hash(v[None])[0]) for v in (x, shifted, changed, x[:-1])}
-    assert len(hashes) == 4
-
-
 @given(traces)
-def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x: np.ndarray) -> None:
+def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x):
     gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0]))
     assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
 
 
 @pytest.mark.parametrize("step", [2.0**-20, 1.0])  # of a sensor: low bits of a raw hash are zeros
 @pytest.mark.parametrize("folds", [2, 5])
-def test_folds_are_balanced(folds: int, step: float) -> None:
+def test_folds_are_balanced(folds, step):
     X = np.round(noise(10_000, 20) / step) * step
     sizes = np.bincount(content_fold(X, folds), minlength=folds)
     assert stats.chisquare(sizes).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("folds", [[0], [0, 2], [-1, 0], []])
-def test_given_folds_are_taken_if_each_trace_has_one_within_the_range(folds: list[int]) -> None:
-    traces = noise(2)[:, None]
-    assert folds_of(traces, 2, [1, 0]).tolist() == [1, 0]
-    assert folds_of(traces[:0], 2, []).tolist() == []
+def test_given_folds_are_taken():
+    assert folds_of(noise(2), 2, [1, 0]).tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("folds", [[0], [0, 2], [-1, 0]])
+def test_each_trace_needs_a_fold_within_the_range(folds):
     with pytest.raises(SettingError, match="2 folds from 0 to 1"):
-        folds_of(traces, 2, folds)
+        folds_of(noise(2), 2, folds)
 
 
 @pytest.mark.parametrize("rate", [0.02, 0.5])
-def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None:
+def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate):
     h = content_hash(noise(8_000, 20))
     coin, fold = audited(h, rate, seed=3), fold_of(h, 2)
     assert stats.binomtest(int(coin.sum()), len(h), rate).pvalue > 1e-4
@@ -116,7 +109,7 @@ def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None
     assert stats.chi2_contingency(table).pvalue > 1e-4
 
 
-def test_engines_of_different_seeds_audit_different_traces() -> None:
+def test_engines_of_different_seeds_audit_different_traces():
     h = content_hash(noise(8_000, 20))
     first, other = audited(h, 0.5, seed=1), audited(h, 0.5, seed=2)
     assert stats.binomtest(int((first == other).sum()), len(h), 0.5).pvalue > 1e-4

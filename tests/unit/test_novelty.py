@@ -47,45 +47,37 @@ def proof(name: str) -> Callable[[Traces, np.random.Generator], Traces]:
     return lambda x, rng: KINDS[name](x[:, 0], x[:, 0], rng)[:, None].astype(np.float32)
 
 
-def gap(x: Traces, rng: np.random.Generator) -> Traces:
-    with_gap = x.copy()
-    with_gap[..., 600:620] = x[..., 600:601]
-    return with_gap
-
-
 noise, hum = proof("white noise"), proof("hum on good parts")
 GARBAGE: dict[str, Callable[[Traces, np.random.Generator], Traces]] = {
     "noise": noise,
     "sine": proof("sine"),
     "hum": hum,
     "spike": spike,
-    "gap": gap,
     "offset": lambda x, _: x + np.float32(SD),
     "drift": lambda x, _: x - np.linspace(0, SD, x.shape[2], dtype=np.float32),
     "silent": lambda x, _: np.zeros_like(x),
     "stuck": lambda x, _: np.full_like(x, MEAN),
-    "reversed": lambda x, _: x[..., ::-1],
 }
 
 
 @pytest.mark.parametrize("kind", GARBAGE)
-def test_garbage_is_novel(gate: NoveltyGate, kind: str) -> None:
+def test_garbage_is_novel(gate, kind):
     # Of the reversed traces those that never touched anything are what they were: one in twenty.
     assert share(gate, GARBAGE[kind](HELD_OUT[:100], np.random.default_rng(1))) >= 0.94
 
 
-def test_clean_traces_are_hardly_ever_novel(gate: NoveltyGate) -> None:
+def test_clean_traces_are_hardly_ever_novel(gate):
     assert share(gate, HELD_OUT) <= 0.02
 
 
 @pytest.mark.parametrize("n", [50, 200])
-def test_few_references_do_not_make_clean_traces_novel(n: int) -> None:
+def test_few_references_do_not_make_clean_traces_novel(n):
     gates = [fit_novelty(TRACES[i : i + n], 1.5) for i in range(0, 500, 100)]
     assert np.mean([share(gate, HELD_OUT[:200]) for gate in gates]) <= 0.015
 
 
 @pytest.mark.parametrize("kind", ["noise", "sine", "silent"])
-def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are(kind: str) -> None:
+def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are(kind):
     rng = np.random.default_rng(1)
     examples = GARBAGE[kind](HELD_OUT[:100], rng)
     gate = fit_novelty(np.concatenate([KNOWN, examples[:50]]), 1.5)
@@ -95,9 +87,7 @@ def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are(kind: str) -
 
 
 @pytest.mark.parametrize("size", [1e6, 3e38, -3e38])
-def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(
-    gate: NoveltyGate, size: float
-) -> None:
+def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(gate, size):
     spiked = torch.from_numpy(HELD_OUT[0].copy())
     spiked[0, 500] = size
     for trace in (spiked, torch.full_like(spiked, size)):
@@ -106,7 +96,7 @@ def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(
 
 
 @pytest.mark.parametrize("size", [1e6, 3e38])
-def test_a_glitch_among_the_references_blinds_to_nothing_else(size: float) -> None:
+def test_a_glitch_among_the_references_blinds_to_nothing_else(size):
     traces = KNOWN.copy()
     traces[100], traces[200, 0, 500] = size, -size
     gate = fit_novelty(traces, 1.5)
@@ -114,25 +104,17 @@ def test_a_glitch_among_the_references_blinds_to_nothing_else(size: float) -> No
     assert share(gate, hum(HELD_OUT[:50], np.random.default_rng(1))) == 1.0
 
 
-def test_a_few_strangers_among_the_references_do_not_blind_to_others() -> None:
-    strangers = spike(KNOWN[:8], np.random.default_rng(0))
-    gate = fit_novelty(np.concatenate([KNOWN[8:408], strangers]), 1.5)
-    assert share(gate, noise(HELD_OUT[:50], np.random.default_rng(1))) >= 0.95
+@pytest.mark.parametrize("value", [0.0, MEAN])
+def test_a_channel_that_dies_is_novel(value):
+    noise = 2 * np.random.default_rng(3).normal(size=(350, 1, 1000))
+    traces = np.concatenate([TRACES[:350], noise], axis=1).astype(np.float32)
+    gate, held_out = fit_novelty(traces[:300], 1.5), traces[300:]
+    assert share(gate, held_out) <= 0.04
+    held_out[:, 0] = value
+    assert share(gate, held_out) == 1.0
 
 
-@pytest.mark.parametrize("channel", [0, 1])
-def test_a_channel_that_dies_is_novel(channel: int) -> None:
-    rng = np.random.default_rng(3)
-    traces = np.concatenate([TRACES[:350], 2 * rng.normal(size=(350, 1, 1000))], 1)
-    gate = fit_novelty(traces[:300].astype(np.float32), 1.5)
-    assert share(gate, traces[300:]) <= 0.04
-    for value in (0.0, traces[:, channel].mean()):
-        dead = traces[300:].copy()
-        dead[:, channel] = value
-        assert share(gate, dead) == 1.0
-
-
-def test_compiled_and_eager_agree_to_the_bit(gate: NoveltyGate) -> None:
+def test_compiled_and_eager_agree_to_the_bit(gate):
     compiled = script(gate)
     traces = [HELD_OUT[:50], hum(HELD_OUT[:50], np.random.default_rng(0))]
     for x in torch.from_numpy(np.concatenate(traces)):
@@ -140,10 +122,9 @@ def test_compiled_and_eager_agree_to_the_bit(gate: NoveltyGate) -> None:
         assert compiled(x) == gate(x) == bool((gate.scores(x) > 1).any())
 
 
-@pytest.mark.parametrize("n", [10, 1100])
 @pytest.mark.parametrize("shape", [(1, 1), (1, 2), (2, 399), (50, 20)])
-def test_shapes_depend_on_channels_and_samples_alone(shape: tuple[int, int], n: int) -> None:
-    gate = fit_novelty(np.random.default_rng(n).normal(size=(n, *shape)).astype(np.float32), 1.5)
-    fresh = NoveltyGate(*shape).state_dict()
-    assert [t.shape for t in gate.state_dict().values()] == [t.shape for t in fresh.values()]
-    assert gate.scores(torch.zeros(shape)).shape == (4,)
+def test_shapes_depend_on_channels_and_samples_alone(shape):
+    traces = np.random.default_rng(0).normal(size=(1100, *shape)).astype(np.float32)
+    gates = [NoveltyGate(*shape), fit_novelty(traces[:10], 1.5), fit_novelty(traces, 1.5)]
+    shapes = [[tensor.shape for tensor in gate.state_dict().values()] for gate in gates]
+    assert shapes[0] == shapes[1] == shapes[2]

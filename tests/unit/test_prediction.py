@@ -2,8 +2,6 @@
 carry it unchanged.
 """
 
-from itertools import product
-
 import numpy as np
 import pytest
 import torch
@@ -14,7 +12,6 @@ from sklearn.neighbors import NeighborhoodComponentsAnalysis
 
 from dengine import (
     DataEngine,
-    Dataset,
     ModelPrediction,
     Policy,
     Reason,
@@ -26,25 +23,23 @@ from dengine.decision.decider import DecisionConditions, trace_gate
 from dengine.folds import content_fold, content_hash
 from dengine.records import ACTIONS, REASONS
 from dengine.reducers.base import space_scale
-from tests.support.driving import learn
 
 CLASSIFIER = WilsonRadiusClassifier(radius=0.5, alpha=0.1, lower_bound=0.9)
 
 
-def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_data) -> None:
+@pytest.mark.parametrize("part", [0, 7])
+def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(part, make_data):
     data = make_data(120, samples=40)
     model = ModelPrediction("rocket", WilsonRadiusClassifier(radius=0.05), 5).fit(data.X, data.y)
     conditions = DecisionConditions(TraceSpec(40))
-    queries = [*data.X[110:], *make_data(10, samples=40, seed=9).X, np.ones(40, np.float32)]
-    for x, part in product((query[None] for query in queries), (0, 7)):
+    for x in (*data.X[110:, None], *make_data(10, samples=40, seed=9).X[:, None]):
         decided = model.decide_one(x, part, conditions)
         fault, content, action, predicted, reason, *evidence, z, propensity = decided
         assert (fault, content) == trace_gate(*x.shape)(torch.from_numpy(x))
         assert (action, propensity) == (predicted, 0.0 if action else 1.0)
-        if not fault:  # without a vote on itself
-            points = tuple(map(tuple, z.tolist()))
-            expected = (ACTIONS[action], *evidence, points, REASONS[reason])
-            assert model.predict_one(x, part or content) == expected
+        points = tuple(map(tuple, z.tolist()))
+        expected = (ACTIONS[action], *evidence, points, REASONS[reason])
+        assert model.predict_one(x, part or content) == expected  # without a vote on itself
 
 
 @pytest.mark.parametrize("folds", [2, 3])
@@ -57,8 +52,8 @@ def test_the_decider_says_what_gate_and_prediction_say_one_after_the_other(make_
     ids=["lda", "nca"],
 )
 def test_labels_of_fold_k_move_neither_its_references_nor_any_query_in_space_k(
-    reducer, folds: int, make_data
-) -> None:
+    reducer, folds, make_data
+):
     data = make_data(120, samples=40)
     queries = make_data(15, samples=40, seed=9).X[:, None, :]
     fold = content_fold(data.X, folds)
@@ -76,7 +71,7 @@ def test_labels_of_fold_k_move_neither_its_references_nor_any_query_in_space_k(
         assert not np.array_equal(second, first)  # the other spaces did see them
 
 
-def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) -> None:
+def test_a_label_added_later_is_counted_in_its_own_folds_space(data):
     model = ModelPrediction(LinearDiscriminantAnalysis(), CLASSIFIER, 2)
     model.fit(data.X[:150], data.y[:150])
     for x, y in zip(data.X[150:], data.y[150:], strict=True):
@@ -89,16 +84,13 @@ def test_a_label_added_later_is_counted_in_its_own_folds_space(data: Dataset) ->
     np.testing.assert_allclose(ring.points[:, 150:200].numpy().T, places, atol=1e-5)
 
 
-def test_a_trace_of_another_shape_is_refused_even_where_the_encoder_would_take_it(
-    data: Dataset,
-) -> None:
+def test_a_trace_of_another_shape_is_refused_even_where_the_encoder_would_take_it(data):
     model = ModelPrediction("rocket", novelty=0).fit(data.X, data.y)
-    longer = np.pad(data.X, ((0, 0), (0, 100)), mode="edge")
+    longer = np.pad(data.X, ((0, 0), (0, 100)))
     with pytest.raises(TraceError, match="samples"):
         model.add(longer[0], 1)
     with pytest.raises(TraceError, match="samples"):
         model.count(longer)
-    assert len(model.index) == len(data.X)
 
 
 class _Nosy(TransformerMixin, BaseEstimator):
@@ -113,14 +105,14 @@ class _Nosy(TransformerMixin, BaseEstimator):
         return np.asarray(X)[:, :2]
 
 
-def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data: Dataset) -> None:
+def test_a_reducer_that_does_not_say_it_uses_labels_is_never_handed_any(data):
     model = ModelPrediction(_Nosy(), CLASSIFIER).fit(data.X, data.y)
     assert model.n_spaces == 1
     assert model.spaces.reducer_.n_ == 200
 
 
 @pytest.mark.parametrize("reducer", ["pca", LinearDiscriminantAnalysis()], ids=["pca", "lda"])
-def test_the_unit_of_the_traces_does_not_matter(reducer, data: Dataset) -> None:
+def test_the_unit_of_the_traces_does_not_matter(reducer, data):
     X, y, queries, hashes = data.X[:150], data.y[:150], data.X[150:], content_hash(data.X[:150])
     newtons = ModelPrediction(reducer, CLASSIFIER).fit(X, y, hashes=hashes)
     smaller = ModelPrediction(reducer, CLASSIFIER).fit(
@@ -130,7 +122,7 @@ def test_the_unit_of_the_traces_does_not_matter(reducer, data: Dataset) -> None:
     np.testing.assert_array_equal(smaller.count(1024 * queries), newtons.count(queries))
 
 
-def test_a_successor_learns_without_disturbing_its_parent(data: Dataset) -> None:
+def test_a_successor_learns_without_disturbing_its_parent(data):
     parent = ModelPrediction("pca", CLASSIFIER).fit(data.X[:100], data.y[:100])
     before = parent.predict_many(data.X[100:])
     child = parent.successor().fit(data.X[50:], 1 - data.y[50:])
@@ -141,11 +133,12 @@ def test_a_successor_learns_without_disturbing_its_parent(data: Dataset) -> None
 
 def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_are_few(
     make_data,
-) -> None:
+):
     """A prior worth three labels: the logit of the members' mean is multiplied by n / (n + 3)."""
     data, policy = make_data(90, samples=40), Policy(guarantee="cost", stops="all")
     engine = DataEngine("rocket", policy=policy, replaying=True)
-    learn(engine, data, range(80))
+    for x, y in zip(data.X[:80], data.y, strict=False):
+        engine.report(engine.decide(x).id, bool(y))
     n_compared = 0
     for n in range(80, 90):
         decision = engine.decide(data.X[n])
@@ -158,7 +151,7 @@ def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_ar
     assert n_compared > 3
 
 
-def test_the_scale_of_copies_of_one_trace_is_1_whatever_their_mean_rounds_to() -> None:
+def test_the_scale_of_copies_of_one_trace_is_1_whatever_their_mean_rounds_to():
     values = np.random.default_rng(0).uniform(-50.0, 50.0, (200, 2)).astype(np.float32)
     for point in values:
         points = np.stack([point, point, point, point + np.float32(1e4)])  # the last is an outlier

@@ -1,7 +1,5 @@
-import threading
 from functools import partial
 from itertools import count
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +8,9 @@ from scipy.special import expit
 from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
 
-from dengine import DataEngine, Dataset, Recipe, RocketReducer
-from dengine.datasets.importing import import_labelled
+from dengine import RocketReducer
 from dengine.errors import SettingError, StoreError
 from dengine.folds import content_fold
-from dengine.model.base import N_EXAMPLES
 from dengine.reducers.base import StopRule
 from dengine.reducers.logistic_heads import fit_heads, masked_loss
 from dengine.reducers.preprocessing import averaging
@@ -24,7 +20,6 @@ from dengine.reducers.rocket import (
     N_SHARES,
     pairwise_products,
 )
-from dengine.reducers.rocket_features import RocketEncoder
 
 
 def traces(n=160):
@@ -61,11 +56,10 @@ def test_space_k_is_the_same_bit_for_bit_whatever_the_labels_of_fold_k_also_over
 def test_a_warm_start_ends_where_a_cold_start_does():
     X, y = traces(300)
     cold = RocketReducer().fit(X, y)
-    warm = train(train(clone(cold).set_state(cold.get_state()), X[:100], y[:100]), X, y)
-    for first, other in zip(warm.towers_, cold.towers_, strict=True):
-        assert (first.w - other.w).abs().max() < 5e-3
+    warm = train(clone(cold).set_state(cold.get_state()), X[:100], y[:100])
+    first, other = cold.embed(X), train(warm, X, y).embed(X)
     # A share is a tenth, and two of them may say labels equally well.
-    assert np.abs(warm.embed(X)[:, :, 0] - cold.embed(X)[:, :, 0]).max() < 0.1
+    np.testing.assert_allclose(first[:, :, 0], other[:, :, 0], atol=0.1)
 
 
 def test_no_step_begins_after_the_deadline():
@@ -150,22 +144,10 @@ def test_heads_end_where_scikit_learns_logistic_regression_does():
         np.testing.assert_allclose(w[k, :-1], theirs.coef_[0], atol=2e-3)
 
 
-@pytest.mark.parametrize(("n", "expected"), [(80, False), (100, True)])
-def test_the_components_are_found_anew_where_the_traces_grew_by_half_and_the_second_axis_keeps_its_direction(
-    n, expected
-):
-    X, y = traces()
-    reducer = train(RocketReducer(), X[:60], y[:60])
-    axes, second = reducer.towers_[0].axes, reducer.embed(X)[:, 0, 1]
-    train(reducer, X[:n], y[:n])
-    assert (reducer.towers_[0].axes is not axes) == expected
-    assert np.corrcoef(second, reducer.embed(X)[:, 0, 1])[0, 1] > 0.5
-
-
 @pytest.mark.parametrize("kind", [partial(RocketReducer, groups=0), RocketReducer])
 def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_tower(
-    kind: Any,
-) -> None:
+    kind,
+):
     X, y = traces(100)
     reducer = kind(folds=3).fit(X, y)
     towers, encoder, logits = reducer.towers_, reducer.net_.encoder, []
@@ -184,74 +166,23 @@ def test_what_answers_is_the_components_then_the_heads_then_the_share_of_each_to
         assert np.abs(expit(mixed) - answers).max(1).min() < 1e-5
 
 
-def test_features_of_a_trace_are_computed_once_until_it_leaves_the_window(monkeypatch) -> None:
-    X, y = traces(90)
-    reducer, folds, computed, raw = (
-        RocketReducer(),
-        content_fold(X, 5),
-        [],
-        RocketEncoder.raw_features,
-    )
-
-    def counted(self, x):
-        computed.append(len(x))
-        return raw(self, x)
-
-    monkeypatch.setattr(RocketEncoder, "raw_features", counted)
-    for rows in (slice(0, 60), slice(30, 90), slice(30, 90)):
-        reducer.train(X[rows], y[rows], folds[rows], numbers=np.arange(1, 91)[rows])
-    assert sum(computed) == 96  # 64, 32 and none: whole chunks
-
-
-def test_features_of_many_traces_are_those_of_each_to_the_bit() -> None:
+def test_features_of_many_traces_are_those_of_each_to_the_bit():
     X, y = traces(100)
     features = RocketReducer(folds=2).fit(X, y).raw_features
     pieces = [features(piece) for piece in np.array_split(X, 15)]
     assert torch.equal(features(X), torch.cat(pieces))
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_windows_times_kernels_are_torchs_dilated_convolutions_at_the_places(channels: int) -> None:
-    encoder = RocketEncoder(channels, 60, 1, 4, 3, 3, 0)  # 4 kernels, 3 dilations
-    a = torch.randn(5, channels, 60, generator=torch.Generator().manual_seed(0))
-    encoder.learn_filters(a, np.random.default_rng(0))
-    result = torch.bmm(encoder.kernel, encoder.as_windows(encoder.read_taps(a), 3))
-    middle = encoder.taps.view(3, 9, -1)[:, 4]
-    for d, spread in enumerate((1, 2, 7)):  # 2 ** 0, and up to the length over 8
-        weight = encoder.kernel[d].reshape(4, channels, 9)
-        whole = torch.conv1d(a, weight, padding=4 * spread, dilation=spread)  # (5, 4, 60)
-        expected = whole[:, :, middle[d]].permute(1, 2, 0)
-        torch.testing.assert_close(result[d].view(expected.shape), expected)
-
-
 @pytest.mark.parametrize(("period", "expected"), [(1000 / 3, 5), (1 / 0.3, 1)])
 def test_traces_are_averaged_to_two_hundred_samples_but_not_where_that_loses_an_oscillation(
-    period: float, expected: int
-) -> None:
+    period, expected
+):
     phase = np.random.default_rng(0).random((20, 1, 1))
     X = np.sin(2 * np.pi * (np.arange(1000) / period + phase)).astype(np.float32)
     assert averaging(torch.from_numpy(X)) == expected
 
 
-def test_an_opened_engine_has_the_features_that_its_next_retrain_needs(
-    tmp_path, monkeypatch
-) -> None:
-    url, (X, y) = str(tmp_path / "cell.sqlite"), traces(520)
-    import_labelled(url, Dataset(X[:, 0], y), Recipe("rocket", {"kernels": 6, "width": 8}))
-    where, raw = set(), RocketEncoder.raw_features
-
-    def told(self, x):
-        if len(x) > N_EXAMPLES:  # so many are embedded to check a version
-            where.add(threading.current_thread().name)
-        return raw(self, x)
-
-    monkeypatch.setattr(RocketEncoder, "raw_features", told)
-    with DataEngine.open(url, replaying=True) as engine:
-        assert engine.retrain().accepted
-    assert where == {"dengine-precompute_0"}  # neither in the opening nor in the retrain
-
-
-def test_a_model_of_other_sizes_is_refused_in_a_sentence_that_says_how_to_go_on() -> None:
+def test_a_model_of_other_sizes_is_refused_in_a_sentence_that_says_how_to_go_on():
     state = RocketReducer(groups=0).fit(*traces()).get_state()
     with pytest.raises(StoreError, match="other sizes; its labels are whole"):
         RocketReducer().set_state(state)

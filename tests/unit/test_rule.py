@@ -6,7 +6,6 @@ import linecache
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +38,7 @@ ACTIONS = tuple(Action)
 @given(n_success=counts, n_failure=counts, alpha=alphas, lower_bound=bounds)
 def test_the_scalar_rule_is_the_interval_and_the_policy(
     interval, n_success, n_failure, alpha, lower_bound
-) -> None:
+):
     policy = Policy(alpha, lower_bound, interval)
     action, lower, upper = policy.rule()(n_success, n_failure)
     assert (lower, upper) == pytest.approx(
@@ -91,17 +90,17 @@ class SpokenRule(DecisionRule):
 class FailingRule(SpokenRule):
     """Cannot be told anything."""
 
-    def update(self, *outcome: Any) -> None:
+    def update(self, *outcome) -> None:
         raise RuntimeError("update failed")
 
 
 @pytest.fixture
-def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def outside(tmp_path: Path, monkeypatch) -> None:
     """The module `fuse` of an outside author, by which a recipe names his rule."""
     source = Path(__file__).read_text(encoding="utf-8")
     rules = source[source.index("class FuseRule") : source.index("@pytest.fixture")]
     head = "import torch\nfrom dengine.decision.rule import DecisionRule, action_of\n\n\n"
-    (tmp_path / "fuse.py").write_text(head + rules.replace(": Any", ""), encoding="utf-8")
+    (tmp_path / "fuse.py").write_text(head + rules, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "fuse", raising=False)
 
@@ -115,9 +114,7 @@ def good(data: Dataset) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("outside")
-def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(
-    data, tmp_path: Path
-) -> None:
+def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(data, tmp_path):
     recipe = Recipe.from_toml(recipe_with("fuse:FuseRule").to_toml())
     url = str(tmp_path / "engine.db")
     with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
@@ -138,7 +135,7 @@ def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(
 
 
 @pytest.mark.usefixtures("outside")
-def test_a_rule_that_does_not_compile_decides_and_is_not_exported(data, tmp_path: Path) -> None:
+def test_a_rule_that_does_not_compile_decides_and_is_not_exported(data, tmp_path):
     with DataEngine(recipe=recipe_with("fuse:SpokenRule"), replaying=True) as engine:
         actions = [cycle.decision.action for cycle in drive(engine, data)]
         assert actions.count(Action.ACCEPT) > 50
@@ -147,9 +144,7 @@ def test_a_rule_that_does_not_compile_decides_and_is_not_exported(data, tmp_path
 
 
 @pytest.mark.usefixtures("outside")
-def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(
-    data, tmp_path: Path
-) -> None:
+def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(data, tmp_path):
     url = str(tmp_path / "engine.db")
     with DataEngine(recipe=recipe_with("fuse:FailingRule"), store=url, replaying=True) as engine:
         decisions = [cycle.decision for cycle in drive(engine, data, last=100)]
@@ -168,7 +163,7 @@ def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(
         ("dengine.recipe:Recipe", "subclass"),
     ],
 )
-def test_a_rule_that_cannot_be_had_is_named(name: str, message: str) -> None:
+def test_a_rule_that_cannot_be_had_is_named(name, message):
     with pytest.raises(SettingError, match=message):
         DataEngine(recipe=recipe_with("local").with_policy(guarantee=name))
 
@@ -183,7 +178,7 @@ class MyRule(DecisionRule):
 """
 
 
-def notebook_rule(number: int, action: int, monkeypatch: pytest.MonkeyPatch) -> type[DecisionRule]:
+def notebook_rule(number: int, action: int, monkeypatch) -> type[DecisionRule]:
     """The class that a notebook cell of this number defines."""
     cell, name = RULE.format(action=action), f"<cell {number}>"
     lines = cell.splitlines(keepends=True)
@@ -194,8 +189,8 @@ def notebook_rule(number: int, action: int, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_notebook_cell_that_is_run_again_defines_a_rule_that_is_asked_for_itself(
-    data: Dataset, monkeypatch
-) -> None:
+    data, monkeypatch
+):
     for number, action in enumerate((1, 2, 0)):
         rule = notebook_rule(number, action, monkeypatch)(0.2, 0.8)
         model = ModelPrediction("pca", rule=rule, novelty=0.0).fit(data.X, np.ones(len(data)))

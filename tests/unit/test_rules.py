@@ -33,12 +33,15 @@ SHARES_BAD = np.array([0.1, 0.3, 0.7, 0.9])  # of the replays
 
 def random_parts(rng: np.random.Generator, levels: list[float]) -> dict[str, Any]:
     """Parts of all replays at one moment: bounds, often on a level, and how they come to be known."""
-    share, anywhere, tied, wide = rng.random((4, N_REPLAYS))
-    bad, good = rng.uniform(0.0, 0.03, N_REPLAYS), rng.uniform(0.85, 1.0, N_REPLAYS)
-    lower = np.where(share < SHARES_BAD, bad, good)
-    lower = np.where(anywhere < 0.1, rng.random(N_REPLAYS), lower)
-    lower = np.where(tied < 0.2, rng.choice(levels, N_REPLAYS), lower)
-    gap = np.where(wide < 0.5, 0.0, 0.3 * rng.random(N_REPLAYS))
+    lower = np.where(
+        rng.random(N_REPLAYS) < SHARES_BAD,
+        rng.uniform(0.0, 0.03, N_REPLAYS),
+        rng.uniform(0.85, 1.0, N_REPLAYS),
+    )
+    lower = np.where(rng.random(N_REPLAYS) < 0.1, rng.random(N_REPLAYS), lower)
+    tied = rng.random(N_REPLAYS) < 0.2
+    lower = np.where(tied, rng.choice(levels, N_REPLAYS), lower)
+    gap = np.where(rng.random(N_REPLAYS) < 0.5, 0.0, 0.3 * rng.random(N_REPLAYS))
     return {"lower": lower, "upper": np.minimum(1.0, lower + gap)}
 
 
@@ -73,7 +76,7 @@ def second_state(rules: Rules, i: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_rule_takes_the_steps_of_a_second_implementation(name: str) -> None:
+def test_the_rule_takes_the_steps_of_a_second_implementation(name):
     policy = Policy(**{"alpha": 0.1, "lower_bound": 0.9} | CASES[name])
     products = [policy.rule() for _ in range(N_REPLAYS)]
     q = policy.inclusion_probability
@@ -111,21 +114,21 @@ def test_the_rule_takes_the_steps_of_a_second_implementation(name: str) -> None:
 
 
 @pytest.mark.parametrize("q", [1.0, 0.1])
-def test_the_second_certificate_is_that_of_the_package(q: float) -> None:
+def test_the_second_certificate_is_that_of_the_package(q):
     rng = np.random.default_rng(3)
     n = rng.integers(1, 3000, 200)
     columns = n, rng.binomial(n, 0.05), rng.uniform(0.001, 0.999, 200)
-    expected = [log_evidence(*map(np.ndarray.item, row), q) for row in zip(*columns, strict=True)]
+    expected = [log_evidence(*row, q) for row in zip(*map(np.ndarray.tolist, columns), strict=True)]
     np.testing.assert_allclose(log_certificate(*columns, q), expected, atol=1e-8)
 
 
 @pytest.mark.parametrize("share", [0.2, 0.1, 0.05, 5 / 120])
-def test_the_second_detector_is_that_of_the_package(share: float) -> None:
+def test_the_second_detector_is_that_of_the_package(share):
     assert design_cusum(share, 1000.0) == cusum(share, 1000.0)
 
 
 @pytest.mark.parametrize("case", FAULTS, ids=lambda case: case.fault)
-def test_a_planted_fault_is_found_and_without_it_the_promise_is_kept(case: Case) -> None:
+def test_a_planted_fault_is_found_and_without_it_the_promise_is_kept(case):
     n = 400
     faulty = play(case, n, seed=1)["broke"]
     stream = "constant" if case.fault == "peeks" else case.stream
@@ -134,7 +137,7 @@ def test_a_planted_fault_is_found_and_without_it_the_promise_is_kept(case: Case)
     assert stats.binomtest(int(honest), n, ALPHA, alternative="greater").pvalue > 1e-3
 
 
-def test_by_costs_no_replay_of_an_adversary_is_ever_more_than_one_false_accept_behind() -> None:
+def test_by_costs_no_replay_of_an_adversary_is_ever_more_than_one_false_accept_behind():
     row = play(Case("cost", "adversary"), 200, seed=2)
     assert row["accepted"] > 0
     assert row["broke"] == row["over_account"] == 0

@@ -24,9 +24,7 @@ def seqs_of(labelled: LabelledTraces) -> list[int]:
 
 @settings(deadline=None)
 @given(capacity=st.integers(1, 200), steps=st.lists(st.integers(0, 90), max_size=6))
-def test_every_snapshot_is_of_the_newest_then_and_never_changes(
-    capacity: int, steps: list[int]
-) -> None:
+def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity, steps):
     window, handed_out, last = TrainingWindow(capacity), [], 0
     for n in steps:
         if n % 7 == 1:
@@ -38,7 +36,7 @@ def test_every_snapshot_is_of_the_newest_then_and_never_changes(
         assert seqs_of(snapshot) == expected
 
 
-def test_what_is_newer_than_a_label_is_found_with_its_trace() -> None:
+def test_what_is_newer_than_a_label_is_found_with_its_trace():
     window = TrainingWindow(4)
     add(window, 2, 3, 5, 8, 9)
     assert (window.newer(5), window.newer(9)) == ([8, 9], [])
