@@ -15,9 +15,7 @@ def test_what_is_no_id_is_refused(name, stream):
         engine.decide(stream.X[0], decision_id=name)
 
 
-def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(
-    stream,
-):
+def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(stream):
     with DataEngine(recipe=RECIPE) as engine:
         first = engine.decide(stream.X[0], part="P1", decision_id="order-7")
         assert (first.id, first.action) == ("order-7", Action.VERIFY)

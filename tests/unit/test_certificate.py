@@ -134,6 +134,7 @@ def test_the_tolerance_is_kept_where_the_bound_is_below_it():
     kept = certificate("all", accepted=1203, false_accepts=24)
     assert kept.accepted.upper == pytest.approx(0.0349, abs=5e-5)  # golden
     assert kept.kept
+    assert kept.saved is None  # without prices
     assert not certificate("all", accepted=1203, false_accepts=60).kept
     audited = certificate("some", 0.1, accepted=9000, audited_accepts=1000, audited_accepts_bad=20)
     assert "Of 10,000 parts that the model would accept, of which 1,000" in audited.sentence

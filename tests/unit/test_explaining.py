@@ -165,12 +165,9 @@ def test_the_envelope_counts_the_samples_that_leave_it_and_needs_twenty_successe
 def test_a_decision_is_explained_by_the_policy_that_was_in_force_when_it_was_made(
     make_data, tmp_path
 ):
-    data, store = (
-        make_data(120, samples=60),
-        SqlStore(str(tmp_path / "e.db"), clock=count(1).__next__),
-    )
+    store = SqlStore(str(tmp_path / "e.db"), clock=count(1).__next__)
     changes = [{"lower_bound": 0.95}, {"shadow": True}, {"alpha": 0.3}]
-    with played(store, data, RECIPES["local"]) as engine:
+    with played(store, make_data(120, samples=60), RECIPES["local"]) as engine:
         (past,) = engine.history(last=1, action="accept")
         trace = engine.find(past.decision.id).trace
         policies, ids = [engine.policy], [past.decision.id]

@@ -62,12 +62,6 @@ def test_the_hash_of_a_trace_never_changes(name):
     assert gate(torch.from_numpy(x))[1] == h[0]  # compiled, as in an exported file
 
 
-def test_the_compiled_decider_tosses_as_numpy_does():
-    decider = script(Decider(VerifyAll(Reason.NO_MODEL), DecisionConditions(TraceSpec(20))))
-    hashes = content_hash(noise(200, 20))
-    assert [decider.toss(int(h)) for h in hashes] == toss(hashes).tolist()
-
-
 def test_a_hash_depends_on_the_values_of_its_trace_alone():
     X = np.round(noise(20)).astype(np.int16)
     hashes = content_hash(X)

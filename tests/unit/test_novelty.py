@@ -86,15 +86,6 @@ def test_a_learned_kind_is_no_longer_novel_and_the_others_still_are(kind):
     assert np.mean([share(gate, make(HELD_OUT[100:150], rng)) for make in others]) >= 0.75
 
 
-@pytest.mark.parametrize("size", [1e6, 3e38, -3e38])
-def test_huge_values_are_novel_to_a_gate_that_learned_and_to_no_other(gate, size):
-    spiked = torch.from_numpy(HELD_OUT[0].copy())
-    spiked[0, 500] = size
-    for trace in (spiked, torch.full_like(spiked, size)):
-        assert gate(trace)
-        assert not NoveltyGate(1, 1000)(trace)
-
-
 @pytest.mark.parametrize("size", [1e6, 3e38])
 def test_a_glitch_among_the_references_blinds_to_nothing_else(size):
     traces = KNOWN.copy()

@@ -131,9 +131,7 @@ def test_a_successor_learns_without_disturbing_its_parent(data):
     assert child.predict_many(data.X[100:]) != before
 
 
-def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_are_few(
-    make_data,
-):
+def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_are_few(make_data):
     """A prior worth three labels: the logit of the members' mean is multiplied by n / (n + 3)."""
     data, policy = make_data(90, samples=40), Policy(guarantee="cost", stops="all")
     engine = DataEngine("rocket", policy=policy, replaying=True)
@@ -149,6 +147,13 @@ def test_the_cost_guarantee_draws_probabilities_towards_one_half_while_labels_ar
             n_compared += 1
         engine.report(decision.id, True)
     assert n_compared > 3
+
+
+def test_a_glitch_among_the_references_spoils_no_training(data):
+    X = data.X.copy()
+    X[0, 5] = 1e30
+    model = ModelPrediction("pca", CLASSIFIER).fit(X, data.y)
+    assert model.predict_interval(data.X)[0].max() > 0.8
 
 
 def test_the_scale_of_copies_of_one_trace_is_1_whatever_their_mean_rounds_to():

@@ -8,7 +8,7 @@ import pytest
 from dengine import DataEngine, Dataset, Outcome, Recipe, Replay, ReplayCell, replay
 from dengine.errors import SettingError
 from dengine.experiments.replay import watch
-from tests.support.driving import RECIPE
+from tests.support.driving import RECIPE, drive
 from tests.support.replays import same
 
 KNOWN = RECIPE.with_policy(guarantee="pooled", stops="all")
@@ -38,6 +38,14 @@ def test_a_budget_of_wall_time_changes_nothing_in_a_replay(data, played):
     same(replay(data, replace(RECIPE, budget=1e-9), seed=1), played, "recipe")
 
 
+def test_a_frame_of_a_history_has_times_with_a_zone(data):
+    engine = DataEngine("pca")
+    drive(engine, data, last=5)
+    frame = engine.history_frame()
+    assert len(frame) == 5
+    assert frame["time"].dt.tz is not None
+
+
 def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data, played):
     seen: list[int] = []
     short = replay(data, RECIPE, seed=1, cycles=90, on_cycle=seen.append)
@@ -47,9 +55,7 @@ def test_fewer_cycles_are_the_beginning_of_the_same_pass_told_one_by_one(data, p
         replay(data, RECIPE, cycles=201)
 
 
-def test_a_replays_repr_shows_its_policy_whose_two_numbers_may_be_given_directly(
-    data,
-):
+def test_a_replays_repr_shows_its_policy_whose_two_numbers_may_be_given_directly(data):
     run = replay(data, "pca", cycles=30, alpha=0.3, lower_bound=0.7)
     assert run.recipe == Recipe.load("pca").with_policy(alpha=0.3, lower_bound=0.7)
     assert "alpha 0.3, LB 70 %" in repr(run)
@@ -102,9 +108,7 @@ def test_a_replay_as_a_frame_has_a_row_a_cycle_that_adds_up_to_its_summary(playe
     np.testing.assert_array_equal(frame[["embedding_1", "embedding_2"]], played.position)
 
 
-def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(
-    data,
-):
+def test_a_window_decides_in_the_models_place_where_it_is_left_and_nowhere_else(data):
     highest = data.X.max(axis=1)
     limit = np.quantile(highest, 0.8)
     tight = RECIPE.with_policy(force_limits=[f"0:1:-1e9:{limit}:reject"])

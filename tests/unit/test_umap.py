@@ -182,6 +182,7 @@ def test_empty_slots_of_the_module_attract_nothing(insertion, n):
 
 @pytest.mark.merge  # ONNX needs seconds
 def test_an_onnx_file_decides_as_the_model_does(make_data, tmp_path):
+    pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
     from dengine.export import export_onnx, load_onnx
 

@@ -34,11 +34,3 @@ def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity, steps)
         handed_out.append((window.snapshot(), list(range(max(0, last - capacity) + 1, last + 1))))
     for snapshot, expected in handed_out:
         assert seqs_of(snapshot) == expected
-
-
-def test_what_is_newer_than_a_label_is_found_with_its_trace():
-    window = TrainingWindow(4)
-    add(window, 2, 3, 5, 8, 9)
-    assert (window.newer(5), window.newer(9)) == ([8, 9], [])
-    trace, label, hash_ = window.row(8)
-    assert (trace[0, 0], label, hash_) == (8.0, 0, 108)
