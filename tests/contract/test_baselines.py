@@ -111,7 +111,6 @@ def test_a_label_counts_at_once_where_the_method_learns_at_once(name, traces):
         ("training.published:ScaledComponents", {}, "module:Class of one, got"),
         ("knn", {"n": 3}, "baseline knn has no parameter n; it has k"),
         ("knn", {"k": 0}, "k to be an integer of at least 1, got 0"),
-        ("wskde", {"bandwidth": -1.0}, "bandwidth to be a number above 0, got -1.0"),
     ],
 )
 def test_a_wrong_setting_is_named(name, params, words):

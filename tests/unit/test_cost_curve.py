@@ -277,7 +277,6 @@ def test_the_curve_is_that_of_replays_under_the_recipes_other_settings(make_data
     [
         Policy(0.1, 0.98, stops="all", guarantee="pooled", audit_rate=0.02),
         Policy(prices=(0.5, 200, 5)),
-        Policy(prices=(0.5, 200, 5), audit_rate=0.0, stops="all"),
     ],
     ids=policy_name,
 )

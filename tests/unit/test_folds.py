@@ -84,10 +84,6 @@ def test_folds_are_balanced(folds, step):
     assert stats.chisquare(sizes).pvalue > 1e-4
 
 
-def test_given_folds_are_taken():
-    assert folds_of(noise(2), 2, [1, 0]).tolist() == [1, 0]
-
-
 @pytest.mark.parametrize("folds", [[0], [0, 2], [-1, 0]])
 def test_each_trace_needs_a_fold_within_the_range(folds):
     with pytest.raises(SettingError, match="2 folds from 0 to 1"):

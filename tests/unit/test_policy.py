@@ -102,8 +102,6 @@ IN_SECONDS = Policy(force_limits=("0.02:0.1::1e6",))
     "begin",
     [
         partial(DataEngine, policy=IN_SECONDS, trace=TraceSpec(SAMPLES, unit="N")),
-        partial(DataEngine.open_or_create, None, policy=IN_SECONDS),
-        partial(DataEngine, recipe=Recipe("pca", policy=IN_SECONDS)),
         partial(DataEngine, model=Counting(), policy=IN_SECONDS),
         lambda: DataEngine().set_policy(IN_SECONDS),
     ],

@@ -192,7 +192,6 @@ def test_every_member_starts_from_the_weights_of_a_checkpoint(network, tmp_path)
         (3, "of named dense tensors alone"),
         (torch.zeros(1, 6), "finite weights of this network"),
         (torch.full((1, 2), np.nan), "finite weights of this network"),
-        (torch.zeros(1, 2).to_sparse(), "of named dense tensors alone"),
         (torch.zeros(1, 2, device="meta"), "of named dense tensors alone"),
     ],
 )

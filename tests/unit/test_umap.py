@@ -245,7 +245,6 @@ def test_a_layout_of_many_traces_takes_several_trainings():
         train(reducer, X, np.arange(1, 3001))
         steps.append(reducer.report.n_steps)
     assert steps == [133, 67]
-    assert [reducer.n_epochs_due(n) for n in (3000, 10_000, 100)] == [80, 40, 200]
 
 
 def test_points_of_another_umap_are_not_counted_with_this_one():
