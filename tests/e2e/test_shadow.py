@@ -1,42 +1,31 @@
 """Decisions with the caller's own ids, and the shadow mode."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 
-from dengine import Action, DataEngine, Dataset
+from dengine import Action, DataEngine
 from dengine.errors import ReportError
-from dengine.store.lookup import BloomFilter
 from tests.support.driving import RECIPE, drive
 
 
-def test_taken_ids_are_never_taken_for_new_ones() -> None:
-    taken = BloomFilter(f"order-{i}" for i in range(20_000))
-    assert all(taken.may_contain(f"order-{i}") for i in range(20_000))
-    assert not any(taken.may_contain(f"part-{i}") for i in range(1_000))
+@pytest.mark.parametrize("name", ["", "two\nlines", 7, "x" * 1000])
+def test_what_is_no_id_is_refused(name, stream):
+    with DataEngine(recipe=RECIPE) as engine, pytest.raises(ReportError, match="Expected the id"):
+        engine.decide(stream.X[0], decision_id=name)
 
 
-@pytest.mark.parametrize("stored", [False, True])
-def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(
-    stream, tmp_path, stored
-) -> None:
-    with DataEngine(recipe=RECIPE, store=tmp_path / "engine.db" if stored else None) as engine:
-        for none in ("", "two\nlines", 7, "x" * 1000):
-            with pytest.raises(ReportError, match="Expected the id"):
-                engine.decide(stream.X[0], decision_id=none)
+def test_the_same_id_and_trace_have_the_same_decision_however_much_was_learned_since(stream):
+    with DataEngine(recipe=RECIPE) as engine:
         first = engine.decide(stream.X[0], part="P1", decision_id="order-7")
-        assert first.id == "order-7"
-        assert first.action is Action.VERIFY
-        drive(engine, stream, 1, 200)
-        assert engine.decide(stream.X[0]).model_version > 0
+        assert (first.id, first.action) == ("order-7", Action.VERIFY)
+        drive(engine, stream, 1, 100)
+        assert engine.version > 0
         assert engine.decide(stream.X[0], part="P1", decision_id="order-7") == first
-        assert engine.store.decisions.counts()["decisions"] == 201
+        assert engine.store.decisions.counts()["decisions"] == 100
 
 
-def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(
-    stream: Dataset, tmp_path: Path
-) -> None:
+def test_what_was_answered_under_an_id_is_there_after_a_kill_that_follows_at_once(stream, tmp_path):
     (tmp_path / "cell").mkdir()
     with DataEngine(recipe=RECIPE, store=tmp_path / "cell" / "engine.db") as engine:
         answers = [engine.decide(x, decision_id=f"order-{i}") for i, x in enumerate(stream.X[:20])]

@@ -53,92 +53,54 @@ GOLDEN = {  # (hash, toss, fold of 2, fold of 5): a store, a controller and an e
 }
 
 
-@pytest.mark.parametrize("name", golden_traces())
-def test_the_hash_of_a_trace_never_changes(name: str) -> None:
-    h = content_hash(golden_traces()[name][None])
-    assert (int(h[0]), int(toss(h)[0]), int(fold_of(h, 2)[0]), int(fold_of(h, 5)[0])) == GOLDEN[
-        name
-    ]
+@pytest.mark.parametrize("name", GOLDEN)
+def test_the_hash_of_a_trace_never_changes(name):
     x = np.atleast_2d(golden_traces()[name])
+    h = content_hash(x[None])
+    assert (*h, *toss(h), *fold_of(h, 2), *fold_of(h, 5)) == GOLDEN[name]
     gate = script(TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0])))
     assert gate(torch.from_numpy(x))[1] == h[0]  # compiled, as in an exported file
 
 
-@given(st.randoms(use_true_random=False))
-def test_a_hash_depends_neither_on_order_nor_on_company(random) -> None:
-    X = noise(40)
-    order = list(range(40))
-    random.shuffle(order)
-    np.testing.assert_array_equal(content_hash(X[order]), content_hash(X)[order])
-    assert content_hash(X[7:8])[0] == content_hash(X)[7]
-
-
-def test_dtype_and_layout_do_not_change_a_hash() -> None:
+def test_a_hash_depends_on_the_values_of_its_trace_alone():
     X = np.round(noise(20)).astype(np.int16)
-    for same in (X, X.astype(np.float64), np.asfortranarray(X), X[:, None, :]):
-        np.testing.assert_array_equal(content_hash(same), content_hash(X.astype(np.float32)))
-
-
-def test_one_sample_more_or_less_or_moved_is_another_hash() -> None:
-    x = noise(1)[0]
-    shifted, changed = np.roll(x, 1), x.copy()
-    changed[20] += 0.01
-    hashes = {int(content_hash(v[None])[0]) for v in (x, shifted, changed, x[:-1])}
-    assert len(hashes) == 4
+    hashes = content_hash(X)
+    for same in (X.astype(np.float64), np.asfortranarray(X), X[:, None, :]):
+        np.testing.assert_array_equal(content_hash(same), hashes)
+    np.testing.assert_array_equal(content_hash(X[::-3]), hashes[::-3])
 
 
 @given(traces)
-def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x: np.ndarray) -> None:
+def test_the_scripted_gate_hashes_as_numpy_does_for_any_float(x):
     gate = TraceGate(TraceSpec(samples=x.shape[1], channels=x.shape[0]))
     assert gate(torch.from_numpy(x))[1] == content_hash(x[None])[0]
 
 
-@pytest.mark.parametrize(
-    "step", [2.0**-20, 1 / 64, 1.0, 2.0]
-)  # of a sensor: low bits of a raw hash would be zeros
-@pytest.mark.parametrize("folds", [2, 3, 5, 10])
-def test_folds_are_balanced(folds: int, step: float) -> None:
-    sizes = np.bincount(
-        content_fold(np.round(noise(10_000, 20) / step) * step, folds), minlength=folds
-    )
+@pytest.mark.parametrize("step", [2.0**-20, 1.0])  # of a sensor: low bits of a raw hash are zeros
+@pytest.mark.parametrize("folds", [2, 5])
+def test_folds_are_balanced(folds, step):
+    X = np.round(noise(10_000, 20) / step) * step
+    sizes = np.bincount(content_fold(X, folds), minlength=folds)
     assert stats.chisquare(sizes).pvalue > 1e-4
 
 
-def test_given_folds_are_taken_if_each_trace_has_one_within_the_range_also_for_no_trace() -> None:
-    traces = noise(2)[:, None]
-    assert folds_of(traces, 2, [1, 0]).tolist() == [1, 0]
-    assert folds_of(traces[:0], 2, []).tolist() == folds_of(traces[:0], 2).tolist() == []
-    for n, folds in ((2, [0]), (2, [0, 2]), (2, [-1, 0]), (2, []), (0, [0])):
-        with pytest.raises(SettingError, match=f"{n} folds from 0 to 1"):
-            folds_of(traces[:n], 2, folds)
+@pytest.mark.parametrize("folds", [[0], [0, 2], [-1, 0]])
+def test_each_trace_needs_a_fold_within_the_range(folds):
+    with pytest.raises(SettingError, match="2 folds from 0 to 1"):
+        folds_of(noise(2), 2, folds)
 
 
-@pytest.mark.parametrize("rate", [0.02, 0.25, 0.5])
-def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate: float) -> None:
+@pytest.mark.parametrize("rate", [0.02, 0.5])
+def test_the_audit_coin_keeps_its_rate_and_ignores_the_fold(rate):
     h = content_hash(noise(8_000, 20))
     coin, fold = audited(h, rate, seed=3), fold_of(h, 2)
     assert stats.binomtest(int(coin.sum()), len(h), rate).pvalue > 1e-4
-    assert (
-        stats.chi2_contingency(
-            [[np.sum((coin == c) & (fold == k)) for k in (0, 1)] for c in (0, 1)]
-        ).pvalue
-        > 1e-4
-    )
+    table = np.bincount(2 * coin + fold).reshape(2, 2)
+    assert stats.chi2_contingency(table).pvalue > 1e-4
 
 
-def test_engines_of_different_seeds_audit_different_traces() -> None:
+def test_engines_of_different_seeds_audit_different_traces():
     h = content_hash(noise(8_000, 20))
     first, other = audited(h, 0.5, seed=1), audited(h, 0.5, seed=2)
     assert stats.binomtest(int((first == other).sum()), len(h), 0.5).pvalue > 1e-4
     np.testing.assert_array_equal(first, audited(h, 0.5, seed=1))
-
-
-def test_the_decider_tosses_as_numpy_does_compiled_or_not() -> None:
-    decider = Decider(VerifyAll(Reason.NO_MODEL), DecisionConditions(TraceSpec(20)))
-    scripted = script(decider)
-    hashes = content_hash(noise(200, 20))
-    assert (
-        [decider.toss(int(h)) for h in hashes]
-        == [scripted.toss(int(h)) for h in hashes]
-        == toss(hashes).tolist()
-    )

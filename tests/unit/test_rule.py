@@ -2,9 +2,9 @@
 restored.
 """
 
-import importlib
 import linecache
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +20,13 @@ from dengine import (
     Dataset,
     Policy,
     Recipe,
-    ReplayCell,
     export_torchscript,
 )
 from dengine.decision.intervals import SCALAR_BOUNDS
 from dengine.decision.rule import DecisionRule, action_of
 from dengine.errors import ExportError, SettingError
 from dengine.model.neighbours import ModelPrediction
+from tests.support.driving import drive, learn
 
 counts = st.integers(0, 5000)
 alphas = st.sampled_from([0.01, 0.05, 0.1, 0.2, 0.5])
@@ -38,7 +38,7 @@ ACTIONS = tuple(Action)
 @given(n_success=counts, n_failure=counts, alpha=alphas, lower_bound=bounds)
 def test_the_scalar_rule_is_the_interval_and_the_policy(
     interval, n_success, n_failure, alpha, lower_bound
-) -> None:
+):
     policy = Policy(alpha, lower_bound, interval)
     action, lower, upper = policy.rule()(n_success, n_failure)
     assert (lower, upper) == pytest.approx(
@@ -87,30 +87,22 @@ class SpokenRule(DecisionRule):
         return {True: 1, False: 0}[lower >= self.accept_threshold]
 
 
-class FailingRule(FuseRule):
+class FailingRule(SpokenRule):
     """Cannot be told anything."""
 
-    def update(
-        self,
-        lower: float,
-        upper: float,
-        success: bool,
-        predicted: int = 0,
-        inclusion_probability: float = 1.0,
-    ) -> None:
+    def update(self, *outcome) -> None:
         raise RuntimeError("update failed")
 
 
 @pytest.fixture
-def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def outside(tmp_path: Path, monkeypatch) -> None:
     """The module `fuse` of an outside author, by which a recipe names his rule."""
     source = Path(__file__).read_text(encoding="utf-8")
-    rule = source[source.index("class FuseRule") : source.index("@pytest.fixture")]
+    rules = source[source.index("class FuseRule") : source.index("@pytest.fixture")]
     head = "import torch\nfrom dengine.decision.rule import DecisionRule, action_of\n\n\n"
-    (tmp_path / "fuse.py").write_text(head + rule, encoding="utf-8")
+    (tmp_path / "fuse.py").write_text(head + rules, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.delitem(sys.modules, "fuse", raising=False)
-    return "fuse:FuseRule"
 
 
 def recipe_with(guarantee: str) -> Recipe:
@@ -121,13 +113,12 @@ def good(data: Dataset) -> np.ndarray:
     return data.X[np.flatnonzero(data.y == 1)[-1]]
 
 
-def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(
-    outside, data, tmp_path: Path
-) -> None:
-    recipe = Recipe.from_toml(recipe_with(outside).to_toml())
+@pytest.mark.usefixtures("outside")
+def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(data, tmp_path):
+    recipe = Recipe.from_toml(recipe_with("fuse:FuseRule").to_toml())
     url = str(tmp_path / "engine.db")
     with DataEngine(recipe=recipe, store=url, replaying=True) as engine:
-        list(engine.run(ReplayCell(data, confirm=True), 150))
+        drive(engine, data, last=150, confirm=True)
         accepted = engine.decide(good(data))
         assert accepted.action is Action.ACCEPT
         engine.report(accepted.id, success=False)  # the system stopped
@@ -135,39 +126,31 @@ def test_a_rule_from_outside_is_named_by_a_recipe_told_of_a_stop_and_restored(
         assert paused.lower >= 0.9  # only the rule holds it back
         assert paused.action is Action.VERIFY
     with DataEngine.open(url, allow_import=True) as engine:
-        again = engine.decide(good(data))
-        assert (again.action, again.lower) == (Action.VERIFY, paused.lower)
+        assert engine.decide(good(data)).action is Action.VERIFY
         engine.retrain()
     with DataEngine.open(url, allow_import=True) as engine:  # now from the version's own state
         assert engine.decide(good(data)).action is Action.VERIFY
-        for x, y in zip(data.X[:60], data.y[:60], strict=True):
-            decision = engine.decide(np.roll(x, 1))
-            if decision.action is Action.VERIFY:
-                engine.report(decision.id, bool(y))
+        learn(engine, replace(data, X=np.roll(data.X, 1, axis=1)), range(60))
         assert engine.decide(good(data)).action is Action.ACCEPT
 
 
-def test_a_rule_that_does_not_compile_decides_and_is_not_exported(
-    outside, data, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("outside")
+def test_a_rule_that_does_not_compile_decides_and_is_not_exported(data, tmp_path):
     with DataEngine(recipe=recipe_with("fuse:SpokenRule"), replaying=True) as engine:
-        actions = [c.decision.action for c in engine.run(ReplayCell(data), len(data))]
+        actions = [cycle.decision.action for cycle in drive(engine, data)]
         assert actions.count(Action.ACCEPT) > 50
-        assert Action.REJECT not in actions
         with pytest.raises(ExportError, match=r"SpokenRule .*does not compile"):
             export_torchscript(engine, tmp_path / "model.ts")
 
 
-def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(
-    outside, data, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("outside")
+def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(data, tmp_path):
     url = str(tmp_path / "engine.db")
     with DataEngine(recipe=recipe_with("fuse:FailingRule"), store=url, replaying=True) as engine:
-        cycles = list(engine.run(ReplayCell(data), 100))
-        assert {c.decision.action for c in cycles} == {Action.VERIFY}
-        assert {c.decision.reason for c in cycles[41:]} == {"model_error"}
+        decisions = [cycle.decision for cycle in drive(engine, data, last=100)]
+        assert {decision.action for decision in decisions} == {Action.VERIFY}
+        assert {decision.reason for decision in decisions[41:]} == {"model_error"}
         assert len(engine.store.labels.with_traces().labels) == 100
-        assert engine.version == 2
     with DataEngine.open(url, allow_import=True) as engine:
         assert engine.decide(good(data)).action is Action.VERIFY
 
@@ -180,7 +163,7 @@ def test_a_rule_that_cannot_be_told_verifies_every_part_and_loses_no_label(
         ("dengine.recipe:Recipe", "subclass"),
     ],
 )
-def test_a_rule_that_cannot_be_had_is_named(name: str, message: str) -> None:
+def test_a_rule_that_cannot_be_had_is_named(name, message):
     with pytest.raises(SettingError, match=message):
         DataEngine(recipe=recipe_with("local").with_policy(guarantee=name))
 
@@ -195,26 +178,21 @@ class MyRule(DecisionRule):
 """
 
 
-def test_two_rules_of_one_name_and_a_notebook_cell_that_is_run_again_are_each_asked_for_themselves(
-    data: Dataset, tmp_path: Path, monkeypatch
-) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
-    rules = []
-    for name, action in (("rule_a", 1), ("rule_b", 2)):
-        (tmp_path / f"{name}.py").write_text(RULE.format(action=action), encoding="utf-8")
-        rules.append(importlib.import_module(name).MyRule)
+def notebook_rule(number: int, action: int, monkeypatch) -> type[DecisionRule]:
+    """The class that a notebook cell of this number defines."""
+    cell, name = RULE.format(action=action), f"<cell {number}>"
+    lines = cell.splitlines(keepends=True)
+    monkeypatch.setitem(linecache.cache, name, (len(cell), None, lines, name))
+    notebook: dict[str, type[DecisionRule]] = {"__name__": "__main__"}
+    exec(compile(cell, name, "exec"), notebook)  # as a notebook does
+    return notebook["MyRule"]
+
+
+def test_a_notebook_cell_that_is_run_again_defines_a_rule_that_is_asked_for_itself(
+    data, monkeypatch
+):
     for number, action in enumerate((1, 2, 0)):
-        cell, name = RULE.format(action=action), f"<cell {number}>"
-        lines = cell.splitlines(keepends=True)
-        monkeypatch.setitem(linecache.cache, name, (len(cell), None, lines, name))
-        notebook: dict[str, type[DecisionRule]] = {"__name__": "__main__"}
-        exec(compile(cell, name, "exec"), notebook)  # as a notebook does
-        rules.append(notebook["MyRule"])
-    y = np.ones(len(data), dtype=int)
-    models = [
-        ModelPrediction("pca", rule=rule(0.2, 0.8), novelty=0.0).fit(data.X, y) for rule in rules
-    ]
-    accept, reject, verify = Action.ACCEPT, Action.REJECT, Action.VERIFY
-    answers = [model.decide(good(data)[None])[0] for model in models]
-    assert answers == [accept, reject, accept, reject, verify]
-    assert all(isinstance(model.decider(None), torch.jit.ScriptModule) for model in models)
+        rule = notebook_rule(number, action, monkeypatch)(0.2, 0.8)
+        model = ModelPrediction("pca", rule=rule, novelty=0.0).fit(data.X, np.ones(len(data)))
+        assert model.decide(good(data)[None])[0] is ACTIONS[action]
+        assert isinstance(model.decider(None), torch.jit.ScriptModule)

@@ -2,7 +2,6 @@
 played with that one finds faults.
 """
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -15,16 +14,15 @@ from dengine.decision.certificate import cusum, log_evidence
 from dengine.decision.member_rules import MemberRule
 from tests.slow.proof.rules.__main__ import FAULTS, verdict
 from tests.slow.proof.rules.implementation import Rules, design_cusum, log_certificate
-from tests.slow.proof.rules.replays import ALPHA, Case, best_gain, play
+from tests.slow.proof.rules.replays import ALPHA, Case, play
 
 ALL = {"stops": "all"}
 AUDITED = {"stops": "some", "audit_rate": 0.3}
+LOOSE = {"alpha": 0.2, "lower_bound": 0.8}
 CASES: dict[str, dict[str, Any]] = {
     "local": {"guarantee": "local", **ALL},
-    "local at (0.2, 80 %)": {"guarantee": "local", "alpha": 0.2, "lower_bound": 0.8, **ALL},
     "pooled": {"guarantee": "pooled", **ALL},
-    "pooled at (0.2, 80 %)": {"guarantee": "pooled", "alpha": 0.2, "lower_bound": 0.8, **ALL},
-    "pooled, audited": {"guarantee": "pooled", "alpha": 0.2, "lower_bound": 0.8, **AUDITED},
+    "pooled, audited": {"guarantee": "pooled", **LOOSE, **AUDITED},
     "cost": {"guarantee": "cost", **ALL},
     "cost, audited": {"guarantee": "cost", "prices": (5.0, 50.0, 20.0), **AUDITED},
 }
@@ -78,7 +76,7 @@ def second_state(rules: Rules, i: int) -> list[Any]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_rule_takes_the_steps_of_a_second_implementation(name: str) -> None:
+def test_the_rule_takes_the_steps_of_a_second_implementation(name):
     policy = Policy(**{"alpha": 0.1, "lower_bound": 0.9} | CASES[name])
     products = [policy.rule() for _ in range(N_REPLAYS)]
     q = policy.inclusion_probability
@@ -115,24 +113,22 @@ def test_the_rule_takes_the_steps_of_a_second_implementation(name: str) -> None:
     assert len(seen) >= 6
 
 
-def test_the_second_certificate_and_detector_are_those_of_the_package() -> None:
+@pytest.mark.parametrize("q", [1.0, 0.1])
+def test_the_second_certificate_is_that_of_the_package(q):
     rng = np.random.default_rng(3)
     n = rng.integers(1, 3000, 200)
-    n_bad = rng.binomial(n, 0.05)
-    mean = rng.uniform(0.001, 0.999, 200)
-    for q in (1.0, 0.1):
-        expected = [
-            log_evidence(*values, q)
-            for values in zip(n.tolist(), n_bad.tolist(), mean.tolist(), strict=True)
-        ]
-        actual = log_certificate(n.astype(float), n_bad.astype(float), mean, q)
-        np.testing.assert_allclose(actual, expected, atol=1e-8)
-    for share in (0.2, 0.1, 0.05, 5 / 120):
-        assert design_cusum(share, 1000.0) == cusum(share, 1000.0)
+    columns = n, rng.binomial(n, 0.05), rng.uniform(0.001, 0.999, 200)
+    expected = [log_evidence(*row, q) for row in zip(*map(np.ndarray.tolist, columns), strict=True)]
+    np.testing.assert_allclose(log_certificate(*columns, q), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.1, 0.05, 5 / 120])
+def test_the_second_detector_is_that_of_the_package(share):
+    assert design_cusum(share, 1000.0) == cusum(share, 1000.0)
 
 
 @pytest.mark.parametrize("case", FAULTS, ids=lambda case: case.fault)
-def test_a_planted_fault_is_found_and_without_it_the_promise_is_kept(case: Case) -> None:
+def test_a_planted_fault_is_found_and_without_it_the_promise_is_kept(case):
     n = 400
     faulty = play(case, n, seed=1)["broke"]
     stream = "constant" if case.fault == "peeks" else case.stream
@@ -141,13 +137,7 @@ def test_a_planted_fault_is_found_and_without_it_the_promise_is_kept(case: Case)
     assert stats.binomtest(int(honest), n, ALPHA, alternative="greater").pvalue > 1e-3
 
 
-def test_by_costs_no_replay_of_an_adversary_is_ever_more_than_one_false_accept_behind() -> None:
+def test_by_costs_no_replay_of_an_adversary_is_ever_more_than_one_false_accept_behind():
     row = play(Case("cost", "adversary"), 200, seed=2)
     assert row["accepted"] > 0
     assert row["broke"] == row["over_account"] == 0
-
-
-def test_a_perfect_bet_on_known_outcomes_needs_the_divergence() -> None:
-    divergence = 0.02 * math.log(0.02 / 0.1) + 0.98 * math.log(0.98 / 0.9)
-    assert best_gain(0.02, 0.1, 1.0) == pytest.approx(divergence, rel=1e-4)
-    assert best_gain(0.02, 0.1, 0.1) < 0.2 * divergence  # audits limit the stake

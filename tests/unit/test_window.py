@@ -3,7 +3,6 @@ afterwards.
 """
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,8 +16,6 @@ def add(window: TrainingWindow, *seqs: int) -> None:
 
 
 def seqs_of(labelled: LabelledTraces) -> list[int]:
-    n = len(labelled.seq)
-    assert labelled.traces.shape == ((n, 1, 3) if n else (0, 1, 1))
     assert labelled.traces[:, 0, 0].tolist() == labelled.seq.tolist()
     assert labelled.labels.tolist() == [seq % 2 for seq in labelled.seq]
     assert labelled.hashes.tolist() == [100 + seq for seq in labelled.seq]
@@ -27,9 +24,7 @@ def seqs_of(labelled: LabelledTraces) -> list[int]:
 
 @settings(deadline=None)
 @given(capacity=st.integers(1, 200), steps=st.lists(st.integers(0, 90), max_size=6))
-def test_every_snapshot_is_of_the_newest_then_and_never_changes(
-    capacity: int, steps: list[int]
-) -> None:
+def test_every_snapshot_is_of_the_newest_then_and_never_changes(capacity, steps):
     window, handed_out, last = TrainingWindow(capacity), [], 0
     for n in steps:
         if n % 7 == 1:
@@ -39,12 +34,3 @@ def test_every_snapshot_is_of_the_newest_then_and_never_changes(
         handed_out.append((window.snapshot(), list(range(max(0, last - capacity) + 1, last + 1))))
     for snapshot, expected in handed_out:
         assert seqs_of(snapshot) == expected
-
-
-@pytest.mark.parametrize("capacity", [4, 100])
-def test_what_is_newer_than_a_label_is_found_with_its_trace(capacity: int) -> None:
-    window = TrainingWindow(capacity)
-    add(window, 2, 3, 5, 8, 9)
-    assert (window.newer(5), window.newer(9)) == ([8, 9], [])
-    trace, label, hash_ = window.row(8)
-    assert (trace[0, 0], label, hash_) == (8.0, 0, 108)
