@@ -196,13 +196,14 @@ class Policy:
     def changed(self, **settings: Any) -> Self:
         """Return a copy with these settings changed.
 
-        If `prices` are among them, and this policy has the guarantee "local" or "pooled", which
-        have no prices, then the guarantee becomes "cost", and an audit rate of 0 becomes 0.05. A
-        guarantee or an audit rate among the settings is taken instead. Raises SettingError for a
-        value out of its range, TypeError for a name that is no setting.
+        If `prices` are among them, but no guarantee, and this policy has the guarantee "local" or
+        "pooled", which have no prices, then the guarantee becomes "cost", and an audit rate of 0
+        becomes 0.05, unless the settings have one. Raises SettingError for a value out of its
+        range, TypeError for a name that is no setting.
         """
         implied: dict[str, Any] = {}
-        if "prices" in settings and self.guarantee in ("local", "pooled"):
+        has_own = "guarantee" in settings or self.guarantee not in ("local", "pooled")
+        if "prices" in settings and not has_own:
             implied = {"guarantee": "cost", "audit_rate": self.audit_rate or AUDIT_RATE}
         return replace(self, **(implied | settings))
 

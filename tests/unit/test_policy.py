@@ -156,8 +156,10 @@ def test_force_limits_that_hold_no_sample_are_refused(limits):
     ],
 )
 def test_prices_alone_are_the_cost_guarantee_with_audits_and_what_is_stated_stays(stated, expected):
-    policy = Policy(**stated | {"prices": (0.5, 200, 5)})
+    settings = stated | {"prices": (0.5, 200, 5)}
+    policy = Policy(**settings)
     assert (policy.guarantee, policy.audit_rate) == expected
+    assert Policy().changed(**settings) == policy
     assert Policy(**stated).changed(prices=(0.5, 200, 5)) == policy
 
 
