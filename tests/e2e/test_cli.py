@@ -243,19 +243,6 @@ def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected() -> None:
         assert expected in " ".join(result.stderr.split())
 
 
-def test_limits_in_seconds_need_a_rate_that_the_recordings_or_an_option_state(
-    data: Path, tmp_path: Path
-) -> None:
-    data, store = shutil.copy(data, tmp_path / "parts.npz"), tmp_path / "new.db"
-    words = f"train --data {data} --reducer pca --store {store} --force-limit 0.01:0.02:-500:"
-    assert "state time.rate_hz of recordings" in dengine(*words.split()).stderr
-    succeed("data", data, "--set", "time.rate_hz=100", "--set", "channels.X=kN", "--save")
-    succeed(*words.split())
-    with DataEngine.open(store) as engine:
-        assert (engine.trace.rate_hz, engine.trace.unit) == (100.0, "kN")
-        assert engine.policy.force_limits
-
-
 def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
     tmp_path: Path, monkeypatch
 ) -> None:
@@ -310,22 +297,6 @@ def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_fold
     assert document("status", "e.db")["ever"]["decisions"] == done  # no part was played
     succeed(*rest, "rest")
     assert [n_rows(Path(name, "run.csv")) for name in ("out", "rest")] == [done, 160 - done]
-
-
-def test_a_file_in_the_way_of_an_interrupted_grid_is_refused_before_the_first_replay(
-    data: Path, own_folder: Path
-) -> None:
-    words = f"compare --data {data} --reducers his:Interrupting --cycles 60 --repeats 3".split()
-    words += [*POLICY, "--keep", "kept", "--out", "out"]
-    assert dengine(*words).exit_code == INTERRUPTED
-    n_kept = len([*own_folder.glob("kept/**/*.npz")])
-    assert n_kept
-    Path("out/replays.csv").unlink()
-    refused = dengine(*words)
-    assert (refused.exit_code, refused.stdout) == (1, "")
-    assert "curves.png exists" in refused.stderr
-    assert document(*words, "--force")["costs"]["kept"] == n_kept
-    assert n_rows(Path("out/replays.csv")) == 3
 
 
 WRONG = """

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Description, describe, load_dataset
+from dengine import DataEngine, Dataset, Description, load_dataset
 from dengine.datasets.sample import write_sample
-from dengine.errors import DataError
 from dengine.experiments.survey import survey_dataset
 from tests.support.command_line import dengine, document, well
 
@@ -51,12 +50,6 @@ def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(
     assert "--force" in refused("data", folder, "--save")
 
 
-def test_sample_recordings_are_written_into_a_new_or_an_empty_folder_alone(folder: Path) -> None:
-    before = sorted(folder.iterdir())
-    assert "Expected a new or an empty folder" in refused("data", "--sample", folder)
-    assert sorted(folder.iterdir()) == before
-
-
 def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(
     folder: Path, tmp_path: Path
 ) -> None:
@@ -69,19 +62,6 @@ def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert engine.status().labels == len(load_dataset(folder))
         assert engine.decide(np.linspace(0.0, 30.0, 998)).reason != "not_finite"
-
-
-def test_open_keys_are_listed_with_their_candidates_and_a_check_fails(tmp_path: Path) -> None:
-    for i, (word, other) in enumerate([("OK", "OK"), ("NOK", "OK"), ("NOK", "NOK"), ("OK", "OK")]):
-        (tmp_path / word).mkdir(exist_ok=True)
-        rows = "".join(f"{k * 0.004:.3f},{np.sin(k + i):.3f},{other}\n" for k in range(30))
-        (tmp_path / word / f"part_{i}.csv").write_text(f"time,FZ,result\n{rows}")
-    assert "disagree on 1 of 4 recordings" in shown("data", tmp_path)
-    refused("data", tmp_path, "--check")
-    with pytest.raises(DataError, match=r"(?s)Still open:.*label\.column.*disagree on 1 of 4"):
-        load_dataset(tmp_path)
-    assert "good" in shown("data", tmp_path, "--set", "label.column=result", "--check")
-    assert load_dataset(tmp_path, describe(tmp_path, {"label.column": "result"})).y.sum() == 3
 
 
 def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder: Path) -> None:
@@ -110,8 +90,6 @@ def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset])
     assert (survey.not_finite, survey.constant, survey.too_large) == (1, 1, 1)
     assert (survey.duplicates, survey.contradicting) == (2, 1)
     assert 14 <= survey.near_repeats <= 20
-    assert survey.looked_at == 117
-    assert (survey.good + survey.bad, survey.lengths) == (120, None)
     assert survey_dataset(data).near_repeats <= 3
 
 
@@ -121,16 +99,14 @@ def test_drift_is_seen_where_there_is_some_and_only_there(
     data = make_data(300, samples=60)
     y = (np.random.default_rng(1).random(300) < np.linspace(1.0, 0.3, 300)).astype(np.int8)
     drifting = replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)
-    still, moved = (
-        {drift.name: drift for drift in survey_dataset(item).drift} for item in (data, drifting)
-    )
-    for name, low, high in (("good", -1.0, -0.2), ("channel 0", 0.3, 1.0)):
-        assert still[name].p > 0.01
-        assert moved[name].p < 1e-4
-        assert low <= moved[name].rho <= high
+    still, moved = (survey_dataset(item).drift for item in (data, drifting))
+    assert min(drift.p for drift in still) > 0.01
+    good, channel = moved[:2]
+    assert max(good.p, channel.p) < 1e-4
+    assert good.rho < -0.2
+    assert channel.rho > 0.3
     flat = survey_dataset(replace(data, y=np.ones(300, dtype=np.int8))).drift[0]
     assert np.isnan([flat.rho, flat.p]).all()
-    assert flat.tenths == (1.0,) * 10
 
 
 def refused(*words: object) -> str:

@@ -130,13 +130,6 @@ def test_labels_that_are_not_of_two_classes_are_refused_in_scikit_learns_words(
         clone(SMALL[name]).fit(traces()[0], labels)
 
 
-def test_labels_of_one_class_are_refused_by_regressions_and_learned_by_a_network() -> None:
-    X, ones = traces()[0], np.ones(80, dtype=int)
-    with pytest.raises(SettingError, match="Expected both classes outside fold 0"):
-        clone(SMALL["rocket"]).fit(X, ones)
-    assert clone(SMALL["conv"]).fit(X, ones).transform(X).shape == (80, 2)
-
-
 @pytest.mark.parametrize("name", SMALL)
 def test_a_pipeline_of_a_reducer_and_our_classifier_beats_the_base_rate(name: str) -> None:
     X, y = traces()

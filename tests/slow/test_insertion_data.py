@@ -47,18 +47,6 @@ def test_labels_are_the_height_alone_and_every_failure_has_a_cause(
     assert counts.min() >= 20
 
 
-def test_the_forces_are_those_of_real_insertions(
-    stored: dict[str, np.ndarray], traces: np.ndarray
-) -> None:
-    plateau, middle = traces[:, -100:].mean(axis=1), traces[:, 400:500].mean(axis=1)
-    rim, success = stored["cause"] == "rim_contact", stored["y"] == 1
-    assert np.mean((plateau[rim] > 22) & (plateau[rim] < 68)) > 0.97
-    assert np.mean((plateau[success] > 7) & (plateau[success] < 60)) > 0.95
-    # 0.8 to 1.0 s: on the rim by now, or still on the way down
-    assert np.median(middle[rim]) > 20
-    assert np.median(middle[success]) < 5
-
-
 def test_the_nearest_neighbour_is_right_in_92_to_96_percent(
     stored: dict[str, np.ndarray], traces: np.ndarray
 ) -> None:

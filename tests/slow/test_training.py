@@ -115,19 +115,9 @@ def test_a_trained_encoder_beats_the_base_rate_starts_conv_and_has_its_section_o
     # The loss of the first step is that of the initial weights.
     fresh, started = (
         ConvReducer(folds=2, fit_steps=1, random_state=0, checkpoint=checkpoint).fit(X, y)
-        for checkpoint in (None, str(tmp_path / "encoder.pt"))
+        for checkpoint in ("", str(tmp_path / "encoder.pt"))
     )
     assert started.loss_ < 0.8 * fresh.loss_
-
-
-def test_the_posterior_of_an_oscillation_tells_the_share_of_good_parts() -> None:
-    data = import_module("evidence_sets").load_set("oscillation", seed=3)
-    posterior = import_module("ideal_score").oscillation_posterior(data.X[:, None])
-    for low, high in ((0.0, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 1.0)):
-        chosen = (posterior >= low) & (posterior <= high)
-        error = 4 * np.sqrt(0.25 / chosen.sum())
-        assert data.y[chosen].mean() == pytest.approx(posterior[chosen].mean(), abs=error)
-    assert ((posterior > 0.5) == data.y).mean() > 0.97
 
 
 CHANGED = """
@@ -149,7 +139,7 @@ def test_every_figure_that_a_file_holds_is_as_in_the_file_and_a_changed_one_is_f
     shutil.copy(FOLDER.parent / "README.md", tmp_path)
     monkeypatch.setattr(import_module("list_figures"), "DOCS", tmp_path / "docs")
     for line in CHANGED.strip().splitlines():
-        name, text, other = re.split(r" +/|(?<=[|s])/", line)
+        name, text, other = re.split(r" +/(?=\S)|(?<=[|s])/(?=[|\d])", line)
         page = tmp_path / name
         content = page.read_text("utf-8")
         assert text in content, f"{name} does not show {text}"

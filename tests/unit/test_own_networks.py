@@ -79,15 +79,6 @@ class ChangedInTraining(Network):
         return self.layers(x) * self.gain
 
 
-class NestedTensors(Network):
-    def __init__(self, *shape):
-        super().__init__(*shape)
-        self.gains = {"first": [torch.randn(8)], "second": [torch.randn(8)]}
-
-    def forward(self, x):
-        return self.layers(x) * self.gains["first"][0] * self.gains["second"][0]
-
-
 class WeightNorm(Network):
     """TorchScript compiles it, and cannot run it."""
 
@@ -150,7 +141,7 @@ def taught(reducer: Any, store: Path | None = None, traces: Any = None) -> DataE
     return engine
 
 
-SLOW = [TiedWeights, Recurrent, ChangedInTraining, NestedTensors]
+SLOW = [TiedWeights, Recurrent, ChangedInTraining]
 SLOW = [pytest.param(network, marks=pytest.mark.slow) for network in SLOW]
 
 

@@ -19,7 +19,6 @@ from dengine import (
     Dataset,
     ModelPrediction,
     Policy,
-    Reason,
     Recipe,
     TraceSpec,
     WilsonRadiusClassifier,
@@ -141,16 +140,12 @@ def test_a_rate_is_stated_later_and_contradicted_never(
             DataEngine.open(url, trace=replace(STATED, **other))
 
 
-def stored(url: Path, **settings: str) -> Path:
-    """A store whose settings an older version wrote."""
-    with DataEngine("pca", store=url) as engine:
-        engine.store.settings.save(engine.store.settings.read() | settings)
-    return url
-
-
-def test_a_store_keeps_the_rate_that_it_holds(make_data, tmp_path: Path) -> None:
+def test_a_store_keeps_the_rate_that_an_older_version_wrote(make_data, tmp_path: Path) -> None:
     old = '{"samples": 100, "rate_hz": 500.0, "channels": 1, "unit": "N", "limit": null, "columns": []}'
-    url = stored(tmp_path / "engine.db", trace=old, inferred="true")
+    url = tmp_path / "engine.db"
+    with DataEngine("pca", store=url) as engine:
+        settings = engine.store.settings
+        settings.save(settings.read() | {"trace": old, "inferred": "true"})
     with DataEngine.open_or_create(url, trace=TraceSpec(100)) as engine:
         engine.decide(make_data(1).X[0])
         assert engine.trace == TraceSpec(100, 500.0, unit="N")
@@ -159,17 +154,6 @@ def test_a_store_keeps_the_rate_that_it_holds(make_data, tmp_path: Path) -> None
 
 
 LIMITED = Policy(force_limits=("0.02:0.1::1e9",))
-
-
-def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stated(
-    make_data, tmp_path: Path
-) -> None:
-    url = stored(tmp_path / "engine.db", recipe=Recipe("pca", policy=LIMITED).to_toml())
-    for begin in (DataEngine.open, DataEngine.open_or_create):
-        with pytest.raises(SettingError, match="Expected the rate of the traces"):
-            begin(url)
-    with DataEngine.open(url, trace=TraceSpec(100, 1000.0)) as engine:
-        assert engine.decide(make_data(1).X[0]).reason is Reason.NO_MODEL
 
 
 def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path: Path) -> None:
