@@ -35,15 +35,7 @@ LESS = {  # so that an example takes seconds; its own options are all read
 }
 OWN_REDUCERS = """
 import os, signal
-from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
-
-class FirstAndLast(TransformerMixin, BaseEstimator):
-    def fit(self, X, y=None):
-        self.n_features_in_ = X.shape[1]
-        return self
-    def transform(self, X):
-        return X[:, [0, -1]]
 
 class Interrupting(PCA):
     fits = 0
@@ -93,9 +85,8 @@ def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
     # Where lines break depends on the length of the program's name.
     assert done.stdout.split() == succeed("-h").replace("Usage: main", "Usage: dengine").split()
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-    assert {"dengine.cli.options", "numpy", "torch", "pandas", "rich", "sklearn"} & imported == {
-        "dengine.cli.options"
-    }
+    assert "dengine.cli.options" in imported
+    assert not {"numpy", "torch", "pandas", "rich", "sklearn"} & imported
 
 
 @pytest.fixture(scope="module")
@@ -103,14 +94,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What examples name: a trained engine.db of a part of the bundled set, backup.db, its copy, and
     cell.csv, a journal of two of its traces.
     """
-    folder = tmp_path_factory.mktemp("examples")
-    traces = load_dataset("insertion")
-    save(folder / "parts.npz", replace(traces, X=traces.X[:200], y=traces.y[:200], cause=None))
+    folder, parts = tmp_path_factory.mktemp("examples"), load_dataset("insertion")
+    save(folder / "parts.npz", replace(parts, X=parts.X[:200], y=parts.y[:200], cause=None))
     words = f"--data {folder}/parts.npz --store {folder}/engine.db --reducer pca"
     succeed("train", *words.split())
     line = "part,p{},{},,verify,verify,uncertain,0.5,0.9,4,1,{}"
-    parts = (line.format(i, traces.y[i], ",".join(map(str, traces.X[i] + 1))) for i in range(2))
-    (folder / "cell.csv").write_bytes(cell_journal(*parts))
+    lines = (line.format(i, parts.y[i], ",".join(map(str, parts.X[i] + 1))) for i in range(2))
+    (folder / "cell.csv").write_bytes(cell_journal(*lines))
     backup_store(folder / "engine.db", folder / "backup.db")
     return folder
 
@@ -143,9 +133,8 @@ def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(
     assert {p.name for p in tmp_path.glob("*.png")} == {"curves.png", "map_pca.png"}
     row = document(*asked, "--check-seconds", 9)["rows"][0]
     assert row["saved_s"] == 9 * row["certain"] > 0
-    short = document(*asked[:5], "--in-order", "--cycles", 20)
-    row = short["rows"][0]
-    assert (short["in_order"], row["replays"]) == (True, 1)
+    row = document(*asked[:5], "--in-order", "--cycles", 20)["rows"][0]
+    assert row["replays"] == 1
     assert row["precision"] is row["promise_kept"] is None  # nothing was accepted
 
 
@@ -179,20 +168,6 @@ def test_training_goes_on_after_retrains_without_a_step(tmp_path: Path, monkeypa
     assert "nothing was done" in line_of(*words)
 
 
-def test_a_store_goes_on_with_a_reducer_of_this_folder(
-    data: Path, own_folder: Path, monkeypatch
-) -> None:
-    elsewhere = [folder for folder in sys.path if folder != str(own_folder)]
-    for words in (["--reducer", "his:FirstAndLast"], ["--allow-import"]):  # made, and opened again
-        monkeypatch.setattr(sys, "path", elsewhere[:])
-        sys.modules.pop("his", None)
-        out = line_of("train", "--data", data, "--store", "e.db", *words)
-        assert "his" in sys.modules
-        assert sys.path[-1] == str(own_folder)  # last: a module of this folder shadows nothing
-        assert "FirstAndLast answers" in out
-    assert "his:FirstAndLast" in succeed("status", "e.db")
-
-
 def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(
     data: Path, tmp_path: Path
 ) -> None:
@@ -217,8 +192,8 @@ def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) 
     pytest.importorskip("mujoco")
     words = f"run --cell simulated --cycles 2 --reducer pca --store {tmp_path}/e.db".split()
     assert "simulated" in succeed(*words).lower()
-    assert document(*words)["simulated"] is True  # and the resumed run sees new parts
-    with DataEngine.open(tmp_path / "e.db") as engine:
+    assert document(*words)["simulated"] is True
+    with DataEngine.open(tmp_path / "e.db") as engine:  # the resumed run saw new parts
         assert len({past.content_hash for past in engine.history()}) == 4
 
 

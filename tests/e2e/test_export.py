@@ -24,14 +24,12 @@ from dengine import (
     TraceSpec,
     export_torchscript,
     load_exported,
-    make_reducer,
 )
 from dengine.decision.rule import DecisionRule
 from dengine.errors import ExportError
 from dengine.export import ExportedModel
 from dengine.export.bundle import metadata_of, read_checked
 from dengine.export.decision import FIELDS, METHODS
-from dengine.folds import content_fold
 from dengine.records import ACTIONS, REASONS, Action
 from tests.support.exports import (
     LIMIT,
@@ -95,19 +93,29 @@ evidence.member_counts evidence.detector_sums evidence.thresholds"""
 
 
 @pytest.mark.parametrize(
-    ("guarantee", "stops", "n"),
+    ("guarantee", "stops", "n", "more"),
     [
-        ("local", "all", 600),
-        ("pooled", "some", 1500),
-        pytest.param("pooled", "all", 900, marks=pytest.mark.slow),
-        pytest.param("cost", "all", 1500, marks=pytest.mark.slow),
+        (
+            "local",
+            "all",
+            600,
+            {"reducer": "rocket", "params": {"folds": 2, "kernels": 4}, "folds": 2},
+        ),
+        ("pooled", "some", 1500, {}),
+        pytest.param("pooled", "all", 900, {}, marks=pytest.mark.slow),
+        pytest.param("cost", "all", 1500, {}, marks=pytest.mark.slow),
     ],
 )
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
-    make_data: Callable[..., Dataset], tmp_path: Path, guarantee: str, stops: Any, n: int
+    make_data: Callable[..., Dataset],
+    tmp_path: Path,
+    guarantee: str,
+    stops: Any,
+    n: int,
+    more: dict[str, Any],
 ) -> None:
     rates = {"audit_rate": 0.1, "label_within": 2000, "force_limits": ["0.1:0.15:-20:"]}
-    settings = recipe(guarantee=guarantee, stops=stops, **rates)
+    settings = recipe(guarantee=guarantee, stops=stops, window=700, **rates, **more)
     spec = TraceSpec(SAMPLES, rate_hz=500.0, limit=LIMIT)
     rng, happened, saved = np.random.default_rng(7), Counter[str](), False
     with DataEngine(recipe=settings, trace=spec, seed=3, replaying=True) as engine:
@@ -146,18 +154,6 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     assert happened.keys() >= {"novel", "audit", "not_finite", "saturated", "outside"}
     assert sum(name.startswith("safe mode") for name in happened) > (stops == "all")
     assert saved
-
-
-def test_several_channels_are_exported_too(
-    make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
-    model = fitted(make_data(150, 40, 3))
-    exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
-    assert exported.trace == TraceSpec(40, channels=3)  # rate and unit were not stated
-    # A reference that is asked about itself has no vote in the file.
-    new = make_data(100, 40, 3, seed=1).X
-    expected = [(k.lower, k.upper, k.n_success, k.n_failure) for k in model.predict_many(new)]
-    assert [decision[2:6] for decision in map(exported.decide, new)] == expected
 
 
 def test_the_file_says_what_it_is_without_being_loaded(
@@ -276,23 +272,6 @@ def test_what_cannot_be_exported_says_why_and_names_the_alternative(
         with pytest.raises(ExportError, match=words):
             export_torchscript(value, tmp_path / "model.ts")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_label_learned_in_the_cell_goes_where_the_engine_would_put_it(
-    make_data, tmp_path: Path
-) -> None:
-    new = make_data(60, SAMPLES, seed=1)
-    reducer = make_reducer("rocket", folds=2, kernels=4)
-    model = fitted(make_data(120, SAMPLES), reducer, capacity=150)
-    exported = load_exported(export_torchscript(model, tmp_path / "model.ts"))
-    for i, (x, y) in enumerate(zip(new.X, new.y, strict=True)):
-        assert exported.learn(x, bool(y)) == min(121 + i, 150)
-        model.add(x, y)
-    kept = buffers(exported)
-    spaces = content_fold(new.X[:30], model.n_spaces).tolist()
-    assert kept["references.spaces"][120:].tolist() == spaces
-    for name in ("total", "labels", "spaces", "points"):
-        assert torch.equal(kept[f"references.{name}"], getattr(model.index, name))
 
 
 def buffers(exported: ExportedModel) -> dict[str, torch.Tensor]:

@@ -26,6 +26,7 @@ from dengine import (
 )
 from dengine.errors import SettingError
 from dengine.reducers.base import LabelFree, Reducer
+from dengine.testing import toy_traces
 
 ESTIMATORS = (
     WilsonRadiusClassifier(),
@@ -77,25 +78,17 @@ def test_scikit_learns_estimator_checks_pass(estimator: Any, check: Any) -> None
     check(estimator)
 
 
-def traces(
-    n: int = 80, channels: int = 1, samples: int = 30, seed: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """(n, C, T) float32 ramps with noise, of two heights; y (n,): the higher ones are the
-    successes.
-    """
-    rng = np.random.default_rng(seed)
-    y = (np.arange(n) % 3 > 0).astype(np.int64)
-    ramp = np.linspace(0.0, 1.0, samples) * (5.0 + 3.0 * y)[:, None, None]
-    return (ramp + rng.normal(0.0, 1.0, (n, channels, samples))).astype(np.float32), y
+def traces(n: int = 80) -> tuple[np.ndarray, np.ndarray]:
+    X, y = toy_traces(n, 30, failures=0.35)
+    return X, y.astype(int)
 
 
 @pytest.mark.parametrize("name", ["conv", "umap", "umap-learn"])
 def test_random_state_is_an_integer_or_a_random_state(name: str) -> None:
     X, y = traces()
     reducer = clone(SMALL[name])
-    for state in (np.int64(3), np.random.RandomState):
-        states = [state, 3] if state == 3 else [state(7), state(7)]
-        fits = [reducer.set_params(random_state=s).fit(X, y).transform(X) for s in states]
+    for states in ((np.int64(3), 3), map(np.random.RandomState, (7, 7))):
+        fits = [reducer.set_params(random_state=state).fit_transform(X, y) for state in states]
         np.testing.assert_array_equal(*fits)
     with pytest.raises(ValueError, match="RandomState"):
         reducer.set_params(random_state=np.random.default_rng(0)).fit(X, y)

@@ -2,7 +2,6 @@
 which all is that README, tutorials and how-to need.
 """
 
-import json
 import os
 import re
 import shlex
@@ -149,26 +148,6 @@ def test_the_lock_covers_each_extra_of_a_user_and_takes_the_public_build_of_torc
     (pinned,) = re.findall("^torch==(.*)$", (repo / "constraints.txt").read_text(), flags=re.M)
     (wanted,) = re.findall(r"sed -n '(s/.*?/p)' constraints.txt", commands)
     assert run(["sed", "-n", wanted, "constraints.txt"], repo).strip() == f"torch==={pinned}"
-
-
-def test_a_lock_has_plain_versions_and_hashes_alone(repo: Path) -> None:
-    makefile = (repo / "Makefile").read_text("utf-8")
-    (program,) = re.findall(r"^define LOCKED\n(.*?)^endef$", makefile, flags=re.M | re.S)
-
-    def lock(version: str) -> subprocess.CompletedProcess[str]:
-        package = {"metadata": {"name": "package", "version": version}}
-        package["download_info"] = {"archive_info": {"hashes": {"sha256": f"{7:064}"}}}
-        checkout = {"metadata": {"name": "dengine", "version": "1"}, "download_info": {}}
-        report, command = (
-            json.dumps({"install": [package, checkout]}),
-            [sys.executable, "-c", program],
-        )
-        return subprocess.run(command, input=report, capture_output=True, text=True)
-
-    assert lock("0.7.post1").stdout == f"package==0.7.post1 --hash=sha256:{7:064}\n"
-    refused = lock("2.13.0+cpu")
-    assert (refused.returncode, refused.stdout) == (1, "")
-    assert "no package 2.13.0+cpu" in refused.stderr
 
 
 @pytest.mark.parametrize("python", ["python3.11", "python3.12", "python3.13"])

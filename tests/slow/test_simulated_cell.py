@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+from dengine import load_dataset
 from dengine.cells.simulation.cell import SimulatedCell, insert_once
 from dengine.cells.simulation.conditions import (
     SCENARIOS,
@@ -106,10 +107,8 @@ def test_a_bad_setting_says_what_was_expected() -> None:
 
 
 def test_saved_traces_come_back_within_one_step(tmp_path) -> None:
-    created = simulate(4, seed=6, n_jobs=1)
-    with np.load(save_insertions(tmp_path / "traces.npz", created)) as saved:
-        assert (saved["X"].dtype, saved["X"].shape) == (np.int16, (4, 1000))
-        step = 0.51 * float(saved["scale"].max())
-        np.testing.assert_allclose(saved["X"] * saved["scale"], traces(4, 6), atol=step)
-        assert saved["y"].tolist() == [item.success for item in created]
-        assert float(saved["rate_hz"]) == 500
+    path = save_insertions(tmp_path / "traces.npz", simulate(4, seed=6, n_jobs=1))
+    saved, step = load_dataset(path), 0.51 * float(np.load(path)["scale"].max())
+    np.testing.assert_allclose(saved.X, traces(4, 6), atol=step)
+    assert saved.y.tolist() == [item.success for item in simulate(4, seed=6, n_jobs=1)]
+    assert saved.spec == SimulatedCell.spec

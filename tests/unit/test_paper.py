@@ -49,12 +49,9 @@ def test_the_published_figures_are_the_papers(repo: Path) -> None:
 
 
 def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
-    head, _, *rows = paper_table(frame(), "conv", "wilson").splitlines()
-    assert head == "| alpha / LB | 80 % | 90 % | 95 % |"
-    assert [row.split(" | ")[0] for row in rows] == ["| 0.5", "| 0.1", "| 0.05"]
-    assert "36.9 ± 1.4 / 1019.8 ± 1.4 [36.9 / 1019.8]" in rows[1]
     some = frame().query("alpha == 0.1 or lower_bound == 0.8")
     table = paper_table(some, "conv", "wilson")  # two cells were not played
+    assert table.startswith("| alpha / LB | 80 % | 90 % | 95 % |\n")
     assert "| 0.05 | 39.6 ± 1.4 / 1151.4 ± 1.4 [39.6 / 1151.4] | - | - |" in table
 
 

@@ -8,7 +8,7 @@ import re
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from itertools import product
 from pathlib import Path
@@ -264,27 +264,6 @@ def test_rows_that_do_not_fit_are_a_fault(tmp_path: Path, layout: str, kind: str
     assert_only_fault(written, expected if "text" in layout else (), column)
 
 
-LINES = {
-    "too many": ("$", ",1"),
-    "too few": (",[^,]*$", ""),
-    "one": (",.*", ""),
-    "quote": ("^", '"'),
-}
-
-
-@pytest.mark.parametrize("layout", TEXT_LAYOUTS)
-@pytest.mark.parametrize("kind", LINES)
-def test_a_line_of_another_number_of_cells_is_a_fault(
-    tmp_path: Path, layout: str, kind: str
-) -> None:
-    written = write(tmp_path, layout, X, y, PLAIN)
-    lines = written.file.read_text().split("\n")
-    line = written.line + 7 * (layout != "wide text")
-    lines[line - 1] = re.sub(*LINES[kind], lines[line - 1])
-    written.file.write_text("\n".join(lines))
-    assert_only_fault(written, [line])
-
-
 FILES = {  # what is replaced in a file, by what; the line and the column of its fault
     "empty": (b".*", b"", 0, ""),
     "only a header": (b"\n.*", b"", 2, ""),
@@ -295,6 +274,10 @@ FILES = {  # what is replaced in a file, by what; the line and the column of its
     "other header": (b"FZ", b"FX", 1, "FZ"),
     "no header": (rb"\A[^\n]*\n", b"", 1, "time"),
     "only blanks": (b".+", b" \n \n", 0, ""),
+    "too many cells": (rb"(\n0\.014[^\n]*)", rb"\1,1", 9, ""),
+    "too few cells": (rb"(\n0\.014[^\n]*),none", rb"\1", 9, ""),
+    "one cell": (rb"\n0\.014[^\n]*", b"\n0.014", 9, ""),
+    "open quote": (rb"\n0\.014", b'\n"0.014', 9, ""),
 }
 
 
@@ -330,54 +313,35 @@ def test_a_file_that_changes_while_it_is_read_is_a_fault(tmp_path: Path, monkeyp
     assert_only_fault(written)
 
 
-def test_equal_samples_under_two_labels_are_faults_and_repeats_are_left_out(tmp_path: Path) -> None:
-    repeated, labels = X[[0, 0, 2, 3, 3]], np.array([1, 0, 1, 1, 1])
-    data = write(tmp_path, "files text", repeated, labels, PLAIN).read()
-    assert data.part.tolist() == ["2", "3"]
-    assert [fault.source[:6] for fault in data.faults] == ["part_0", "part_1", "part_4"]
-
-
-def test_a_listing_names_parts_once_and_is_no_recording(tmp_path: Path) -> None:
-    written = write(tmp_path, "files text", X, y, PLAIN)
-    (tmp_path / "part_list.csv").write_text("part,verdict\n000,OK\n1,NOK\n2,OK\n2,NOK\n4,NOK\n9,OK")
-    label = replace(LABEL, listing="part_list.csv", key="part")
-    data = load_dataset(tmp_path, replace(written.description, label=label))
-    assert data.part.tolist() == ["0", "1", "4"]
-    assert [fault.source for fault in data.faults] == ["part_2.csv", "part_3.csv"]
-    assert "1 of 5 rows of part_list.csv name no recording that was read: 9." in data.notes
-
-
 @pytest.mark.parametrize("rate", [3.0, 700.0])
-def test_a_resampled_recording_may_end_one_step_before_the_trace(rate: float) -> None:
-    clock, label = Clock(("time",), rate_hz=rate), LabelSource("y", good=("1",), bad=("0",))
-    about = Description((), "frame", "files", time=clock, channels={"FZ": Channel()}, label=label)
-    for n in range(3, 60, 4):
-        squares = np.arange(n) ** 2.0
-        table = pd.DataFrame({"time": np.arange(n) / rate, "FZ": squares, "y": 1})
-        data = load_dataset(table, replace(about, traces=TraceForm(n + 1, "resample")))
-        np.testing.assert_allclose(data.X[0, :n], squares, rtol=1e-5, atol=1e-3)
+@pytest.mark.parametrize("n", range(3, 60, 4))
+def test_a_resampled_recording_may_end_one_step_before_the_trace(rate: float, n: int) -> None:
+    squares = np.arange(n) ** 2.0
+    table = pd.DataFrame({"time": np.arange(n) / rate, "FZ": squares, "y": 1})
+    stated = f'format=frame layout=files time.column=time time.rate_hz={rate} channels.FZ="" '
+    stated += f"label.column=y label.good=1 label.bad=0 traces.samples={n + 1} "
+    stated += "traces.lengths=resample"
+    data = load_dataset(table, Description().with_values(parse_stated(stated.split())))
+    np.testing.assert_allclose(data.X[0, :n], squares, rtol=1e-5, atol=1e-3)
 
 
 # Bad input.
-
-NO_RECORDINGS = """
-none      -          Expected a file, a folder or
-.         -          dengine data {folder} --save
-empty     -          another folder? See `dengine data
-.         none.toml  Expected a description in {folder}/none.toml
-"""
 
 
 def test_one_sentence_says_what_to_type_if_there_are_no_recordings_or_no_description(
     tmp_path: Path,
 ) -> None:
-    description, empty = write(tmp_path, "files text", X, y, PLAIN).description, tmp_path / "empty"
-    empty.mkdir()
-    (empty / "recordings.toml").write_text(description.to_toml())
-    for line in NO_RECORDINGS.strip().splitlines():
-        source, about, message = re.split("  +", line)
-        with pytest.raises(DataError, match=re.escape(message.format(folder=tmp_path))):
-            load_dataset(tmp_path / source, None if about == "-" else tmp_path / about)
+    (tmp_path / "1_OK.csv").write_text("t,F\n0,1\n")
+    stated = "files=none channels.F=N label.column=y label.good=1 label.bad=0 traces.samples=3"
+    other = Description().with_values(parse_stated(stated.split()))
+    for source, description, message in (
+        (tmp_path / "none", None, "Expected a file, a folder or"),
+        (tmp_path, None, f"dengine data {tmp_path} --save"),
+        (tmp_path, other, "another folder? See `dengine data"),
+        (tmp_path, tmp_path / "none.toml", f"Expected a description in {tmp_path}/none.toml"),
+    ):
+        with pytest.raises(DataError, match=re.escape(message)):
+            load_dataset(source, description)
 
 
 NO_DESCRIPTION = """
@@ -451,25 +415,6 @@ def test_stated_sections_are_kept_and_a_question_mark_is_answered(tmp_path: Path
     write(tmp_path, "files text", X, y, PLAIN)
     proposal = describe(tmp_path, {"traces": {"samples": 7}, "time.rate_hz": "?"})
     assert (proposal.traces.samples, proposal.time.rate_hz) == (7, 500.0)
-
-
-def test_lines_of_json_under_another_suffix_are_refused_until_that_is_stated(
-    tmp_path: Path,
-) -> None:
-    path = tmp_path / "all.json"
-    path.write_text('{"ok": true, "force": [0, 2, 4]}\n{"ok": false, "force": [1, 2, 7]}')
-    with pytest.raises(DataError, match='state format="jsonl"'):
-        describe(path)
-    assert load_dataset(path, describe(path, {"format": "jsonl"})).y.tolist() == [1, 0]
-
-
-def test_a_column_of_rows_that_is_shorter_than_the_samples_is_a_fault(tmp_path: Path) -> None:
-    path = tmp_path / "all.jsonl"
-    part = '{"ok": %d, "force": [%d, 2, 4], "state": ["k", "k"]}'
-    path.write_text(f"{part % (0, 0)}\n{part % (1, 1)}")
-    stated = "rows.state.keep=k label.good=1 label.bad=0 channels.force=N traces.samples=3"
-    with pytest.raises(DataError, match="Expected columns of one length"):
-        load_dataset(path, describe(path, parse_stated(stated.split())))
 
 
 @QUICK

@@ -88,10 +88,6 @@ class Wide(Reducer):
         return np.asarray(X)[:, :2]
 
 
-class Wrong(Wide):
-    default_radius = -1.0
-
-
 OWN = [  # a reducer, its radius, its retrain_every
     ("conv", 0.07, 10),
     ("umap", 0.3, 50),
@@ -119,18 +115,6 @@ def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(
     assert {(recipe.radius, recipe.retrain_every) for recipe in ways} == {(radius, retrain_every)}
     assert ModelPrediction(reducer).classifier.radius == radius
     assert Recipe(reducer, radius=0.5).radius == 0.5
-
-
-def test_a_class_by_its_name_and_what_is_wrong_with_its_own_radius_are_read(
-    tmp_path: Path, monkeypatch
-) -> None:
-    code = "from dengine import ConvReducer\nclass Own(ConvReducer):\n    default_radius = 0.05\n"
-    (tmp_path / "own_radius_of_test_recipe.py").write_text(code, encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    by_name = Recipe.load("own_radius_of_test_recipe:Own")
-    assert (by_name.radius, by_name.retrain_every) == (0.05, 10)
-    with pytest.raises(SettingError, match="radius > 0"):
-        DataEngine(Wrong())
 
 
 def test_a_stored_recipe_imports_nothing_to_learn_a_radius() -> None:

@@ -264,8 +264,9 @@ def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was
     assert report.seconds in range(2, next(ticks) - before)  # whole seconds: of no other clock
 
 
-@pytest.mark.parametrize("name", ["seed", "policy_since", "evidence_since", "began_in"])
-def test_a_damaged_number_among_the_stores_settings_is_named(name: str) -> None:
-    texts = EngineSettings(Recipe("pca")).to_store() | {name: "3x"}
-    with pytest.raises(StoreError, match=f"Expected a {name} in the store's settings, got '3x'"):
+def test_a_damaged_number_among_the_stores_settings_is_named() -> None:
+    texts = EngineSettings(Recipe("pca")).to_store() | {"policy_since": "3x"}
+    with pytest.raises(
+        StoreError, match="Expected a policy_since in the store's settings, got '3x'"
+    ):
         EngineSettings.from_store(texts, "cell.db")

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from dengine import (
     DataEngine,
-    Dataset,
     DengineError,
     Reason,
     ReplayCell,
@@ -209,37 +208,35 @@ def test_what_cannot_honestly_be_fitted_is_refused_and_nothing_else_is(
         assert np.isfinite(fitted).all()
 
 
-def other_lengths(data: Dataset) -> list[np.ndarray]:
-    """Traces of 1 to 420 samples: cut, held, stretched, and some with faults of their own."""
-    out = []
-    for i, x in enumerate(data.X):
-        n = (98, 100, 103, 60, 150, 199, 200, 50, 49, 201, 1, 2, 420)[i % 13]
-        y = np.interp(np.linspace(0, len(x) - 1, n), np.arange(len(x)), x).astype(np.float32)
-        y[: i % 20 == 19] = np.nan
-        out.append(y)
-    return out
+LENGTHS = (98, 100, 103, 60, 150, 199, 200, 50, 49, 201, 1, 2, 420)
 
 
 @pytest.mark.parametrize("fit", FITS[1:])
-def test_engine_and_exported_file_decide_alike_on_traces_of_other_lengths(
+def test_engine_and_exported_file_decide_alike_on_traces_of_two_channels_and_other_lengths(
     fit: str, make_data, tmp_path: Path
 ) -> None:
-    engine = DataEngine("pca", trace=TraceSpec(SAMPLES, fit=fit), retrain_every=10**6)
-    learn(engine, make_data(300, samples=SAMPLES), range(300))
+    spec, actions = TraceSpec(SAMPLES, channels=2, fit=fit), set()
+    engine = DataEngine("pca", trace=spec, retrain_every=10**6)
+    learn(engine, make_data(300, SAMPLES, 2), range(300))
     engine.retrain()
     exported = load_exported(export_torchscript(engine, tmp_path / "fit.ts"))
     assert exported.trace == engine.trace
-    for x in other_lengths(make_data(130, samples=SAMPLES, seed=7)):
-        if can_fit_length(len(x), SAMPLES, FITS.index(fit)):
+    for i, x in enumerate(make_data(130, SAMPLES, 2, seed=7).X):
+        n = LENGTHS[i % 13]
+        x = np.tile(x, 5)[:, :n]
+        x[1, : i % 20 == 19] = np.nan
+        if can_fit_length(n, SAMPLES, FITS.index(fit)):
             ours, theirs = engine.decide(x), exported.decide(x)
             # The compiled fit, as a cell program calls it.
             raw = exported.module.decide(torch.from_numpy(x))
             assert row(ours) == row(theirs)
             assert tuple(raw[2:6]) == row(ours)[2:]
             np.testing.assert_array_equal(raw[6].numpy(), theirs.embedding)
-            assert (ours.reason is Reason.NOT_FINITE) == np.isnan(x[:SAMPLES]).any()
+            assert (ours.reason is Reason.NOT_FINITE) == np.isnan(x).any()
+            actions.add(ours.action)
         else:
-            with pytest.raises(TraceError, match=f"got {len(x)}"):
+            with pytest.raises(TraceError, match=f"got {n}"):
                 exported.decide(x)
-            with pytest.raises(torch.jit.Error, match="Expected one trace of 1 x 100 samples"):
+            with pytest.raises(torch.jit.Error, match="Expected one trace of 2 x 100 samples"):
                 exported.module.decide(torch.from_numpy(x))
+    assert "accept" in actions

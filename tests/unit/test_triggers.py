@@ -65,11 +65,9 @@ def test_an_insertion_begins_where_the_trigger_goes_on_after_it_was_quiet(
     active: str, quiet: int, starts: list
 ) -> None:
     finder = StartFinder(STEP, quiet * STEP)
-    results = [finder.feed(i * STEP, mark == "x") for i, mark in enumerate(active)]
-    assert [i for i, start in enumerate(results) if start] == starts
-    assert all(
-        result.seen and result.time == i * STEP for i, result in enumerate(results) if result
-    )
+    for i, mark in enumerate(active):
+        expected = Start(i * STEP, seen=True) if i in starts else None
+        assert finder.feed(i * STEP, mark == "x") == expected
 
 
 def test_a_start_in_a_gap_is_known_to_be_unseen() -> None:

@@ -132,7 +132,6 @@ def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
     except DengineError:
         assert (engine.find(id_).success, engine.state.new_labels) == (None, before)
     else:
-        assert isinstance(value, bool | int | float | np.generic | np.ndarray)
         assert value in (0, 1)
         assert engine.find(id_).success is bool(value)
 
@@ -183,14 +182,11 @@ def test_a_damaged_journal_is_read_or_refused(folder: Path, content: bytes) -> N
         read_journal(folder / "damaged.csv", SPEC)
 
 
-@given(
-    labels=st.lists(st.sampled_from([0, 1]) | anything, min_size=3, max_size=3),
-    X=st.just(X[:3]) | traces,
-)
+@given(labels=st.lists(st.sampled_from([0, 1]) | anything, min_size=3, max_size=3))
 @tries(0.3)
-def test_odd_arrays_and_labels_are_imported_or_refused(labels: list[Any], X: Any) -> None:
+def test_odd_labels_are_imported_or_refused(labels: list[Any]) -> None:
     with suppress(DengineError):
-        import_labelled(open_store(None), (X, labels), recipe="pca")
+        import_labelled(open_store(None), (X[:3], labels), recipe="pca")
 
 
 def must_be_one_line(words: list[str]) -> None:
