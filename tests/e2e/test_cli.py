@@ -53,7 +53,7 @@ def save(path: Path, data: Dataset, **more: object) -> Path:
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
     """160 traces of 40 samples in two easy shapes, and their labels."""
     return save(tmp_path_factory.mktemp("data") / "easy.npz", easy_parts(160, 0))
 
@@ -63,14 +63,14 @@ def n_rows(table: Path) -> int:
 
 
 @pytest.fixture(scope="module")
-def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(data, tmp_path_factory):
     store = tmp_path_factory.mktemp("store") / "engine.db"
     succeed("train", "--data", data, "--store", store, "--reducer", "pca", *POLICY)
     return store
 
 
 @pytest.fixture
-def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_folder(tmp_path, monkeypatch):
     """A folder with reducers of one's own, in which the command is called."""
     (tmp_path / "his.py").write_text(OWN_REDUCERS)
     monkeypatch.chdir(tmp_path)
@@ -79,7 +79,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     sys.modules.pop("his", None)
 
 
-def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
+def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy():
     command = [sys.executable, "-X", "importtime", "-m", "dengine", "-h"]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     # Where lines break depends on the length of the program's name.
@@ -90,7 +90,7 @@ def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """What examples name: a trained engine.db of a part of the bundled set, backup.db, its copy, and
     cell.csv, a journal of two of its traces.
     """
@@ -107,9 +107,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 # The example of serve is what `tests.support.serving.started` types.
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "serve"])
-def test_every_help_ends_in_a_command_that_works(
-    verb: str, folder: Path, tmp_path: Path, monkeypatch, make_data
-) -> None:
+def test_every_help_ends_in_a_command_that_works(verb, folder, tmp_path, monkeypatch, make_data):
     if verb == "simulate":
         pytest.importorskip("mujoco")
     for file in () if verb in ("run", "train") else folder.iterdir():  # these two make a store
@@ -122,9 +120,7 @@ def test_every_help_ends_in_a_command_that_works(
     succeed(named, *words, *LESS.get(verb, "").split())
 
 
-def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(
-    data: Path, tmp_path: Path
-) -> None:
+def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(data, tmp_path):
     asked = f"replay --data {data} --reducer pca --repeats 2 --cycles 100".split() + POLICY
     shown = line_of(*asked, "--out", tmp_path, "--explain")
     for words in ("retrains, the worst in", "FP: bad parts accepted", "pca (local)"):
@@ -138,9 +134,7 @@ def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(
     assert row["precision"] is row["promise_kept"] is None  # nothing was accepted
 
 
-def test_a_trained_store_holds_every_label_once_and_an_answering_version(
-    trained: Path, data: Path
-) -> None:
+def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained, data):
     again = document("train", "--data", data, "--store", trained)["import"]
     assert (again["imported"], again["repeated"], again["resumed"]) == (0, 160, True)
     shown, text = document("status", trained), line_of("status", trained)
@@ -151,7 +145,7 @@ def test_a_trained_store_holds_every_label_once_and_an_answering_version(
         assert engine.decide(easy_parts(1, 0).X[0]).predicted != "verify"
 
 
-def test_training_goes_on_after_retrains_without_a_step(tmp_path: Path, monkeypatch) -> None:
+def test_training_goes_on_after_retrains_without_a_step(tmp_path, monkeypatch):
     data, store = save(tmp_path / "easy.npz", easy_parts(20, 0)), tmp_path / "e.db"
     words = f"train --data {data} --store {store}".split()
     with monkeypatch.context() as busy:
@@ -168,9 +162,7 @@ def test_training_goes_on_after_retrains_without_a_step(tmp_path: Path, monkeypa
     assert "nothing was done" in line_of(*words)
 
 
-def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(
-    data: Path, tmp_path: Path
-) -> None:
+def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data, tmp_path):
     store = tmp_path / "e.db"
     words = f"run --cell replay --data {data} --store {store} --out {tmp_path} --force".split()
     first = document(*words, "--reducer", "pca", *POLICY, "--cycles", 110)
@@ -188,7 +180,7 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(
     assert re.search(r"at most 2\d cycles, got 60", more.stderr)
 
 
-def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) -> None:
+def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path):
     pytest.importorskip("mujoco")
     words = f"run --cell simulated --cycles 2 --reducer pca --store {tmp_path}/e.db".split()
     assert "simulated" in succeed(*words).lower()
@@ -202,7 +194,7 @@ replay --data DATA --cycles 5000; replay --data DATA --channel FX; simulate --n 
 run --cell replay --data DATA --store e.db --reducer nowhere:Nothing"""
 
 
-def test_a_foreseen_failure_is_one_line_and_exit_code_1(data: Path, own_folder: Path) -> None:
+def test_a_foreseen_failure_is_one_line_and_exit_code_1(data, own_folder):
     for words in re.split("; |\n", FAILING):
         result = dengine(*words.replace("DATA", str(data)).split(), "--json")
         assert [path.name for path in own_folder.iterdir()] == ["his.py"]
@@ -210,7 +202,7 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(data: Path, own_folder: 
         assert result.stderr.startswith("Error: Expected")
 
 
-def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected() -> None:
+def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected():
     for line in WRONG.strip().splitlines():
         words, expected = re.split("  +", line)
         result = dengine(*words.split())
@@ -218,9 +210,7 @@ def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected() -> None:
         assert expected in " ".join(result.stderr.split())
 
 
-def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
-    tmp_path: Path, monkeypatch
-) -> None:
+def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr("dengine.cli.options.find_spec", lambda name: None)
     monkeypatch.chdir(tmp_path)
     for words in ("run --cell simulated --cycles 3 --store e.db", "simulate --n 3 --out x.npz"):
@@ -229,8 +219,8 @@ def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
 
 
 def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is_certified(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     parts, store = easy_parts(700, 1, wave=slice(300, 400)), tmp_path / "engine.db"
     data = save(tmp_path / "changing.npz", parts, serial=parts.part)
     succeed("data", data, "--set", "part.column=serial", "--set", "channels.X=N", "--save")
@@ -250,7 +240,7 @@ def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is
     assert "safe mode too" not in line_of("status", store)
 
 
-def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder: Path) -> None:
+def test_an_interrupted_replay_reports_what_was_finished(data, own_folder):
     words = f"replay --data {data} --reducer his:Interrupting --cycles 60 --repeats 50 --out out"
     result = dengine(*words.split(), *POLICY)
     assert result.exit_code == INTERRUPTED
@@ -260,7 +250,7 @@ def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder:
     assert (own_folder / "out" / "curves.png").is_file()
 
 
-def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_folder: Path) -> None:
+def test_an_interrupted_run_keeps_every_cycle_that_it_names(data, own_folder):
     words = f"run --cell replay --data {data} --cycles 160 --store e.db --reducer his:Interrupting"
     result = dengine(*words.split(), "--lower-bound", 0.99, "--out", "out")
     assert result.exit_code == INTERRUPTED
@@ -289,9 +279,7 @@ train                             Missing option
 """
 
 
-def test_an_interrupted_import_says_how_far_it_came_and_goes_on_there(
-    tmp_path: Path, monkeypatch
-) -> None:
+def test_an_interrupted_import_says_how_far_it_came_and_goes_on_there(tmp_path, monkeypatch):
     easy = easy_parts(160, 0)
     easy.X[0, 3], easy.X[1], easy.X[2:8] = np.nan, 7.0, easy.X[2]  # bad, and equal ones
     data, store = save(tmp_path / "easy.npz", easy), tmp_path / "e.db"

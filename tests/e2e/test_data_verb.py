@@ -1,14 +1,13 @@
 """`dengine data`, which describes recordings, and the other verbs, which read by that."""
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Description, load_dataset
+from dengine import DataEngine, Description, load_dataset
 from dengine.datasets.sample import write_sample
 from dengine.experiments.survey import survey_dataset
 from tests.support.command_line import dengine, document, well
@@ -22,7 +21,7 @@ def shown(*words: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recorded(tmp_path_factory):
     """24 recordings as UR cells make them, one of them broken."""
     path = tmp_path_factory.mktemp("recorded")
     write_sample(path, 24)
@@ -30,13 +29,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(recorded: Path, tmp_path: Path) -> Path:
+def folder(recorded, tmp_path):
     return Path(shutil.copytree(recorded, tmp_path / "cell_3"))
 
 
-def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(folder, tmp_path):
     text = shown("data", folder, "--out", tmp_path / "out")
     assert 'FZ_Base = ""' in text
     assert "write the description with --save" in text
@@ -50,9 +47,7 @@ def test_a_proposal_is_shown_read_and_drawn_but_written_only_when_asked(
     assert "--force" in refused("data", folder, "--save")
 
 
-def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(folder, tmp_path):
     words = f"replay --data {folder} --reducer pca --repeats 1 --cycles 15".split()
     assert f"dengine data {folder} --save" in refused(*words)
     shown("data", folder, "--save")
@@ -64,7 +59,7 @@ def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(
         assert engine.decide(np.linspace(0.0, 30.0, 998)).reason != "not_finite"
 
 
-def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder: Path) -> None:
+def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder):
     shown("data", folder, "--save")
     refused("data", folder, "--check", "--json")
     faults = load_dataset(folder).faults
@@ -74,7 +69,7 @@ def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder: Path) -> N
     assert "made for" in shown("data", folder, "--check")
 
 
-def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset]) -> None:
+def test_what_is_wrong_with_traces_is_counted(make_data):
     data = make_data(120, samples=60)
     X, y = data.X.copy(), data.y.copy()
     X[3, 5], X[4], X[5, 5] = np.nan, 2.0, -3e38
@@ -88,8 +83,8 @@ def test_what_is_wrong_with_traces_is_counted(make_data: Callable[..., Dataset])
 
 
 def test_drift_is_seen_where_there_is_some_and_only_there(
-    make_data: Callable[..., Dataset],
-) -> None:
+    make_data,
+):
     data = make_data(300, samples=60)
     y = (np.random.default_rng(1).random(300) < np.linspace(1.0, 0.3, 300)).astype(np.int8)
     drifting = replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)

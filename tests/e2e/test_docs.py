@@ -89,7 +89,7 @@ def name(page: Path) -> str:
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Path:
+def desk(tmp_path):
     """A folder that keeps what the commands write, with nothing in it but a small set."""
     X, y = recordings()
     # In the place of a large set.
@@ -175,9 +175,7 @@ def typed_pages() -> list:
 
 
 @pytest.mark.parametrize("page", typed_pages())
-def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(
-    page: Path, desk: Path
-) -> None:
+def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(page, desk):
     type_page(page, desk)
 
 
@@ -192,7 +190,7 @@ def type_page(page: Path, desk: Path) -> None:
             type_in(command, desk)
 
 
-def test_every_shortened_command_is_on_a_page() -> None:
+def test_every_shortened_command_is_on_a_page():
     commands = [command for page in PAGES for block in blocks(page) for command in block.commands]
     assert [
         key for key in SMALLER if not any(command.startswith(key) for command in commands)
@@ -201,8 +199,8 @@ def test_every_shortened_command_is_on_a_page() -> None:
 
 @pytest.mark.slow
 def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(
-    desk: Path,
-) -> None:
+    desk,
+):
     (suggested,) = re.findall(
         r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8")
     )

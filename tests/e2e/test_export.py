@@ -44,13 +44,13 @@ from tests.support.exports import (
 
 
 @pytest.fixture(scope="module")
-def audited(make_data: Callable[..., Dataset]) -> Iterator[DataEngine]:
+def audited(make_data):
     with trained(make_data(400, SAMPLES), audit_rate=0.3) as engine:
         yield engine
 
 
 @pytest.fixture(scope="module")
-def file(audited: DataEngine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(audited, tmp_path_factory):
     return export_torchscript(audited, tmp_path_factory.mktemp("export") / "model.ts")
 
 
@@ -74,8 +74,8 @@ def a_stream(
 
 
 def test_a_plain_torch_load_decides_by_calling_the_module_and_reads_the_seven_fields(
-    file: Path, make_data: Callable[..., Dataset]
-) -> None:
+    file, make_data
+):
     plain, exported = torch.jit.load(str(file)), load_exported(file)
     for x in wild_traces(make_data(30, SAMPLES, seed=9).X)[:40]:
         called, expected = (
@@ -107,13 +107,13 @@ evidence.member_counts evidence.detector_sums evidence.thresholds"""
     ],
 )
 def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
-    make_data: Callable[..., Dataset],
-    tmp_path: Path,
-    guarantee: str,
-    stops: Any,
-    n: int,
-    more: dict[str, Any],
-) -> None:
+    make_data,
+    tmp_path,
+    guarantee,
+    stops,
+    n,
+    more,
+):
     rates = {"audit_rate": 0.1, "label_within": 2000, "force_limits": ["0.1:0.15:-20:"]}
     settings = recipe(guarantee=guarantee, stops=stops, window=700, **rates, **more)
     spec = TraceSpec(SAMPLES, rate_hz=500.0, limit=LIMIT)
@@ -156,9 +156,7 @@ def test_the_file_decides_and_learns_as_the_engine_does_until_its_next_retrain(
     assert saved
 
 
-def test_the_file_says_what_it_is_without_being_loaded(
-    audited: DataEngine, file: Path, monkeypatch
-) -> None:
+def test_the_file_says_what_it_is_without_being_loaded(audited, file, monkeypatch):
     monkeypatch.setattr(torch.jit, "load", lambda *a, **k: pytest.fail("the code was loaded"))
     metadata = metadata_of(read_checked(file), file)
     assert metadata["trace"] == asdict(TraceSpec(SAMPLES, 500.0, limit=LIMIT)) | {"columns": []}
@@ -170,7 +168,7 @@ def test_the_file_says_what_it_is_without_being_loaded(
     assert file.with_name("model.ts.sha256").read_text() == f"{digest}  model.ts\n"
 
 
-def test_loading_unpickles_nothing_in_python(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loading_unpickles_nothing_in_python(file, monkeypatch):
     import pickle
 
     for name in ("load", "loads", "Unpickler"):
@@ -185,7 +183,7 @@ def sum_anew(path: Path) -> None:
 
 
 @pytest.fixture
-def copy(file: Path, tmp_path: Path) -> Path:
+def copy(file, tmp_path):
     target = tmp_path / "model.ts"
     target.write_bytes(file.read_bytes())
     sum_anew(target)
@@ -193,7 +191,7 @@ def copy(file: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", ["flip", "truncation", "swap"])
-def test_every_damaged_file_is_refused(copy: Path, kind: str) -> None:
+def test_every_damaged_file_is_refused(copy, kind):
     content, rng = copy.read_bytes(), np.random.default_rng(1)
     for i, j in np.sort(rng.integers(len(content) - 512, size=(20, 2))).tolist():
         flipped, other_block = bytes([content[i] ^ 1 << j % 8]), content[j : j + 512]
@@ -235,14 +233,14 @@ FOREIGN: dict[str, Callable[[Path], Any]] = {  # by what is said of it
 
 
 @pytest.mark.parametrize("words", FOREIGN)
-def test_a_foreign_file_with_its_sum_is_refused(copy: Path, words: str) -> None:
+def test_a_foreign_file_with_its_sum_is_refused(copy, words):
     FOREIGN[words](copy)
     sum_anew(copy)
     with pytest.raises(ExportError, match=words):
         load_exported(copy)
 
 
-def test_a_missing_file_or_sum_is_named(copy: Path) -> None:
+def test_a_missing_file_or_sum_is_named(copy):
     total = copy.with_name("model.ts.sha256")
     with pytest.raises(ExportError, match=r"other\.ts cannot be read: No such file"):
         load_exported(copy.with_name("other.ts"))
@@ -255,9 +253,7 @@ def test_a_missing_file_or_sum_is_named(copy: Path) -> None:
         load_exported(copy)
 
 
-def test_what_cannot_be_exported_says_why_and_names_the_alternative(
-    data: Dataset, tmp_path: Path
-) -> None:
+def test_what_cannot_be_exported_says_why_and_names_the_alternative(data, tmp_path):
     missed = fitted(data)
     missed.rule_is_stale = True
     baseline = type("Thing", (), {"model": object()})()
@@ -280,8 +276,8 @@ def buffers(exported: ExportedModel) -> dict[str, torch.Tensor]:
 
 
 def test_checking_a_file_teaches_it_nothing_and_what_waits_is_kept_apart_from_what_is_told(
-    make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
+    make_data, tmp_path
+):
     """The file accepts whatever comes, and silence confirms it."""
     data, new = make_data(300, SAMPLES, failures=0.02), make_data(4, SAMPLES, seed=4).X
     lenient = {"lower_bound": 0.6, "stops": "all", "radius": 10.0, "novelty": 0.0}

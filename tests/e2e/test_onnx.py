@@ -4,16 +4,12 @@ not be used.
 
 import hashlib
 import re
-from collections.abc import Callable
 from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from dengine import (
-    Dataset,
     ModelPrediction,
     TraceSpec,
     export_torchscript,
@@ -33,16 +29,14 @@ BALLS = [{}, pytest.param({"interval": "binomial", "radius": 0.5}, marks=pytest.
 
 
 @pytest.fixture(scope="module")
-def file(make_data: Callable[..., Dataset], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(make_data, tmp_path_factory):
     return export_onnx(
         fitted(make_data(300)), tmp_path_factory.mktemp("onnx") / "model.onnx", trace=SPEC
     )
 
 
 @pytest.mark.parametrize("ball", BALLS)
-def test_both_formats_decide_alike(
-    file: Path, make_data: Callable[..., Dataset], tmp_path: Path, ball: dict[str, Any]
-) -> None:
+def test_both_formats_decide_alike(file, make_data, tmp_path, ball):
     model = fitted(make_data(300), **ball)
     first = load_onnx(export_onnx(model, tmp_path / "model.onnx", trace=SPEC) if ball else file)
     two = load_exported(export_torchscript(model, tmp_path / "model.ts", trace=SPEC))
@@ -72,9 +66,7 @@ EVERYTHING = (
 )
 
 
-def test_what_the_twin_cannot_do_is_refused(
-    data: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_the_twin_cannot_do_is_refused(data, tmp_path, monkeypatch):
     hashes = np.arange(1, len(data) + 1)
     hashes[7] = hashes[3]
     limits = {"guarantee": "pooled", "stops": "all", "force_limits": ("0.01:0.1:-50:50",)}
@@ -95,7 +87,7 @@ def test_what_the_twin_cannot_do_is_refused(
     assert not any(tmp_path.iterdir())
 
 
-def test_a_damaged_file_and_a_foreign_one_are_refused(file: Path, tmp_path: Path) -> None:
+def test_a_damaged_file_and_a_foreign_one_are_refused(file, tmp_path):
     metadata = load_onnx(file).metadata
     assert (metadata["format"], metadata["learns"], metadata["references"]) == ("onnx", False, 300)
     with pytest.raises(TraceError, match="Expected 100 samples, got 98"):

@@ -2,8 +2,6 @@
 traces.
 """
 
-from typing import Any
-
 import numpy as np
 import pytest
 from sklearn.base import clone
@@ -74,7 +72,7 @@ label_using = pytest.mark.parametrize("name", ["conv", "rocket", "cross-fitted"]
 @parametrize_with_checks(
     list(ESTIMATORS), expected_failed_checks=lambda item: EXCLUDED.get(type(item), {})
 )
-def test_scikit_learns_estimator_checks_pass(estimator: Any, check: Any) -> None:
+def test_scikit_learns_estimator_checks_pass(estimator, check):
     check(estimator)
 
 
@@ -84,7 +82,7 @@ def traces(n: int = 80) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["conv", "umap", "umap-learn"])
-def test_random_state_is_an_integer_or_a_random_state(name: str) -> None:
+def test_random_state_is_an_integer_or_a_random_state(name):
     X, y = traces()
     reducer = clone(SMALL[name])
     for states in ((np.int64(3), 3), map(np.random.RandomState, (7, 7))):
@@ -95,7 +93,7 @@ def test_random_state_is_an_integer_or_a_random_state(name: str) -> None:
 
 
 @label_using
-def test_of_two_classes_the_larger_is_the_success(name: str) -> None:
+def test_of_two_classes_the_larger_is_the_success(name):
     X, y = traces()
     expected = clone(SMALL[name]).fit(X, y).transform(X)
     for names in (("bad", "good"), (False, True), (1, 2)):
@@ -117,14 +115,14 @@ def test_of_two_classes_the_larger_is_the_success(name: str) -> None:
     ],
 )
 def test_labels_that_are_not_of_two_classes_are_refused_in_scikit_learns_words(
-    name: str, labels, message: str
-) -> None:
+    name, labels, message
+):
     with pytest.raises(SettingError, match=message):
         clone(SMALL[name]).fit(traces()[0], labels)
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_a_pipeline_of_a_reducer_and_our_classifier_beats_the_base_rate(name: str) -> None:
+def test_a_pipeline_of_a_reducer_and_our_classifier_beats_the_base_rate(name):
     X, y = traces()
     in_one_unit = StandardScaler(), WilsonRadiusClassifier(radius=0.5)
     pipeline = make_pipeline(clone(SMALL[name]), *in_one_unit)
@@ -132,7 +130,7 @@ def test_a_pipeline_of_a_reducer_and_our_classifier_beats_the_base_rate(name: st
 
 
 @pytest.mark.parametrize("name", [n for n in SMALL if n not in ("umap-learn", "label-free")])
-def test_a_transform_places_a_trace_bit_for_bit_whatever_is_beside_it(name: str) -> None:
+def test_a_transform_places_a_trace_bit_for_bit_whatever_is_beside_it(name):
     X, y = traces(200)
     reducer = clone(SMALL[name]).fit(X, y)
     Z, order = reducer.transform(X), np.random.default_rng(0).permutation(len(X))

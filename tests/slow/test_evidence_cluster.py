@@ -34,8 +34,8 @@ def rows(folder: Path) -> list[list[object]]:
 
 
 def test_evidence_outlives_a_killed_worker_and_a_kill_of_its_own_and_has_the_same_rows(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     import distributed
 
     local, folder = tmp_path / "local", tmp_path / "cluster"

@@ -14,13 +14,13 @@ CAUSES = {"missed_grasp", "rim_contact", "wedging", "stuck", "slip", "debris", "
 
 
 @pytest.fixture(scope="module")
-def stored() -> dict[str, np.ndarray]:
+def stored():
     with (DATA / "insertion.npz").open("rb") as file, np.load(file, allow_pickle=False) as arrays:
         return dict(arrays)
 
 
 @pytest.fixture(scope="module")
-def traces(stored: dict[str, np.ndarray]) -> np.ndarray:
+def traces(stored):
     return (stored["X"] * stored["scale"]).astype(np.float32)
 
 
@@ -29,17 +29,15 @@ def accuracy(X: np.ndarray, y: np.ndarray, model: object) -> float:
     return float(cross_val_score(model, X, y, cv=shuffled).mean())
 
 
-def test_the_counts_are_those_of_the_paper_and_no_trace_comes_twice(
-    stored: dict[str, np.ndarray], traces
-) -> None:
+def test_the_counts_are_those_of_the_paper_and_no_trace_comes_twice(stored, traces):
     assert (stored["X"].shape, stored["X"].dtype) == ((1503, 1000), np.int16)
     assert np.bincount(stored["y"]).tolist() == [700, 803]
     assert len(np.unique(traces, axis=0)) == len(traces)
 
 
 def test_labels_are_the_height_alone_and_every_failure_has_a_cause(
-    stored: dict[str, np.ndarray],
-) -> None:
+    stored,
+):
     np.testing.assert_array_equal(stored["y"] == 1, np.abs(stored["height_mm"]) <= 0.5)
     np.testing.assert_array_equal(stored["cause"] == "none", stored["y"] == 1)
     names, counts = np.unique(stored["cause"][stored["y"] == 0], return_counts=True)
@@ -47,15 +45,11 @@ def test_labels_are_the_height_alone_and_every_failure_has_a_cause(
     assert counts.min() >= 20
 
 
-def test_the_nearest_neighbour_is_right_in_92_to_96_percent(
-    stored: dict[str, np.ndarray], traces: np.ndarray
-) -> None:
+def test_the_nearest_neighbour_is_right_in_92_to_96_percent(stored, traces):
     assert 0.92 <= accuracy(traces, stored["y"], KNeighborsClassifier(1)) <= 0.96
 
 
-def test_nothing_before_contact_and_nothing_of_the_sensor_tells_the_outcome(
-    stored, traces: np.ndarray
-) -> None:
+def test_nothing_before_contact_and_nothing_of_the_sensor_tells_the_outcome(stored, traces):
     before, names = traces[:, :BEFORE_CONTACT], stored["condition_names"].tolist()
     sensor = "noise_n ripple_n ripple_hz bias_n drift_n step_n dropped_share delay_s"
     features = {

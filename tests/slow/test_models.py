@@ -12,8 +12,8 @@ MODELS = sorted((Path(__file__).parents[2] / "models").glob("*/model.ts"))
 
 @pytest.mark.parametrize("path", MODELS, ids=lambda p: p.parent.name)
 def test_a_shipped_model_is_certain_and_right_of_most_of_its_own_data_and_its_card_says_what_made_it(
-    path: Path,
-) -> None:
+    path,
+):
     model, data = load_exported(path), load_dataset("insertion")
     assert model.metadata["references"] == len(data)
     actions = np.array([model.decide(x).action for x in data.X[:300]])

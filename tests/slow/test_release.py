@@ -60,7 +60,7 @@ def find_interpreter(name: str) -> str | None:
 
 
 @pytest.fixture(scope="module")
-def distributions(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def distributions(repo, tmp_path_factory):
     """Folder with the sdist, and the wheel that is built from it."""
     if shutil.which("git") is None:
         pytest.skip("git, which lists the files of a release, is not on this machine")
@@ -74,7 +74,7 @@ def distributions(repo: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.merge
-def test_both_files_pass_the_checks_of_the_package_index(distributions: Path) -> None:
+def test_both_files_pass_the_checks_of_the_package_index(distributions):
     files = sorted(distributions.iterdir())
     assert {"".join(file.suffixes)[-4:] for file in files} == {".whl", "r.gz"}
     command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, files)]
@@ -82,7 +82,7 @@ def test_both_files_pass_the_checks_of_the_package_index(distributions: Path) ->
 
 
 @pytest.fixture(scope="module")
-def installed(distributions: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed(distributions, tmp_path_factory):
     """The Python of an environment with the wheel, and with the other packages of this one."""
     folder = tmp_path_factory.mktemp("installed")
     run(f"'{sys.executable}' -m venv --without-pip venv", folder)
@@ -96,9 +96,7 @@ def installed(distributions: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 @pytest.mark.merge
-def test_the_wheel_and_the_sdist_have_dengine_whole_and_no_other_package(
-    distributions: Path, repo: Path
-) -> None:
+def test_the_wheel_and_the_sdist_have_dengine_whole_and_no_other_package(distributions, repo):
     (wheel,) = distributions.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     information = f"dengine-{dengine.__version__}.dist-info"
@@ -116,8 +114,8 @@ def test_the_wheel_and_the_sdist_have_dengine_whole_and_no_other_package(
 
 @pytest.mark.merge
 def test_the_wheel_works_where_there_is_no_checkout_and_an_engine_with_pca_loads_nothing_heavy(
-    installed: Path,
-) -> None:
+    installed,
+):
     printed = run([str(installed), "-I", "-c", USE], installed.parent)
     where, loaded, size, played = printed.splitlines()
     assert Path(where).is_relative_to(installed.parents[1])
@@ -127,8 +125,8 @@ def test_the_wheel_works_where_there_is_no_checkout_and_an_engine_with_pca_loads
 
 @pytest.mark.parametrize("pages", TYPED)
 def test_the_commands_of_a_page_run_in_an_empty_folder_with_the_wheel_alone(
-    pages: str, installed: Path, repo: Path, tmp_path: Path
-) -> None:
+    pages, installed, repo, tmp_path
+):
     chosen = ["-k", f"from_top_to_bottom and {pages}", f"--basetemp={tmp_path / 'typed'}"]
     options = ["-p", "no:xdist", "-p", "no:cacheprovider", "-o", "addopts=--import-mode=importlib"]
     test = repo / "tests" / "e2e" / "test_docs.py"
@@ -137,8 +135,8 @@ def test_the_commands_of_a_page_run_in_an_empty_folder_with_the_wheel_alone(
 
 
 def test_the_lock_covers_each_extra_of_a_user_and_takes_the_public_build_of_torch(
-    repo: Path,
-) -> None:
+    repo,
+):
     makefile = (repo / "Makefile").read_text("utf-8")
     (extras,) = re.findall(r"^EXTRAS = (.*)$", makefile, flags=re.M)
     project = tomllib.loads((repo / "pyproject.toml").read_text("utf-8"))["project"]
@@ -152,8 +150,8 @@ def test_the_lock_covers_each_extra_of_a_user_and_takes_the_public_build_of_torc
 
 @pytest.mark.parametrize("python", ["python3.11", "python3.12", "python3.13"])
 def test_with_its_dependencies_from_the_index_the_wheel_runs_the_readmes_example(
-    python: str, distributions: Path, repo: Path, tmp_path: Path
-) -> None:
+    python, distributions, repo, tmp_path
+):
     interpreter = find_interpreter(python)
     if interpreter is None:
         pytest.skip(f"{python} is not on this machine")

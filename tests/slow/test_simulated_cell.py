@@ -36,9 +36,7 @@ def good(**changes: float | str) -> Conditions:
     )
 
 
-def test_a_well_aligned_part_meets_the_bottom_late_and_one_beside_the_hole_rests_on_the_rim() -> (
-    None
-):
+def test_a_well_aligned_part_meets_the_bottom_late_and_one_beside_the_hole_rests_on_the_rim():
     pushed = push(good())
     assert abs(pushed.height_mm) < 0.5
     force = pushed.force
@@ -53,13 +51,13 @@ def traces(n: int, seed: int, n_jobs: int = 1) -> np.ndarray:
     return np.stack([item.trace for item in simulate(n, seed=seed, n_jobs=n_jobs)])
 
 
-def test_a_trace_depends_on_seed_and_cycle_only() -> None:
+def test_a_trace_depends_on_seed_and_cycle_only():
     few = traces(3, 9)
     np.testing.assert_array_equal(few, traces(6, 9, n_jobs=2)[:3])
     assert not np.array_equal(few, traces(3, 10))
 
 
-def test_the_cell_still_makes_the_bundled_traces() -> None:
+def test_the_cell_still_makes_the_bundled_traces():
     with (files("dengine") / "data" / "insertion.npz").open("rb") as file, np.load(file) as stored:
         bundled, cycles = stored["X"][:5] * stored["scale"], stored["cycle"][:5]
         seed = int(stored["seed"])
@@ -68,7 +66,7 @@ def test_the_cell_still_makes_the_bundled_traces() -> None:
     assert np.median(np.abs(created - bundled)) < 0.02
 
 
-def test_the_clock_charges_cycles_verifications_and_stops() -> None:
+def test_the_clock_charges_cycles_verifications_and_stops():
     cell = SimulatedCell(replace(ALWAYS_MISSED, unreported_share=0.0))
     cell.insert()
     assert not cell.verify()
@@ -85,7 +83,7 @@ def test_the_clock_charges_cycles_verifications_and_stops() -> None:
     assert cell.clock == 47 + 47 + 5
 
 
-def test_scenarios_change_what_they_say_and_nothing_else() -> None:
+def test_scenarios_change_what_they_say_and_nothing_else():
     base = CellParameters()
     changed = {"nominal": "", "bias_jump": "bias_offset_n", "wear": "friction"}
     changed |= {"variant": "part_mass_kg clearance_mm chamfer_mm"}
@@ -97,7 +95,7 @@ def test_scenarios_change_what_they_say_and_nothing_else() -> None:
     assert SCENARIOS["wear"](base, 99, 100).friction[0] == pytest.approx(base.friction[0] + 0.35)
 
 
-def test_a_bad_setting_says_what_was_expected() -> None:
+def test_a_bad_setting_says_what_was_expected():
     with pytest.raises(SettingError, match="nominal, wear, variant, bias_jump"):
         find_scenario("rain")
     with pytest.raises(SettingError, match="at least 1"):
@@ -106,7 +104,7 @@ def test_a_bad_setting_says_what_was_expected() -> None:
         push(good(), time_step_s=0.0007)
 
 
-def test_saved_traces_come_back_within_one_step(tmp_path) -> None:
+def test_saved_traces_come_back_within_one_step(tmp_path):
     path = save_insertions(tmp_path / "traces.npz", simulate(4, seed=6, n_jobs=1))
     saved, step = load_dataset(path), 0.51 * float(np.load(path)["scale"].max())
     np.testing.assert_allclose(saved.X, traces(4, 6), atol=step)

@@ -25,12 +25,12 @@ Run = Callable[..., str]
 
 
 @pytest.fixture(autouse=True)
-def _beside_the_scripts(monkeypatch) -> None:
+def _beside_the_scripts(monkeypatch):
     monkeypatch.syspath_prepend(str(FOLDER))  # as `python training/NAME.py` has it
 
 
 @pytest.fixture
-def run(monkeypatch, capsys) -> Run:
+def run(monkeypatch, capsys):
     """Runs a script's main in this process; what it printed."""
 
     def run_script(name: str, words: str = "") -> str:
@@ -41,7 +41,7 @@ def run(monkeypatch, capsys) -> Run:
     return run_script
 
 
-def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_path: Path) -> None:
+def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run, tmp_path):
     words = "--seeds=0:3 --only=conv,knn --sets='opposite,screw driving' --cycles=150 --n-jobs=1"
     words += f" --out={tmp_path} --keep={tmp_path}/kept"
     first = run("evidence", words)
@@ -65,7 +65,7 @@ def test_the_evidence_plays_nothing_twice_and_compares_by_pairs(run: Run, tmp_pa
     assert (folder / "index.md").read_text("utf-8") == page
 
 
-def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_condition() -> None:
+def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_condition():
     settings = {"set": "drift", "interval": "wilson", "alpha": 0.1, "lower_bound": 0.9}
     old = pd.DataFrame(
         {"recipe": ["pca", "pca", "conv", "conv"], "seed": [1, 2] * 2, "commit": "a"}
@@ -76,9 +76,7 @@ def test_a_row_of_the_evidence_gives_way_where_another_commit_plays_its_conditio
     assert merged.to_numpy().tolist() == [["conv", 2, "b"], ["pca", 1, "a"], ["pca", 2, "a"]]
 
 
-def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(
-    run: Run, tmp_path: Path
-) -> None:
+def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeated(run, tmp_path):
     steps = [([0.0, 0.0024, 0.0036], [0.0, 0.2, 0.3]), ([0.0036, 0.0048], [0.3, 0.5])]
     graphs = [{"graph": {"time values": time, "torque values": torque}} for time, torque in steps]
     for cycle, part, result in ((7, "a", "NOK"), (5, "a", "OK"), (6, "b", "OK")):
@@ -92,8 +90,8 @@ def test_screw_driving_steps_are_joined_on_one_grid_and_the_last_value_is_repeat
 
 
 def test_a_trained_encoder_beats_the_base_rate_starts_conv_and_has_its_section_of_the_card(
-    run: Run, tmp_path: Path
-) -> None:
+    run, tmp_path
+):
     X, y = toy_traces(120)
     np.savez(tmp_path / "toy.npz", X=X, y=y)
     card = tmp_path / "card.md"
@@ -123,8 +121,8 @@ docs/results/index.md       /| insertion | 1503 | 992 |/| insertion | 1503 | 929
 
 
 def test_every_figure_that_a_file_holds_is_as_in_the_file_and_a_changed_one_is_found(
-    run: Run, tmp_path: Path, monkeypatch, capsys
-) -> None:
+    run, tmp_path, monkeypatch, capsys
+):
     with pytest.raises(SystemExit, match="0"):
         run("list_figures")
     assert " 0 wrong" in capsys.readouterr().out
@@ -144,8 +142,8 @@ def test_every_figure_that_a_file_holds_is_as_in_the_file_and_a_changed_one_is_f
 
 
 def test_a_part_of_the_evidence_is_played_at_its_commit_once_and_its_files_are_in_the_manifest(
-    run: Run, tmp_path: Path, monkeypatch
-) -> None:
+    run, tmp_path, monkeypatch
+):
     evidence = import_module("make_evidence")
     writes = "-c open('{out}/table.csv','a').write('x\\n')"
     part = evidence.Part(writes, {"table.csv": "docs/table.csv"})

@@ -2,8 +2,6 @@
 and not in silence.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,9 +14,7 @@ BAD = {Reason.NOT_FINITE: np.full(7_000, np.nan), Reason.CONSTANT: np.zeros((3, 
 
 
 @pytest.mark.parametrize("reason", BAD, ids=str)
-def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(
-    tmp_path: Path, reason: Reason, make_data
-) -> None:
+def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(tmp_path, reason, make_data):
     data = make_data(80)
     with DataEngine("pca", retrain_every=60, store=tmp_path / "engine.db") as engine:
         for _ in range(2):
@@ -33,7 +29,7 @@ def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(
 
 
 @pytest.mark.parametrize("samples", [1, MIN_SAMPLES - 1])
-def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(samples: int) -> None:
+def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(samples):
     match = rf"got 1 x {samples}; record longer, or start with DataEngine\(trace="
     with DataEngine("pca") as engine:
         with pytest.raises(TraceError, match=match):

@@ -88,7 +88,7 @@ class Bag:
 
 
 @pytest.fixture
-def bag() -> Bag:
+def bag():
     return Bag()
 
 
@@ -126,9 +126,7 @@ def listing(bag: Bag, path: Path, first: int = 0) -> None:
 
 
 @pytest.mark.parametrize("stamped", [True, False])
-def test_a_bag_is_cut_by_its_trigger_and_labelled_by_a_topic(
-    bag: Bag, tmp_path: Path, stamped: bool
-) -> None:
+def test_a_bag_is_cut_by_its_trigger_and_labelled_by_a_topic(bag, tmp_path, stamped):
     if not stamped:
         bag.types = TYPES | {FORCE: ("geometry_msgs/msg/Wrench", WRENCH + VECTOR)}
     path = bag.write(tmp_path / "cell.mcap")
@@ -145,7 +143,7 @@ def test_a_bag_is_cut_by_its_trigger_and_labelled_by_a_topic(
     np.testing.assert_array_equal(both.X[:, 0], bag.traces[..., 0])
 
 
-def test_a_listing_of_starts_and_ends_cuts_a_bag(bag: Bag, tmp_path: Path) -> None:
+def test_a_listing_of_starts_and_ends_cuts_a_bag(bag, tmp_path):
     bag.write(tmp_path / "cell.mcap")
     listing(bag, tmp_path / "cycles.csv")
     windows = '{listing="cycles.csv", key="part", start="start", end="end", format="iso"}'
@@ -157,8 +155,8 @@ def test_a_listing_of_starts_and_ends_cuts_a_bag(bag: Bag, tmp_path: Path) -> No
 
 
 def test_a_folder_of_several_files_is_one_recording_unless_one_before_others_is_damaged(
-    bag: Bag, tmp_path: Path
-) -> None:
+    bag, tmp_path
+):
     folder = tmp_path / "bag"
     first = bag.write(folder / "bag_0.mcap", slice(0, HALF), chunk_bytes=4096)
     bag.write(folder / "bag_1.mcap", slice(HALF, None))
@@ -171,9 +169,7 @@ def test_a_folder_of_several_files_is_one_recording_unless_one_before_others_is_
             load_dataset(folder, description)
 
 
-def test_a_lost_message_and_a_missing_label_are_faults_and_nothing_is_filled_in(
-    bag: Bag, tmp_path: Path
-) -> None:
+def test_a_lost_message_and_a_missing_label_are_faults_and_nothing_is_filled_in(bag, tmp_path):
     bag.lost = {STARTS[2] + 10}
     del bag.labels[STARTS[5] + SAMPLES + 10]
     data = read(bag.write(tmp_path / "cell.mcap"))
@@ -183,9 +179,7 @@ def test_a_lost_message_and_a_missing_label_are_faults_and_nothing_is_filled_in(
     assert "got 0.004 s before row 11" in faults[0]
 
 
-def test_a_file_that_was_not_closed_or_is_damaged_is_a_fault_and_read_up_to_there(
-    bag: Bag, tmp_path: Path
-) -> None:
+def test_a_file_that_was_not_closed_or_is_damaged_is_a_fault_and_read_up_to_there(bag, tmp_path):
     path = bag.write(tmp_path / "cell.mcap", chunk_bytes=4096)
     description, content = describe(path, STATED), path.read_bytes()
     cut = int(len(content) * 0.6)
@@ -202,13 +196,13 @@ def test_a_file_that_was_not_closed_or_is_damaged_is_a_fault_and_read_up_to_ther
             refuse(path)
 
 
-def test_files_of_another_storage_are_refused_with_how_to_convert_them(tmp_path: Path) -> None:
+def test_files_of_another_storage_are_refused_with_how_to_convert_them(tmp_path):
     (tmp_path / "bag_0.db3").write_bytes(b"SQLite format 3\0")
     with pytest.raises(DataError, match=r"got bag_0\.db3; `ros2 bag convert`"):
         describe(tmp_path)
 
 
-def test_a_long_table_is_cut_like_a_bag(bag: Bag, tmp_path: Path) -> None:
+def test_a_long_table_is_cut_like_a_bag(bag, tmp_path):
     rows = zip(bag.stamps, bag.force[:, 2], bag.phase, strict=True)
     text = "".join(f"{np.datetime64(int(t), 'ns')}Z,{z:.9g},{p}\n" for t, z, p in rows)
     (tmp_path / "shift.csv").write_text(f"time,FZ,phase\n{text}")

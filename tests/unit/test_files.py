@@ -23,7 +23,7 @@ TEXT = b"my notes\n"
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory, make_data) -> Path:
+def store(tmp_path_factory, make_data):
     path = tmp_path_factory.mktemp("outputs") / "engine.db"
     data = make_data(70)
     with DataEngine("pca", retrain_every=60, store=path) as engine:
@@ -32,9 +32,7 @@ def store(tmp_path_factory: pytest.TempPathFactory, make_data) -> Path:
 
 
 @pytest.mark.parametrize("force", [False, True])
-def test_no_folder_device_pipe_or_link_is_written_to_even_by_force(
-    tmp_path: Path, monkeypatch, force: bool
-) -> None:
+def test_no_folder_device_pipe_or_link_is_written_to_even_by_force(tmp_path, monkeypatch, force):
     monkeypatch.chdir(tmp_path)
     Path("folder").mkdir()
     os.mkfifo("pipe")
@@ -50,7 +48,7 @@ def test_no_folder_device_pipe_or_link_is_written_to_even_by_force(
     assert not Path("nothing").exists()
 
 
-def test_no_part_of_a_database_is_replaced_even_by_force(tmp_path: Path) -> None:
+def test_no_part_of_a_database_is_replaced_even_by_force(tmp_path):
     with sqlite3.connect(tmp_path / "a.db") as connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("CREATE TABLE t (x)")
@@ -61,12 +59,12 @@ def test_no_part_of_a_database_is_replaced_even_by_force(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300, "missing/model.ts"])
-def test_a_name_that_no_file_can_have_is_an_error_of_ours(name: str, tmp_path: Path) -> None:
+def test_a_name_that_no_file_can_have_is_an_error_of_ours(name, tmp_path):
     with pytest.raises(OutputError, match="choose a folder that exists, is writable and has room"):
         write_output(tmp_path / name, b"new")
 
 
-def test_an_error_of_what_is_written_stays_what_it_is_and_leaves_nothing(tmp_path: Path) -> None:
+def test_an_error_of_what_is_written_stays_what_it_is_and_leaves_nothing(tmp_path):
     with pytest.raises(DataError, match="no labels"), output_file(tmp_path / "a.csv"):
         raise DataError("Expected labels, got no labels.")
     with pytest.raises(OutputError, match="No space left"), output_file(tmp_path / "a.csv"):
@@ -74,7 +72,7 @@ def test_an_error_of_what_is_written_stays_what_it_is_and_leaves_nothing(tmp_pat
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_path: Path) -> None:
+def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_path):
     files = [write_output(tmp_path / name, name.encode()) for name in ("a.csv", "b.png")]
     for file in files:
         manifest = write_manifest(tmp_path, [file])
@@ -85,7 +83,7 @@ def test_a_folders_manifest_lists_every_output_and_replaces_nobody_elses(tmp_pat
         write_manifest(tmp_path, files)
 
 
-def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path: Path) -> None:
+def test_an_export_with_its_sum_is_replaced_by_force_alone(store, tmp_path):
     target = tmp_path / "model.ts"
     total = sibling_path(target, "sha256")
     for present in (target, total):
@@ -104,7 +102,7 @@ def test_an_export_with_its_sum_is_replaced_by_force_alone(store: Path, tmp_path
 
 
 @pytest.mark.parametrize("form", ["torchscript", "onnx"])
-def test_an_export_onto_its_own_store_is_refused_even_by_force(store: Path, form: str) -> None:
+def test_an_export_onto_its_own_store_is_refused_even_by_force(store, form):
     before = store.read_bytes()
     done = dengine("export", store, "--out", store, "--format", form, "--force")
     assert done.exit_code == 1
@@ -126,9 +124,7 @@ def full_disk() -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, ignored)
 
 
-def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(store, tmp_path):
     with DataEngine.open(store) as engine:
         model = export_torchscript(engine, tmp_path / "model.ts")
         before = model.read_bytes()
@@ -140,8 +136,8 @@ def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(
 
 
 def test_a_folder_with_somebody_elses_picture_keeps_it_and_the_tables_are_shown(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     # Pictures are named after the recipes, and only those that are drawn are in the way.
     for name in ("data.png", "map_pca.png"):
         (tmp_path / name).write_bytes(TEXT)

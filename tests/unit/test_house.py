@@ -30,21 +30,21 @@ def parse_modules() -> dict[str, ast.Module]:
     return {name: ast.parse(file.read_text("utf-8")) for name, file in FILES.items()}
 
 
-def test_at_most_ten_modules_stand_at_the_top() -> None:
+def test_at_most_ten_modules_stand_at_the_top():
     top = sorted(file.name for file in PACKAGE.glob("*.py") if not file.name.startswith("__"))
     assert len(top) <= 10, (
         f"{len(top)} modules stand at the top; put one into a family: {', '.join(top)}"
     )
 
 
-def test_the_package_keeps_its_size_in_syntax_nodes() -> None:
+def test_the_package_keeps_its_size_in_syntax_nodes():
     nodes = sum(1 for tree in parse_modules().values() for _ in ast.walk(tree))
     assert nodes <= NODES, (
         f"dengine has {nodes} syntax nodes, {nodes - NODES} too many: take something out"
     )
 
 
-def test_no_base_of_ours_has_a_single_subclass() -> None:
+def test_no_base_of_ours_has_a_single_subclass():
     ours = set()
     for name in KNOWN - {"dengine.__main__"}:
         with suppress(ImportError):  # an extra is not installed
@@ -58,14 +58,14 @@ def test_no_base_of_ours_has_a_single_subclass() -> None:
     assert not alone, f"these have one subclass; make the two one class, or compose them: {alone}"
 
 
-def test_the_engine_keeps_a_public_face_of_at_most_27_members() -> None:
+def test_the_engine_keeps_a_public_face_of_at_most_27_members():
     public = [name for name in dir(DataEngine) if not name.startswith("_")]
     assert len(public) <= 27, (
         f"{len(public)} public members; what only a running engine knows is its `state`: {public}"
     )
 
 
-def test_no_module_is_imported_by_a_string() -> None:
+def test_no_module_is_imported_by_a_string():
     # The one table of names by string is `dengine/__init__.pyi`; a user's own `module:Class` is
     # imported by `import_class`.
     strings = {
@@ -81,13 +81,13 @@ def test_no_module_is_imported_by_a_string() -> None:
     )
 
 
-def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there() -> None:
+def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there():
     assert len(read_faults([])) == 63
     for name, file, before, *_ in MUTATIONS:
         assert (REPO / file).read_text("utf-8").count(before) == 1, f"{name}: {before!r} in {file}"
 
 
-def test_tests_go_through_public_faces() -> None:
+def test_tests_go_through_public_faces():
     private = re.compile(r"\b(?:engine|store)\._[a-z]\w*")
     files = [file for folder in ("tests", "training") for file in (REPO / folder).rglob("*.py")]
     result = {
@@ -98,7 +98,7 @@ def test_tests_go_through_public_faces() -> None:
     assert not result, f"say it by a public face, or leave it out: {', '.join(sorted(result))}"
 
 
-def test_the_readme_shows_where_things_are() -> None:
+def test_the_readme_shows_where_things_are():
     sys.path.insert(0, str(REPO / "docs" / "hooks"))
     from tree import tree
 
@@ -114,7 +114,7 @@ OLD_WORDS = {  # a word of before, and the word of the glossary; stored columns 
 }
 
 
-def test_words_that_the_glossary_replaced_are_gone() -> None:
+def test_words_that_the_glossary_replaced_are_gone():
     texts = [REPO / "README.md", *(REPO / "docs").rglob("*.md"), *PACKAGE.rglob("*.py")]
     texts += [*PACKAGE.rglob("*.js"), *PACKAGE.rglob("*.?pp")]
     found = [
@@ -126,7 +126,7 @@ def test_words_that_the_glossary_replaced_are_gone() -> None:
     assert not found, found
 
 
-def test_the_names_on_the_page_about_the_life_of_a_trace_exist() -> None:
+def test_the_names_on_the_page_about_the_life_of_a_trace_exist():
     page = (REPO / "docs" / "explanation" / "life_of_a_trace.md").read_text("utf-8")
     assert len(page.split()) <= 700
     spoken = set(re.findall(r"`([A-Z]\w+(?:\.\w+)?|[a-z]\w+)`", page))

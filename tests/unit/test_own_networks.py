@@ -147,8 +147,8 @@ SLOW = [pytest.param(network, marks=pytest.mark.slow) for network in SLOW]
 
 @pytest.mark.parametrize("network", [UnsavedBuffer, WeightNorm, *SLOW])
 def test_an_engine_decides_by_the_weights_that_it_trained_whatever_tensors_a_network_keeps(
-    network: Any, tmp_path: Path
-) -> None:
+    network, tmp_path
+):
     X = toy_traces(10, seed=3)[0]
     for seed in (0, None):  # two engines of one process, each opened again
         store, reducer = tmp_path / f"{seed}.db", reducer_of(network, seed)
@@ -175,8 +175,8 @@ ALONE = "decided on alone lies elsewhere than the reducer embeds it"
     ],
 )
 def test_a_version_that_could_not_be_opened_or_answers_otherwise_is_dropped_and_the_cell_goes_on(
-    network: Any, reason: str, tmp_path: Path
-) -> None:
+    network, reason, tmp_path
+):
     with taught(reducer_of(network), tmp_path / "cell.db") as engine:
         assert engine.version == 0
         assert all(reason in report.reason for report in engine.store.versions.retrains())
@@ -186,8 +186,8 @@ def test_a_version_that_could_not_be_opened_or_answers_otherwise_is_dropped_and_
 
 
 def test_a_model_that_answers_otherwise_than_it_was_trained_is_neither_exported_nor_in_the_contract(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     X, y = toy_traces(60)
     model = ModelPrediction(reducer_of(OtherwiseCompiled)).fit(X, y)
     with pytest.raises(ExportError, match="lies elsewhere than the reducer embeds it"):
@@ -201,16 +201,14 @@ def test_a_model_that_answers_otherwise_than_it_was_trained_is_neither_exported_
 
 
 @pytest.mark.parametrize("reducer", ["conv", "rocket"])
-def test_a_window_that_never_holds_enough_for_a_first_training_is_refused(reducer: str) -> None:
+def test_a_window_that_never_holds_enough_for_a_first_training_is_refused(reducer):
     with pytest.raises(SettingError, match=r"a window of at least 20 labelled traces.*got 19"):
         DataEngine(recipe=Recipe(reducer, window=19))
 
 
 @pytest.mark.parametrize("amplitude", [-1e-8, 1e-45])
 @pytest.mark.parametrize("reducer", ["conv", "umap", PCA(2)])
-def test_traces_too_small_for_their_unit_raise_an_alarm_that_says_so(
-    reducer: Any, amplitude: float
-) -> None:
+def test_traces_too_small_for_their_unit_raise_an_alarm_that_says_so(reducer, amplitude):
     X, y = toy_traces(60)
     tiny = (amplitude * (np.abs(X) if amplitude < 0.0 else X)).astype(np.float32)
     engine = taught(reducer, traces=(tiny, y))

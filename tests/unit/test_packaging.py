@@ -8,7 +8,6 @@ import sys
 import tomllib
 from importlib.metadata import packages_distributions
 from itertools import chain
-from pathlib import Path
 
 import pytest
 
@@ -22,14 +21,14 @@ def fresh(code: str) -> str:
     return done.stdout.strip()
 
 
-def test_importing_dengine_loads_nothing_but_the_standard_library_and_its_lazy_loader() -> None:
+def test_importing_dengine_loads_nothing_but_the_standard_library_and_its_lazy_loader():
     code = "import sys; before = set(sys.modules); import dengine; print(*sorted(set(sys.modules) - before))"
     tops = {name.split(".")[0] for name in fresh(code).split()}
     assert "dengine" in tops
     assert tops - {"dengine", "lazy_loader"} <= set(sys.stdlib_module_names)
 
 
-def test_every_public_name_is_there_and_listed() -> None:
+def test_every_public_name_is_there_and_listed():
     assert sorted(dengine.__all__) == sorted(set(dengine.__all__))
     for name in dengine.__all__:
         assert getattr(dengine, name) is not None
@@ -42,8 +41,8 @@ PROJECT_PAGE = "dengine/data/project_page.md"
 
 
 def test_the_page_of_an_index_has_no_link_that_leads_into_a_checkout_and_its_example_runs(
-    repo: Path, tmp_path: Path, monkeypatch
-) -> None:
+    repo, tmp_path, monkeypatch
+):
     page = (repo / PROJECT_PAGE).read_text("utf-8")
     assert "](" not in page
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
@@ -52,7 +51,7 @@ def test_the_page_of_an_index_has_no_link_that_leads_into_a_checkout_and_its_exa
     assert (tmp_path / "engine.db").is_file()
 
 
-def test_every_package_that_is_imported_is_declared(repo: Path) -> None:
+def test_every_package_that_is_imported_is_declared(repo):
     code = "\n".join(path.read_text("utf-8") for path in (repo / "dengine").rglob("*.py"))
     packages = set(re.findall(r"^ *(?:from|import) (\w+)", code, re.M)) - sys.stdlib_module_names
     assert {"torch", "uvicorn"} <= packages

@@ -1,7 +1,6 @@
 """The paper's tables and findings, from frames made by hand."""
 
 from itertools import product
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -30,7 +29,7 @@ def by_claim(found: list[str], claim: str) -> list[bool]:
     return [line.startswith("confirmed: ") for line in found if claim in line]
 
 
-def test_the_published_figures_are_the_papers(repo: Path) -> None:
+def test_the_published_figures_are_the_papers(repo):
     paper = repo.parent / "shared" / "paper.tex"
     if not paper.is_file():
         pytest.skip("the paper's source is not beside this checkout")
@@ -48,14 +47,14 @@ def test_the_published_figures_are_the_papers(repo: Path) -> None:
             assert f"{alpha} & {output}" in table
 
 
-def test_a_table_has_the_papers_form_with_ours_and_theirs() -> None:
+def test_a_table_has_the_papers_form_with_ours_and_theirs():
     some = frame().query("alpha == 0.1 or lower_bound == 0.8")
     table = paper_table(some, "conv", "wilson")  # two cells were not played
     assert table.startswith("| alpha / LB | 80 % | 90 % | 95 % |\n")
     assert "| 0.05 | 39.6 ± 1.4 / 1151.4 ± 1.4 [39.6 / 1151.4] | - | - |" in table
 
 
-def test_the_papers_own_figures_bear_its_findings_out() -> None:
+def test_the_papers_own_figures_bear_its_findings_out():
     lines = findings(pd.concat([frame(), frame("binomial")]))
     claims = {"Wilson interval reacts": 1, "binomial interval does not react": 1}
     claims |= {"share of false positives": 2, "delays the first": 3}
@@ -63,9 +62,7 @@ def test_the_papers_own_figures_bear_its_findings_out() -> None:
         assert by_claim(lines, claim) == [True] * n
 
 
-def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_nothing_breaks_no_tolerance() -> (
-    None
-):
+def test_a_finding_that_does_not_hold_says_so_and_a_grid_that_was_certain_of_nothing_breaks_no_tolerance():
     missed = frame(certain=900), frame("binomial", certain=500, false_positive=60)
     lines = findings(pd.concat(missed))
     assert by_claim(lines, "Wilson interval reacts") == [False]

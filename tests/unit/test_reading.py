@@ -182,8 +182,8 @@ def recordings(draw: Callable[..., Any]) -> tuple[np.ndarray, np.ndarray]:
 @QUICK
 @given(recordings(), styles())
 def test_recordings_are_read_as_they_were_written_and_a_proposal_is_right_or_open(
-    layout: str, drawn: tuple[np.ndarray, np.ndarray], style: Style
-) -> None:
+    layout, drawn, style
+):
     with tempfile.TemporaryDirectory() as folder:
         written = write(Path(folder), layout, *drawn, style)
         data = proposed = written.read()
@@ -237,7 +237,7 @@ NO_NUMBERS = [
 
 
 @pytest.mark.parametrize(("layout", "cell"), NO_NUMBERS)
-def test_a_cell_that_is_no_finite_number_is_a_fault(tmp_path: Path, layout: str, cell: Any) -> None:
+def test_a_cell_that_is_no_finite_number_is_a_fault(tmp_path, layout, cell):
     written = write(tmp_path, layout, X, y, GERMAN, put(cell))
     is_wide = layout == "wide text"
     lines = [written.line + 7 * (not is_wide)] if "text" in layout else []
@@ -256,7 +256,7 @@ ROWS: dict[str, Edit] = {
 
 @pytest.mark.parametrize("layout", [layout for layout in LAYOUTS if layout[:4] != "wide"])
 @pytest.mark.parametrize("kind", ROWS)
-def test_rows_that_do_not_fit_are_a_fault(tmp_path: Path, layout: str, kind: str) -> None:
+def test_rows_that_do_not_fit_are_a_fault(tmp_path, layout, kind):
     written = write(tmp_path, layout, X, y, PLAIN, ROWS[kind])
     lines = {"cut": [0], "unknown word": [0, written.line]}
     column = "" if kind == "cut" else "verdict" if "word" in kind else "time"
@@ -282,9 +282,7 @@ FILES = {  # what is replaced in a file, by what; the line and the column of its
 
 
 @pytest.mark.parametrize(("old", "new", "line", "column"), FILES.values(), ids=FILES)
-def test_a_damaged_file_is_a_fault_and_the_others_are_read(
-    tmp_path: Path, old: bytes, new: bytes, line: int, column: str
-) -> None:
+def test_a_damaged_file_is_a_fault_and_the_others_are_read(tmp_path, old, new, line, column):
     written = write(tmp_path, "files text", X, y, PLAIN)
     written.file.write_bytes(re.sub(b"(?s)" + old, new, written.file.read_bytes()))
     assert_only_fault(written, [line], column)
@@ -292,14 +290,14 @@ def test_a_damaged_file_is_a_fault_and_the_others_are_read(
 
 @pytest.mark.parametrize("kind", ["json", "npz", "text"])
 @pytest.mark.parametrize("keep", [0, 0.5, 0.99])
-def test_a_cut_file_is_a_fault(tmp_path: Path, kind: str, keep: float) -> None:
+def test_a_cut_file_is_a_fault(tmp_path, kind, keep):
     written = write(tmp_path, f"files {kind}", X, y, Style(is_packed=True))
     content = written.file.read_bytes()
     written.file.write_bytes(content[: int(keep * len(content))])
     assert_only_fault(written)
 
 
-def test_a_file_that_changes_while_it_is_read_is_a_fault(tmp_path: Path, monkeypatch) -> None:
+def test_a_file_that_changes_while_it_is_read_is_a_fault(tmp_path, monkeypatch):
     written = write(tmp_path, "files text", X, y, PLAIN)
     read = Path.read_bytes
 
@@ -315,7 +313,7 @@ def test_a_file_that_changes_while_it_is_read_is_a_fault(tmp_path: Path, monkeyp
 
 @pytest.mark.parametrize("rate", [3.0, 700.0])
 @pytest.mark.parametrize("n", range(3, 60, 4))
-def test_a_resampled_recording_may_end_one_step_before_the_trace(rate: float, n: int) -> None:
+def test_a_resampled_recording_may_end_one_step_before_the_trace(rate, n):
     squares = np.arange(n) ** 2.0
     table = pd.DataFrame({"time": np.arange(n) / rate, "FZ": squares, "y": 1})
     stated = f'format=frame layout=files time.column=time time.rate_hz={rate} channels.FZ="" '
@@ -329,8 +327,8 @@ def test_a_resampled_recording_may_end_one_step_before_the_trace(rate: float, n:
 
 
 def test_one_sentence_says_what_to_type_if_there_are_no_recordings_or_no_description(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     (tmp_path / "1_OK.csv").write_text("t,F\n0,1\n")
     stated = "files=none channels.F=N label.column=y label.good=1 label.bad=0 traces.samples=3"
     other = Description().with_values(parse_stated(stated.split()))
@@ -363,7 +361,7 @@ version = '?'       version 1
 @pytest.mark.parametrize(
     "line", [*NO_DESCRIPTION.strip().splitlines(), f"#{' ' * 10**6}at most 1 MB"]
 )
-def test_a_damaged_description_is_refused(line: str, tmp_path: Path) -> None:
+def test_a_damaged_description_is_refused(line, tmp_path):
     text, message = re.split("  +", line) if len(line) < 99 else (line, "at most 1 MB")
     (tmp_path / "recordings.toml").write_bytes(text.encode("latin-1"))
     with pytest.raises(DataError, match=message):
@@ -402,7 +400,7 @@ channels={FZ={limit=1.0}, "Weg ü"=""}  one limit
 
 
 @pytest.mark.parametrize("line", [*STATED.strip().splitlines(), *SAVED.strip().splitlines()])
-def test_a_stated_value_that_cannot_be_is_refused(tmp_path: Path, line: str) -> None:
+def test_a_stated_value_that_cannot_be_is_refused(tmp_path, line):
     written = write(tmp_path, "files text", X, y, PLAIN)
     text, message = re.split("  +", line)
     stated = parse_stated([text])
@@ -411,7 +409,7 @@ def test_a_stated_value_that_cannot_be_is_refused(tmp_path: Path, line: str) -> 
         load_dataset(tmp_path, saved or describe(tmp_path, stated))
 
 
-def test_stated_sections_are_kept_and_a_question_mark_is_answered(tmp_path: Path) -> None:
+def test_stated_sections_are_kept_and_a_question_mark_is_answered(tmp_path):
     write(tmp_path, "files text", X, y, PLAIN)
     proposal = describe(tmp_path, {"traces": {"samples": 7}, "time.rate_hz": "?"})
     assert (proposal.traces.samples, proposal.time.rate_hz) == (7, 500.0)
@@ -419,9 +417,7 @@ def test_stated_sections_are_kept_and_a_question_mark_is_answered(tmp_path: Path
 
 @QUICK
 @given(*[st.text(min_size=1)] * 5)
-def test_a_description_comes_back_from_its_toml(
-    name: str, unit: str, word: str, pattern: str, note: str
-) -> None:
+def test_a_description_comes_back_from_its_toml(name, unit, word, pattern, note):
     description = Description(
         channels={name: Channel(unit, limit=0.1), "other": Channel()},
         label=LabelSource(word, good=(word, "1"), path=pattern),

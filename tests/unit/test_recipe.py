@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,11 +44,11 @@ recipes = st.builds(
 
 
 @given(recipes)
-def test_toml_gives_back_the_recipe(recipe: Recipe) -> None:
+def test_toml_gives_back_the_recipe(recipe):
     assert Recipe.from_toml(recipe.to_toml()) == recipe
 
 
-def test_the_page_of_the_recipes_shows_them_as_they_are(repo: Path) -> None:
+def test_the_page_of_the_recipes_shows_them_as_they_are(repo):
     page = (repo / "docs" / "reference" / "recipes.md").read_text("utf-8")
     (shown,) = re.findall(r"^```toml [^\n]*\n(.*?\n)```$", page, flags=re.M | re.S)
     recipe = Recipe.load("conv")
@@ -65,7 +64,7 @@ def test_the_page_of_the_recipes_shows_them_as_they_are(repo: Path) -> None:
         assert Recipe.from_toml(form.format(*cells)) == RECIPES[name]
 
 
-def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None:
+def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('reducer = "pca"\nradius = 0.7\n[policy]\nalpha = 0.2\n', encoding="utf-8")
     loaded = Recipe.load(path)
@@ -102,7 +101,7 @@ OWN = [  # a reducer, its radius, its retrain_every
 @pytest.mark.parametrize(("reducer", "radius", "retrain_every"), OWN)
 def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(
     reducer, radius, retrain_every
-) -> None:
+):
     ways = [
         Recipe(reducer),
         Recipe(reducer, radius=None, retrain_every=None).with_policy(alpha=0.2),
@@ -117,7 +116,7 @@ def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(
     assert Recipe(reducer, radius=0.5).radius == 0.5
 
 
-def test_a_stored_recipe_imports_nothing_to_learn_a_radius() -> None:
+def test_a_stored_recipe_imports_nothing_to_learn_a_radius():
     text = 'reducer = "nobody_has_this:Class"\n'
     with pytest.raises(StoreError, match="radius, retrain_every; restore the store"):
         Recipe.from_store({"recipe": text})
@@ -140,8 +139,6 @@ def test_a_stored_recipe_imports_nothing_to_learn_a_radius() -> None:
         ("budget = 0", "budget > 0"),
     ],
 )
-def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(
-    text: str, message: str
-) -> None:
+def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(text, message):
     with pytest.raises(SettingError, match=message):
         Recipe.from_toml(text, where="mine")

@@ -43,7 +43,7 @@ def summary(data: Dataset) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("name", READ)
-def test_a_saved_description_and_a_completed_proposal_read_what_was_recorded(name: str) -> None:
+def test_a_saved_description_and_a_completed_proposal_read_what_was_recorded(name):
     expected = EXPECTED[name]
     source = CORPUS / name / expected["source"]
     data = load_dataset(source)
@@ -55,7 +55,7 @@ def test_a_saved_description_and_a_completed_proposal_read_what_was_recorded(nam
 
 
 @pytest.mark.parametrize("name", READ)
-def test_a_proposal_leaves_open_what_nothing_proves_and_shows_the_candidates(name: str) -> None:
+def test_a_proposal_leaves_open_what_nothing_proves_and_shows_the_candidates(name):
     expected = EXPECTED[name]
     proposal = describe(CORPUS / name / expected["source"])
     assert sorted(proposal.open_keys) == sorted(expected["open"])
@@ -65,6 +65,6 @@ def test_a_proposal_leaves_open_what_nothing_proves_and_shows_the_candidates(nam
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_holds_no_samples_is_refused_with_the_reason(name: str) -> None:
+def test_what_holds_no_samples_is_refused_with_the_reason(name):
     with pytest.raises(DataError, match=EXPECTED[name]["refused"]):
         describe(CORPUS / name / EXPECTED[name]["source"])

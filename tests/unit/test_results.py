@@ -2,10 +2,9 @@
 
 import hashlib
 import json
-from pathlib import Path
 
 
-def test_each_published_file_of_the_evidence_is_the_one_that_its_manifest_names(repo: Path) -> None:
+def test_each_published_file_of_the_evidence_is_the_one_that_its_manifest_names(repo):
     manifest = json.loads((repo / "docs" / "results" / "manifest.json").read_text("utf-8"))
     assert manifest["parts"]
     for name, part in manifest["parts"].items():

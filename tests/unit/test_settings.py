@@ -5,7 +5,6 @@ reducers, models, stores.
 import sys
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from sklearn.preprocessing import StandardScaler
 
 from dengine import (
     DataEngine,
-    Dataset,
     ModelPrediction,
     Policy,
     Recipe,
@@ -33,7 +31,7 @@ from tests.support.driving import Counting, drive, learn
 POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
 
 
-def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
+def test_what_is_given_beside_a_recipe_takes_its_place():
     given = {"policy": POLICY, "radius": 0.07, "folds": 3, "retrain_every": 20, "budget": 0.3}
     engine, expected = DataEngine(recipe="conv", **given), replace(RECIPES["conv"], **given)
     assert engine.recipe == expected
@@ -68,16 +66,16 @@ REFUSED = [  # settings, and the words that say why not
 
 @pytest.mark.parametrize(("given", "words"), REFUSED)
 def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store(
-    given, words: str, tmp_path: Path
-) -> None:
+    given, words, tmp_path
+):
     with pytest.raises(SettingError, match=words):
         DataEngine.open_or_create(store=tmp_path / "engine.db", **given)
     assert DataEngine("pca", store=tmp_path / "engine.db").store.settings.read()
 
 
 def test_the_loops_settings_and_those_of_a_policy_that_are_no_rule_count_for_a_baseline_too(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     policy = Policy(audit_rate=0.3, label_within=200)
     given = {"model": Counting(), "store": tmp_path / "e.db", "retrain_every": 7, "budget": 0.2}
     with DataEngine(policy=policy, **given) as engine:
@@ -100,9 +98,7 @@ OTHERS = {
 }
 
 
-def test_the_same_line_begins_and_goes_on_and_another_is_an_error_that_names_both(
-    data: Dataset, tmp_path: Path
-) -> None:
+def test_the_same_line_begins_and_goes_on_and_another_is_an_error_that_names_both(data, tmp_path):
     url, given = tmp_path / "engine.db", {"reducer": "pca", "policy": POLICY, "retrain_every": 30}
     for start in (0, 20, 40):
         with DataEngine.open_or_create(url, **given) as engine:
@@ -125,9 +121,7 @@ STATED = TraceSpec(100, 1000.0, 2, ("N", "mm"), columns=("force", "path"))
 
 
 @pytest.mark.parametrize("first", [FIRST, None], ids=["a contract", "the first trace"])
-def test_a_rate_is_stated_later_and_contradicted_never(
-    first: TraceSpec | None, make_data, tmp_path: Path
-) -> None:
+def test_a_rate_is_stated_later_and_contradicted_never(first, make_data, tmp_path):
     url = tmp_path / "engine.db"
     with DataEngine("pca", store=url, trace=first) as engine:
         engine.decide(make_data(1, channels=2).X[0])
@@ -140,7 +134,7 @@ def test_a_rate_is_stated_later_and_contradicted_never(
             DataEngine.open(url, trace=replace(STATED, **other))
 
 
-def test_a_store_keeps_the_rate_that_an_older_version_wrote(make_data, tmp_path: Path) -> None:
+def test_a_store_keeps_the_rate_that_an_older_version_wrote(make_data, tmp_path):
     old = '{"samples": 100, "rate_hz": 500.0, "channels": 1, "unit": "N", "limit": null, "columns": []}'
     url = tmp_path / "engine.db"
     with DataEngine("pca", store=url) as engine:
@@ -156,7 +150,7 @@ def test_a_store_keeps_the_rate_that_an_older_version_wrote(make_data, tmp_path:
 LIMITED = Policy(force_limits=("0.02:0.1::1e9",))
 
 
-def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path: Path) -> None:
+def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path):
     for cell, trace in (("a", STATED), ("b", None)):
         store = address(tmp_path / "line.db", cell, "nut")
         with DataEngine("pca", LIMITED, store=store, trace=trace) as engine:
@@ -177,9 +171,7 @@ def ours(alpha: float = 0.2) -> ModelPrediction:
         ({"recipe": Recipe(PCA(2), policy=POLICY)}, {"reducer": PCA(3)}),
     ],
 )
-def test_a_used_store_takes_the_object_it_was_made_with_and_no_other(
-    first, then, data: Dataset, tmp_path: Path
-) -> None:
+def test_a_used_store_takes_the_object_it_was_made_with_and_no_other(first, then, data, tmp_path):
     url, given = tmp_path / "engine.db", first | {"retrain_every": 20}
     with DataEngine.open_or_create(url, **given) as engine:
         drive(engine, data, 0, 21)
@@ -202,8 +194,8 @@ class Rule(DecisionRule): ...
     "mine", [{"reducer": "theirs:Own"}, {"policy": replace(POLICY, guarantee="theirs:Rule")}]
 )
 def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
-    mine, data, tmp_path: Path, monkeypatch
-) -> None:
+    mine, data, tmp_path, monkeypatch
+):
     module, url = tmp_path / "theirs.py", str(tmp_path / "engine.db")
     module.write_text(OUTSIDE)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -230,9 +222,7 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
     monkeypatch.delitem(sys.modules, "theirs")
 
 
-def test_an_object_without_a_name_runs_and_is_handed_in_again(
-    data: Dataset, tmp_path: Path
-) -> None:
+def test_an_object_without_a_name_runs_and_is_handed_in_again(data, tmp_path):
     for params in ({"segments": [1]}, {"a b": 1}, {"inner": PCA(2)}):  # that TOML cannot say
         with pytest.raises(SettingError, match="params of plain names and values"):
             Recipe("conv", params)
@@ -248,8 +238,8 @@ def test_an_object_without_a_name_runs_and_is_handed_in_again(
 
 
 def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was_handed_in(
-    data: Dataset,
-) -> None:
+    data,
+):
     for steps in (1, 3):
         engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
         drive(engine, data, 0, 31)
@@ -264,7 +254,7 @@ def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was
     assert report.seconds in range(2, next(ticks) - before)  # whole seconds: of no other clock
 
 
-def test_a_damaged_number_among_the_stores_settings_is_named() -> None:
+def test_a_damaged_number_among_the_stores_settings_is_named():
     texts = EngineSettings(Recipe("pca")).to_store() | {"policy_since": "3x"}
     with pytest.raises(
         StoreError, match="Expected a policy_since in the store's settings, got '3x'"

@@ -3,8 +3,6 @@
 import json
 from contextlib import nullcontext
 from dataclasses import asdict, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -54,20 +52,20 @@ UNITS = [
 
 
 @pytest.mark.parametrize(("unit", "units", "stored"), UNITS)
-def test_each_channel_has_a_unit(unit: Any, units: list[str], stored: Any) -> None:
+def test_each_channel_has_a_unit(unit, units, stored):
     spec = TraceSpec(10, channels=len(units), unit=unit)
     assert (spec.unit, [*spec.units]) == (stored, units)
     assert stored_trace_spec({"trace": json.dumps(asdict(spec))}) == spec
 
 
 @pytest.mark.parametrize("unit", [("kN",), ("kN", "mm", "V"), (), 5, (1, 2)])
-def test_units_that_are_no_text_or_too_many_are_refused(unit: Any) -> None:
+def test_units_that_are_no_text_or_too_many_are_refused(unit):
     with pytest.raises(SettingError, match="unit"):
         TraceSpec(10, channels=2, unit=unit)
 
 
 @pytest.mark.parametrize("dtype", ["f2", "f8", ">f4", "i1", ">i2", "i8", "u2", "?"])
-def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
+def test_every_real_dtype_is_cast_to_float32(dtype):
     x = np.arange(100).astype(dtype)
     result = as_trace(x, None)
     assert result.dtype == np.float32
@@ -76,7 +74,7 @@ def test_every_real_dtype_is_cast_to_float32(dtype: str) -> None:
     assert as_trace(x.reshape(50, 2), TraceSpec(2, channels=50)).shape == (50, 2)  # it is agreed on
 
 
-def test_a_cell_that_knows_its_traces_states_what_the_engine_does_not_know(make_data) -> None:
+def test_a_cell_that_knows_its_traces_states_what_the_engine_does_not_know(make_data):
     data = replace(make_data(3), rate_hz=250.0, unit="kN")
     for stated, trace in (
         (None, TraceSpec(100, 250.0, unit="kN")),
@@ -98,7 +96,7 @@ NO_CONTRACTS = {
 
 
 @pytest.mark.parametrize("message", NO_CONTRACTS)
-def test_a_contract_that_no_trace_can_keep_is_refused(message: str) -> None:
+def test_a_contract_that_no_trace_can_keep_is_refused(message):
     with pytest.raises(DengineError, match=message):
         TraceSpec(**NO_CONTRACTS[message])
 
@@ -125,9 +123,7 @@ PADDED = TraceSpec(100, fit="pad")
         (np.ones((1000, 2)), None, TRANSPOSED),
     ],
 )
-def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(
-    trace, spec, message: str
-) -> None:
+def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(trace, spec, message):
     with pytest.raises(TraceError, match=message):
         as_trace(trace, spec)
 
@@ -135,7 +131,7 @@ def test_a_callers_mistake_says_what_was_expected_what_came_and_what_to_do(
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize(("channels", "where"), [(1, 0), (3, 57), (3, 99)])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_one_sample_that_is_not_finite_is_found_anywhere(value, where, channels, compiled) -> None:
+def test_one_sample_that_is_not_finite_is_found_anywhere(value, where, channels, compiled):
     x = ramp(100, channels)
     x[-1, where] = value
     assert reason_of(x, compiled=compiled) is Reason.NOT_FINITE
@@ -161,14 +157,14 @@ LEVELS = [np.full((channels, 50), level) for channels in (1, 2) for level in (0.
 )
 def test_dead_and_saturated_sensors_are_found_and_a_plateau_or_one_quiet_channel_is_no_fault(
     x, limit, reason
-) -> None:
+):
     assert reason_of(np.asarray(x, dtype=np.float32), limit) is reason
 
 
 SAMPLES = 100
 
 
-def test_cut_and_pad_keep_what_was_measured_at_its_own_time() -> None:
+def test_cut_and_pad_keep_what_was_measured_at_its_own_time():
     x = ramp(160)[0]
     np.testing.assert_array_equal(as_trace(x, TraceSpec(SAMPLES, fit="cut"))[0], x[:SAMPLES])
     padded = as_trace(x[:60], PADDED)[0]
@@ -177,9 +173,7 @@ def test_cut_and_pad_keep_what_was_measured_at_its_own_time() -> None:
 
 @given(have=st.integers(50, 200), channels=st.integers(1, 3), seed=st.integers(0, 99))
 @settings(max_examples=60, deadline=None)
-def test_resample_is_linear_interpolation_over_the_whole(
-    have: int, channels: int, seed: int
-) -> None:
+def test_resample_is_linear_interpolation_over_the_whole(have, channels, seed):
     x = np.random.default_rng(seed).normal(size=(channels, have)).astype(np.float32)
     result = as_trace(x, TraceSpec(SAMPLES, channels=channels, fit="resample"))
     grid = np.linspace(0, have - 1, SAMPLES)
@@ -195,9 +189,7 @@ def test_resample_is_linear_interpolation_over_the_whole(
     seed=st.integers(0, 99),
 )
 @settings(max_examples=150, deadline=None)
-def test_what_cannot_honestly_be_fitted_is_refused_and_nothing_else_is(
-    have, samples: int, fit: int, seed: int
-) -> None:
+def test_what_cannot_honestly_be_fitted_is_refused_and_nothing_else_is(have, samples, fit, seed):
     x = np.random.default_rng(seed).normal(size=(2, have)).astype(np.float32)
     spec = TraceSpec(samples, channels=2, fit=FITS[fit])
     honest = have >= samples if fit == 1 else samples <= 2 * have <= 4 * samples
@@ -213,8 +205,8 @@ LENGTHS = (98, 100, 103, 60, 150, 199, 200, 50, 49, 201, 1, 2, 420)
 
 @pytest.mark.parametrize("fit", FITS[1:])
 def test_engine_and_exported_file_decide_alike_on_traces_of_two_channels_and_other_lengths(
-    fit: str, make_data, tmp_path: Path
-) -> None:
+    fit, make_data, tmp_path
+):
     spec, actions = TraceSpec(SAMPLES, channels=2, fit=fit), set()
     engine = DataEngine("pca", trace=spec, retrain_every=10**6)
     learn(engine, make_data(300, SAMPLES, 2), range(300))

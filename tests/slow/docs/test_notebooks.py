@@ -63,13 +63,13 @@ def printed(cell: Any) -> str:
     )
 
 
-def test_the_index_names_every_notebook() -> None:
+def test_the_index_names_every_notebook():
     text = INDEX.read_text(encoding="utf-8")
     assert [path.stem for path in NOTEBOOKS if f"/{path.stem}.ipynb)" not in text] == []
 
 
 @every_notebook
-def test_a_notebook_is_stored_as_it_ran_without_errors_and_paths(path: Path) -> None:
+def test_a_notebook_is_stored_as_it_ran_without_errors_and_paths(path):
     notebook = read(path)
     cells = code_cells(notebook)
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
@@ -84,7 +84,7 @@ def test_a_notebook_is_stored_as_it_ran_without_errors_and_paths(path: Path) -> 
 
 
 @every_notebook
-def test_a_notebook_runs_and_its_exact_cells_print_what_is_stored(path: Path) -> None:
+def test_a_notebook_runs_and_its_exact_cells_print_what_is_stored(path):
     nbclient = pytest.importorskip("nbclient")
     stored = read(path)
     notebook = copy.deepcopy(stored)

@@ -22,7 +22,7 @@ TO_BE_MADE = {f"dengine/{folder}/NAME.py" for folder in ("reducers", "cells", "c
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     """The folder of the site: the one that `make docs` has just built where DENGINE_SITE names it, or a new one."""
     if built := os.environ.get("DENGINE_SITE"):
         return Path(built)
@@ -41,7 +41,7 @@ def text_of(pages: list[Path]) -> str:
     return "\n".join(page.read_text(encoding="utf-8") for page in pages)
 
 
-def test_a_page_asks_nothing_of_the_network(site: Path) -> None:
+def test_a_page_asks_nothing_of_the_network(site):
     pages = sorted(site.rglob("*.html"))
     asked = set(re.findall(ASSETS, text_of(pages)))
     assert (len(pages) > 30, len(asked) > 30) == (True, True)
@@ -63,7 +63,7 @@ def is_module(name: str) -> bool:
         return False
 
 
-def test_the_reference_documents_exactly_the_public_names(site: Path) -> None:
+def test_the_reference_documents_exactly_the_public_names(site):
     reference = text_of(sorted((site / "reference").glob("*.html")))
     entries = set(re.findall(r'id="(dengine\.[\w.]+)"', reference))
     names = {
@@ -74,7 +74,7 @@ def test_the_reference_documents_exactly_the_public_names(site: Path) -> None:
     assert names == {*dengine.__all__, *RETURNED.split()}
 
 
-def test_the_documents_import_public_names_alone() -> None:
+def test_the_documents_import_public_names_alone():
     typed = "\n".join(
         re.findall(r"^```python.*?\n(.*?)^```$", text_of(DOCUMENTS), flags=re.S | re.M)
     )
@@ -84,7 +84,7 @@ def test_the_documents_import_public_names_alone() -> None:
     assert names - set(dengine.__all__) == set()
 
 
-def test_the_page_of_the_command_line_has_every_option_of_every_verb(site: Path) -> None:
+def test_the_page_of_the_command_line_has_every_option_of_every_verb(site):
     page = (site / "reference" / "command_line.html").read_text(encoding="utf-8")
     for verb in main.commands:
         section = page.split(f'id="dengine-{verb}"')[1].split("<h2")[0]
@@ -94,7 +94,7 @@ def test_the_page_of_the_command_line_has_every_option_of_every_verb(site: Path)
 
 
 @pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(REPO)))
-def test_every_file_and_heading_that_a_page_links_is_there(page: Path) -> None:
+def test_every_file_and_heading_that_a_page_links_is_there(page):
     prose = re.sub(r"^```.*?^```$", "", text_of([page]), flags=re.S | re.M)
     for path, anchor in re.findall(r"\]\(([^)#:\s]*)(?:#([^)]+))?\)", prose):
         linked = page.parent / path if path else page
@@ -105,7 +105,7 @@ def test_every_file_and_heading_that_a_page_links_is_there(page: Path) -> None:
             assert anchor in map("-".join, words)
 
 
-def test_every_script_and_module_that_the_documents_name_is_there() -> None:
+def test_every_script_and_module_that_the_documents_name_is_there():
     files = r"(?<![\w./-])(?:training|tests|dengine|models|docs)/[\w/]+\.(?:py|toml|md|npz|png)\b"
     named = set(re.findall(files, text_of(DOCUMENTS)))
     assert {"training/benchmark_cycle.py", "dengine/decision/members.py"} <= named

@@ -3,10 +3,9 @@ verified.
 """
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -82,7 +81,7 @@ def learned(store: Path | None = None) -> DataEngine:
 
 
 @pytest.fixture(scope="module")
-def engines() -> Iterator[list[DataEngine]]:
+def engines():
     """With a model, without one, and of an open contract; each works after all that was tried."""
     untrained = [DataEngine("pca", trace=TraceSpec(SAMPLES, fit=fit)) for fit in FITS[::3]]
     items = [learned(), *untrained]
@@ -95,7 +94,7 @@ def engines() -> Iterator[list[DataEngine]]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     created = tmp_path_factory.mktemp("fuzz")
     (created / "small.npz").write_bytes(FILES["data.npz"][0])
     (created / "cell.csv").write_bytes(journal(PARTS))
@@ -110,9 +109,7 @@ def journal(lines: bytes) -> bytes:
 
 @given(value=traces, which=st.integers(0, 2))
 @tries(3.0)
-def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(
-    engines, value: Any, which: int
-) -> None:
+def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(engines, value, which):
     with suppress(DengineError):
         engines[which].decide(value)
 
@@ -122,9 +119,7 @@ def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(
     x=SOUND,
 )
 @tries(3.0)
-def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
-    engines, value: Any, x: np.ndarray
-) -> None:
+def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(engines, value, x):
     engine = engines[0]
     id_, before = engine.decide(x * -3.0).id, engine.state.new_labels
     try:
@@ -138,7 +133,7 @@ def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
 
 @given(value=anything, x=SOUND)
 @tries(2.0)
-def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(engines, value, x) -> None:
+def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(engines, value, x):
     with suppress(DengineError):
         engines[0].report(value, True)
     with suppress(DengineError):
@@ -150,8 +145,8 @@ def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(engines, v
 )
 @tries()
 def test_a_recipe_with_another_value_or_damaged_makes_an_engine_or_is_refused(
-    folder: Path, data, value, lines
-) -> None:
+    folder, data, value, lines
+):
     at = data.draw(st.sampled_from([i for i, line in enumerate(lines) if " = " in line]))
     lines[at] = lines[at].partition(" = ")[0] + " = " + value
     content = "\n".join(lines).encode("utf-8", "surrogatepass")
@@ -163,7 +158,7 @@ def test_a_recipe_with_another_value_or_damaged_makes_an_engine_or_is_refused(
 @pytest.mark.parametrize("name", FILES)
 @given(data=st.data())
 @tries(0.3)
-def test_a_damaged_file_of_data_is_read_or_refused(name: str, tmp_path_factory, data) -> None:
+def test_a_damaged_file_of_data_is_read_or_refused(name, tmp_path_factory, data):
     here = tmp_path_factory.mktemp("data")
     cell = here / "cell"
     cell.mkdir()
@@ -176,7 +171,7 @@ def test_a_damaged_file_of_data_is_read_or_refused(name: str, tmp_path_factory, 
 
 @given(content=spoilt(PARTS).map(journal) | spoilt(journal(PARTS)))
 @tries()
-def test_a_damaged_journal_is_read_or_refused(folder: Path, content: bytes) -> None:
+def test_a_damaged_journal_is_read_or_refused(folder, content):
     (folder / "damaged.csv").write_bytes(content)
     with suppress(DengineError):
         read_journal(folder / "damaged.csv", SPEC)
@@ -184,7 +179,7 @@ def test_a_damaged_journal_is_read_or_refused(folder: Path, content: bytes) -> N
 
 @given(labels=st.lists(st.sampled_from([0, 1]) | anything, min_size=3, max_size=3))
 @tries(0.3)
-def test_odd_labels_are_imported_or_refused(labels: list[Any]) -> None:
+def test_odd_labels_are_imported_or_refused(labels):
     with suppress(DengineError):
         import_labelled(open_store(None), (X[:3], labels), recipe="pca")
 
@@ -199,9 +194,7 @@ def must_be_one_line(words: list[str]) -> None:
 
 @given(data=st.data(), words=st.sampled_from(COMMANDS.splitlines()).map(str.split))
 @tries(0.1)
-def test_a_command_with_other_words_works_or_says_one_error(
-    folder: Path, data, words: list[str]
-) -> None:
+def test_a_command_with_other_words_works_or_says_one_error(folder, data, words):
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(1, len(words)))
         words[at : at + data.draw(st.integers(0, 1))] = data.draw(
@@ -214,9 +207,7 @@ def test_a_command_with_other_words_works_or_says_one_error(
 
 @given(data=st.data(), shown=st.booleans())
 @tries(0.1)
-def test_a_damaged_store_is_opened_and_decides_or_is_refused(
-    folder: Path, tmp_path_factory, data, shown: bool
-) -> None:
+def test_a_damaged_store_is_opened_and_decides_or_is_refused(folder, tmp_path_factory, data, shown):
     path = tmp_path_factory.mktemp("damaged") / "cell.db"
     path.write_bytes(data.draw(spoilt((folder / "store.db").read_bytes())))
     if shown:
