@@ -82,9 +82,7 @@ def test_what_is_wrong_with_traces_is_counted(make_data):
     assert survey_dataset(data).near_repeats <= 3
 
 
-def test_drift_is_seen_where_there_is_some_and_only_there(
-    make_data,
-):
+def test_drift_is_seen_where_there_is_some_and_only_there(make_data):
     data = make_data(300, samples=60)
     y = (np.random.default_rng(1).random(300) < np.linspace(1.0, 0.3, 300)).astype(np.int8)
     drifting = replace(data, X=data.X + np.linspace(0, 9, 300)[:, None], y=y)

@@ -198,9 +198,7 @@ def test_every_shortened_command_is_on_a_page():
 
 
 @pytest.mark.slow
-def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(
-    desk,
-):
+def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(desk):
     (suggested,) = re.findall(
         r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8")
     )

@@ -88,17 +88,16 @@ def test_what_the_twin_cannot_do_is_refused(data, tmp_path, monkeypatch):
 
 
 def test_a_damaged_file_and_a_foreign_one_are_refused(file, tmp_path):
-    metadata = load_onnx(file).metadata
+    metadata, content = load_onnx(file).metadata, file.read_bytes()
     assert (metadata["format"], metadata["learns"], metadata["references"]) == ("onnx", False, 300)
     with pytest.raises(TraceError, match="Expected 100 samples, got 98"):
         load_onnx(file).decide(np.ones(98))
-    copy, content = tmp_path / "model.onnx", file.read_bytes()
-    total = copy.with_name("model.onnx.sha256")
-    total.write_text(hashlib.sha256(content).hexdigest())
-    copy.write_bytes(content[:-9])
-    with pytest.raises(ExportError, match="is damaged or truncated"):
-        load_onnx(copy)
-    total.write_text(hashlib.sha256(b"garbage").hexdigest())
-    copy.write_bytes(b"garbage")
-    with pytest.raises(ExportError, match="is not a dengine export in ONNX"):
-        load_onnx(copy)
+    copy = tmp_path / "model.onnx"
+    for written, summed, words in (
+        (content[:-9], content, "is damaged or truncated"),
+        (b"garbage", b"garbage", "is not a dengine export in ONNX"),
+    ):
+        copy.write_bytes(written)
+        copy.with_name("model.onnx.sha256").write_text(hashlib.sha256(summed).hexdigest())
+        with pytest.raises(ExportError, match=words):
+            load_onnx(copy)

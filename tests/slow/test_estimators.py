@@ -23,7 +23,7 @@ from dengine import (
     WilsonRadiusClassifier,
 )
 from dengine.errors import SettingError
-from dengine.reducers.base import LabelFree, Reducer
+from dengine.reducers.base import LabelFree
 from dengine.testing import toy_traces
 
 ESTIMATORS = (
@@ -45,7 +45,7 @@ BATCH = (
     "umap-learn lays the rows of a batch out together, so a row's place depends on those beside it."
 )
 # By estimator, by check: why it is right that it fails.
-EXCLUDED: dict[type, dict[str, str]] = {
+EXCLUDED = {
     UmapLearnReducer: {
         "check_methods_sample_order_invariance": BATCH,
         "check_methods_subset_invariance": BATCH,
@@ -56,7 +56,7 @@ EXCLUDED: dict[type, dict[str, str]] = {
 }
 
 
-SMALL: dict[str, Reducer] = {
+SMALL = {
     "conv": ConvReducer(fit_steps=30),
     "rocket": RocketReducer(),
     "pca": PcaReducer(),

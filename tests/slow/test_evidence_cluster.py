@@ -33,9 +33,7 @@ def rows(folder: Path) -> list[list[object]]:
     return table[DECISIONS].to_numpy().tolist()
 
 
-def test_evidence_outlives_a_killed_worker_and_a_kill_of_its_own_and_has_the_same_rows(
-    tmp_path,
-):
+def test_evidence_outlives_a_killed_worker_and_a_kill_of_its_own_and_has_the_same_rows(tmp_path):
     import distributed
 
     local, folder = tmp_path / "local", tmp_path / "cluster"

@@ -35,9 +35,7 @@ def test_the_counts_are_those_of_the_paper_and_no_trace_comes_twice(stored, trac
     assert len(np.unique(traces, axis=0)) == len(traces)
 
 
-def test_labels_are_the_height_alone_and_every_failure_has_a_cause(
-    stored,
-):
+def test_labels_are_the_height_alone_and_every_failure_has_a_cause(stored):
     np.testing.assert_array_equal(stored["y"] == 1, np.abs(stored["height_mm"]) <= 0.5)
     np.testing.assert_array_equal(stored["cause"] == "none", stored["y"] == 1)
     names, counts = np.unique(stored["cause"][stored["y"] == 0], return_counts=True)

@@ -134,9 +134,7 @@ def test_the_commands_of_a_page_run_in_an_empty_folder_with_the_wheel_alone(
     assert re.search(r"\d+ passed", printed), printed
 
 
-def test_the_lock_covers_each_extra_of_a_user_and_takes_the_public_build_of_torch(
-    repo,
-):
+def test_the_lock_covers_each_extra_of_a_user_and_takes_the_public_build_of_torch(repo):
     makefile = (repo / "Makefile").read_text("utf-8")
     (extras,) = re.findall(r"^EXTRAS = (.*)$", makefile, flags=re.M)
     project = tomllib.loads((repo / "pyproject.toml").read_text("utf-8"))["project"]

@@ -135,9 +135,7 @@ def test_a_full_disk_is_an_error_of_ours_and_the_earlier_export_stays(store, tmp
     assert {file.name for file in tmp_path.iterdir()} == {"model.ts", "model.ts.sha256"}
 
 
-def test_a_folder_with_somebody_elses_picture_keeps_it_and_the_tables_are_shown(
-    tmp_path,
-):
+def test_a_folder_with_somebody_elses_picture_keeps_it_and_the_tables_are_shown(tmp_path):
     # Pictures are named after the recipes, and only those that are drawn are in the way.
     for name in ("data.png", "map_pca.png"):
         (tmp_path / name).write_bytes(TEXT)

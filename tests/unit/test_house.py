@@ -89,13 +89,10 @@ def test_each_fault_of_the_net_fits_the_code_and_names_tests_that_are_there():
 
 def test_tests_go_through_public_faces():
     private = re.compile(r"\b(?:engine|store)\._[a-z]\w*")
-    files = [file for folder in ("tests", "training") for file in (REPO / folder).rglob("*.py")]
-    result = {
-        f"{result} ({file.name})"
-        for file in files
-        for result in private.findall(file.read_text("utf-8"))
-    }
-    assert not result, f"say it by a public face, or leave it out: {', '.join(sorted(result))}"
+    for folder in ("tests", "training"):
+        for file in (REPO / folder).rglob("*.py"):
+            found = private.findall(file.read_text("utf-8"))
+            assert not found, f"{file.name}: say it by a public face, or leave it out: {found}"
 
 
 def test_the_readme_shows_where_things_are():

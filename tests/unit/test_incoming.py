@@ -5,7 +5,6 @@ for many labels.
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 
-import numpy as np
 import pytest
 
 from dengine import DataEngine
@@ -20,10 +19,6 @@ class Slow(Counting):
     def add(self, x, y):
         super().add(x, y)
         Slow.now += 1.0
-
-
-def answers(engine: DataEngine, probe: np.ndarray) -> list[tuple]:
-    return [evidence(engine.decide(x)) for x in probe]
 
 
 class Held(ThreadPoolExecutor):
@@ -94,7 +89,7 @@ def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides
                 engine.poll(brief=True)
             engine.close()
         with DataEngine.open(tmp_path / f"{n}.db") as first:
-            expected = answers(first, probe)
+            expected = [evidence(first.decide(x)) for x in probe]
             assert len(first.model.index) == n
         with DataEngine.open(tmp_path / f"{n}.db") as second:
-            assert answers(second, probe) == expected
+            assert [evidence(second.decide(x)) for x in probe] == expected

@@ -121,15 +121,6 @@ class OtherwiseCompiled(Network):
         return -self.layers(x) if torch.jit.is_scripting() else self.layers(x)
 
 
-class FailsCompiled(Network):
-    """Compiles, and raises when it is asked."""
-
-    def forward(self, x):
-        if torch.jit.is_scripting():
-            raise RuntimeError("not in a script")
-        return self.layers(x)
-
-
 def reducer_of(network: Any, random_state: Any = 0) -> TorchReducer:
     return TorchReducer(network=network, folds=2, steps=4, fit_steps=30, random_state=random_state)
 

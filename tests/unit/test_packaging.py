@@ -53,7 +53,8 @@ def test_the_page_of_an_index_has_no_link_that_leads_into_a_checkout_and_its_exa
 
 def test_every_package_that_is_imported_is_declared(repo):
     code = "\n".join(path.read_text("utf-8") for path in (repo / "dengine").rglob("*.py"))
-    packages = set(re.findall(r"^ *(?:from|import) (\w+)", code, re.M)) - sys.stdlib_module_names
+    imports = r"^ *(?:from (\w+)[.\w]* import |import (\w+)[.\w]*(?: as \w+)?$)"
+    packages = set(chain(*re.findall(imports, code, re.M))) - {"", *sys.stdlib_module_names}
     assert {"torch", "uvicorn"} <= packages
     project = tomllib.loads((repo / "pyproject.toml").read_text("utf-8"))["project"]
     declared = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]

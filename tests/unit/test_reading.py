@@ -154,7 +154,7 @@ QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCh
 
 
 @st.composite
-def styles(draw: Callable[..., Any]) -> Style:
+def styles(draw: Any) -> Style:
     """Draw a way of writing."""
     delimiter = draw(st.sampled_from(",;\t| "))
     decimal = draw(st.sampled_from([mark for mark in ".," if mark != delimiter]))
@@ -168,7 +168,7 @@ def styles(draw: Callable[..., Any]) -> Style:
 
 
 @st.composite
-def recordings(draw: Callable[..., Any]) -> tuple[np.ndarray, np.ndarray]:
+def recordings(draw: Any) -> tuple[np.ndarray, np.ndarray]:
     """Draw samples (n, C, T), no two parts alike, and labels (n,)."""
     n, c = draw(st.integers(2, 12)), draw(st.integers(1, 3))
     shape = (n, c, draw(st.integers(max(c, 2), 9)))
@@ -244,7 +244,7 @@ def test_a_cell_that_is_no_finite_number_is_a_fault(tmp_path, layout, cell):
     assert_only_fault(written, lines, "FZ_7" if is_wide else "FZ")
 
 
-ROWS: dict[str, Edit] = {
+ROWS = {
     "swapped": lambda table: table.iloc[np.r_[:7, 8, 7, 9:20]],
     "lost": lambda table: table.drop(7),
     "doubled": lambda table: table.iloc[np.r_[:8, 7:20]],
@@ -326,9 +326,7 @@ def test_a_resampled_recording_may_end_one_step_before_the_trace(rate, n):
 # Bad input.
 
 
-def test_one_sentence_says_what_to_type_if_there_are_no_recordings_or_no_description(
-    tmp_path,
-):
+def test_one_sentence_says_what_to_type_if_there_are_no_recordings_or_no_description(tmp_path):
     (tmp_path / "1_OK.csv").write_text("t,F\n0,1\n")
     stated = "files=none channels.F=N label.column=y label.good=1 label.bad=0 traces.samples=3"
     other = Description().with_values(parse_stated(stated.split()))
@@ -407,12 +405,6 @@ def test_a_stated_value_that_cannot_be_is_refused(tmp_path, line):
     saved = written.description.with_values(stated) if line in SAVED else None
     with pytest.raises(DataError, match=re.escape(message)):
         load_dataset(tmp_path, saved or describe(tmp_path, stated))
-
-
-def test_stated_sections_are_kept_and_a_question_mark_is_answered(tmp_path):
-    write(tmp_path, "files text", X, y, PLAIN)
-    proposal = describe(tmp_path, {"traces": {"samples": 7}, "time.rate_hz": "?"})
-    assert (proposal.traces.samples, proposal.time.rate_hz) == (7, 500.0)
 
 
 @QUICK

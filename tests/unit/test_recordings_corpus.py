@@ -17,7 +17,7 @@ from dengine.errors import DataError
 
 CORPUS = Path(__file__).parents[1] / "recordings"
 FOLDERS = sorted(path.parent for path in CORPUS.glob("*/expected.json"))
-EXPECTED: dict[str, dict[str, Any]] = {
+EXPECTED = {
     folder.name: json.loads((folder / "expected.json").read_text("utf-8")) for folder in FOLDERS
 }
 READ = [name for name, expected in EXPECTED.items() if "refused" not in expected]

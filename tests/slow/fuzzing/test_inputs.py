@@ -19,9 +19,7 @@ from dengine import (
     TraceSpec,
     describe,
     load_dataset,
-    open_store,
 )
-from dengine.datasets.importing import import_labelled
 from dengine.export.cell_journal import read_journal
 from dengine.records import FITS
 from dengine.testing import toy_traces
@@ -175,13 +173,6 @@ def test_a_damaged_journal_is_read_or_refused(folder, content):
     (folder / "damaged.csv").write_bytes(content)
     with suppress(DengineError):
         read_journal(folder / "damaged.csv", SPEC)
-
-
-@given(labels=st.lists(st.sampled_from([0, 1]) | anything, min_size=3, max_size=3))
-@tries(0.3)
-def test_odd_labels_are_imported_or_refused(labels):
-    with suppress(DengineError):
-        import_labelled(open_store(None), (X[:3], labels), recipe="pca")
 
 
 def must_be_one_line(words: list[str]) -> None:
