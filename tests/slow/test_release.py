@@ -73,14 +73,6 @@ def distributions(repo, tmp_path_factory):
     return folder
 
 
-@pytest.mark.merge
-def test_both_files_pass_the_checks_of_the_package_index(distributions):
-    files = sorted(distributions.iterdir())
-    assert {"".join(file.suffixes)[-4:] for file in files} == {".whl", "r.gz"}
-    command = [sys.executable, "-m", "twine", "check", "--strict", *map(str, files)]
-    assert run(command, distributions).count("PASSED") == 2
-
-
 @pytest.fixture(scope="module")
 def installed(distributions, tmp_path_factory):
     """The Python of an environment with the wheel, and with the other packages of this one."""

@@ -15,11 +15,10 @@ from dengine.cells.simulation.conditions import (
     CellParameters,
     Conditions,
     draw_conditions,
-    find_scenario,
 )
 from dengine.cells.simulation.generate import save_insertions, simulate
 from dengine.cells.simulation.world import push
-from dengine.errors import DengineError, SettingError
+from dengine.errors import DengineError
 from dengine.records import Outcome
 
 NO_FAULTS = CellParameters(missed_grasp=0, weak_grip=0, debris=0, wrong_part=0)
@@ -93,15 +92,6 @@ def test_scenarios_change_what_they_say_and_nothing_else():
         assert {key for key in late if late[key] != asdict(base)[key]} == {*changed[name].split()}
         assert name == "wear" or scenario(base, 49, 100) == base
     assert SCENARIOS["wear"](base, 99, 100).friction[0] == pytest.approx(base.friction[0] + 0.35)
-
-
-def test_a_bad_setting_says_what_was_expected():
-    with pytest.raises(SettingError, match="nominal, wear, variant, bias_jump"):
-        find_scenario("rain")
-    with pytest.raises(SettingError, match="at least 1"):
-        simulate(0)
-    with pytest.raises(SettingError, match="divides 2 ms"):
-        push(good(), time_step_s=0.0007)
 
 
 def test_saved_traces_come_back_within_one_step(tmp_path):

@@ -18,7 +18,6 @@ from tests.support.command_line import dengine as command
 REPO = Path(__file__).resolve().parents[3]
 DOCUMENTS = [REPO / "README.md", REPO / "CONTRIBUTING.md", *sorted((REPO / "docs").rglob("*.md"))]
 ASSETS = r'<(?:script|img|iframe|source|link)\b[^>]*?\s(?:src|href)=["\']?([^"\'\s>]+)'
-TO_BE_MADE = {f"dengine/{folder}/NAME.py" for folder in ("reducers", "cells", "cli")}
 
 
 @pytest.fixture(scope="module")
@@ -103,10 +102,3 @@ def test_every_file_and_heading_that_a_page_links_is_there(page):
             headings = re.findall(r"^#+ (.+)$", text_of([linked]), flags=re.M)
             words = [re.sub(r"[^\w\s-]", "", heading).lower().split() for heading in headings]
             assert anchor in map("-".join, words)
-
-
-def test_every_script_and_module_that_the_documents_name_is_there():
-    files = r"(?<![\w./-])(?:training|tests|dengine|models|docs)/[\w/]+\.(?:py|toml|md|npz|png)\b"
-    named = set(re.findall(files, text_of(DOCUMENTS)))
-    assert {"training/benchmark_cycle.py", "dengine/decision/members.py"} <= named
-    assert [path for path in sorted(named - TO_BE_MADE) if not (REPO / path).exists()] == []
