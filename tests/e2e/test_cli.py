@@ -162,6 +162,13 @@ def test_training_goes_on_after_retrains_without_a_step(tmp_path, monkeypatch):
     assert "nothing was done" in line_of(*words)
 
 
+def test_training_on_too_few_labels_says_so(tmp_path):
+    data = save(tmp_path / "easy.npz", easy_parts(10, 0))
+    failed = dengine("train", "--data", data, "--store", tmp_path / "e.db")
+    assert failed.exit_code == 1
+    assert "Expected at least 20 traces, got 10" in failed.stderr
+
+
 def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data, tmp_path):
     store = tmp_path / "e.db"
     words = f"run --cell replay --data {data} --store {store} --out {tmp_path} --force".split()
@@ -284,7 +291,7 @@ def test_an_interrupted_import_says_how_far_it_came_and_goes_on_there(tmp_path, 
     easy.X[0, 3], easy.X[1], easy.X[2:8] = np.nan, 7.0, easy.X[2]  # bad, and equal ones
     data, store = save(tmp_path / "easy.npz", easy), tmp_path / "e.db"
 
-    def interrupted(*args: object) -> object:
+    def interrupted(*args):
         os.kill(os.getpid(), signal.SIGINT)
         return import_labelled(*args)
 

@@ -53,10 +53,23 @@ def test_every_other_verb_asks_for_the_description_and_then_reads_by_it(folder, 
     shown("data", folder, "--save")
     assert document(*words, "--samples", 400)["rows"][0]["cycles"] == 15
     assert "Expected a label among" in refused(*words, "--set", "label.good=yes")
-    well("train", "--data", folder, "--store", tmp_path / "cell.db", "--reducer", "pca")
+    for _ in range(2):  # nothing is imported twice
+        well("train", "--data", folder, "--store", tmp_path / "cell.db", "--reducer", "pca")
     with DataEngine.open(tmp_path / "cell.db") as engine:
         assert engine.status().labels == len(load_dataset(folder))
         assert engine.decide(np.linspace(0.0, 30.0, 998)).reason != "not_finite"
+
+
+def test_sample_recordings_are_written_into_a_new_or_an_empty_folder_alone(folder):
+    before = sorted(folder.iterdir())
+    assert "Expected a new or an empty folder" in refused("data", "--sample", folder)
+    assert sorted(folder.iterdir()) == before
+
+
+def test_open_keys_are_listed_and_a_check_fails(tmp_path):
+    np.savez(tmp_path / "parts.npz", a=5, b=2.0)
+    assert "layout: " in shown("data", tmp_path / "parts.npz")
+    refused("data", tmp_path / "parts.npz", "--check")
 
 
 def test_a_check_ends_with_1_if_there_is_a_fault_and_names_it(folder):

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
-import tomllib
 import zipfile
 from pathlib import Path
 
@@ -124,18 +123,6 @@ def test_the_commands_of_a_page_run_in_an_empty_folder_with_the_wheel_alone(
     test = repo / "tests" / "e2e" / "test_docs.py"
     printed = run([str(installed), "-m", "pytest", *options, *chosen, str(test)], tmp_path)
     assert re.search(r"\d+ passed", printed), printed
-
-
-def test_the_lock_covers_each_extra_of_a_user_and_takes_the_public_build_of_torch(repo):
-    makefile = (repo / "Makefile").read_text("utf-8")
-    (extras,) = re.findall(r"^EXTRAS = (.*)$", makefile, flags=re.M)
-    project = tomllib.loads((repo / "pyproject.toml").read_text("utf-8"))["project"]
-    assert {*extras.split(",")} == {*project["optional-dependencies"]} - {"docs", "dev"}
-    commands = run(["make", "--dry-run", "dist"], repo)
-    assert f'".[{extras}]"' in commands
-    (pinned,) = re.findall("^torch==(.*)$", (repo / "constraints.txt").read_text(), flags=re.M)
-    (wanted,) = re.findall(r"sed -n '(s/.*?/p)' constraints.txt", commands)
-    assert run(["sed", "-n", wanted, "constraints.txt"], repo).strip() == f"torch==={pinned}"
 
 
 @pytest.mark.parametrize("python", ["python3.11", "python3.12", "python3.13"])

@@ -12,7 +12,14 @@ import torch
 from sklearn.decomposition import PCA
 from torch import nn
 
-from dengine import DataEngine, ModelPrediction, Recipe, TorchReducer, export_torchscript
+from dengine import (
+    DataEngine,
+    ModelPrediction,
+    PcaReducer,
+    Recipe,
+    TorchReducer,
+    export_torchscript,
+)
 from dengine.errors import ExportError, SettingError
 from dengine.testing import check_reducer, toy_traces
 
@@ -121,6 +128,22 @@ class OtherwiseCompiled(Network):
         return -self.layers(x) if torch.jit.is_scripting() else self.layers(x)
 
 
+class FailingModule(nn.Module):
+    dim = 2
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        if torch.jit.is_scripting():
+            raise RuntimeError("not in a script")
+        return x[:, :, :2]
+
+
+class FailsCompiled(PcaReducer):
+    """A reducer whose module compiles, and raises when it is asked."""
+
+    def module(self):
+        return FailingModule()
+
+
 def reducer_of(network: Any, random_state: Any = 0) -> TorchReducer:
     return TorchReducer(network=network, folds=2, steps=4, fit_steps=30, random_state=random_state)
 
@@ -189,6 +212,15 @@ def test_a_model_that_answers_otherwise_than_it_was_trained_is_neither_exported_
     ):
         with pytest.raises(AssertionError, match=broken):
             check_reducer(reducer_of(network))
+
+
+def test_a_module_that_compiles_and_does_not_run_is_told_everywhere_in_a_sentence(tmp_path):
+    assert "not in a script" in taught(FailsCompiled()).status().alarm
+    model = ModelPrediction(FailsCompiled()).fit(*toy_traces(60))
+    with pytest.raises(ExportError, match=r"cannot be exported.*not in a script"):
+        export_torchscript(model, tmp_path / "model.ts")
+    with pytest.raises(AssertionError, match=r"cannot run it.*not in a script"):
+        check_reducer(FailsCompiled())
 
 
 @pytest.mark.parametrize("reducer", ["conv", "rocket"])

@@ -154,7 +154,7 @@ QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCh
 
 
 @st.composite
-def styles(draw: Any) -> Style:
+def styles(draw):
     """Draw a way of writing."""
     delimiter = draw(st.sampled_from(",;\t| "))
     decimal = draw(st.sampled_from([mark for mark in ".," if mark != delimiter]))
@@ -168,7 +168,7 @@ def styles(draw: Any) -> Style:
 
 
 @st.composite
-def recordings(draw: Any) -> tuple[np.ndarray, np.ndarray]:
+def recordings(draw):
     """Draw samples (n, C, T), no two parts alike, and labels (n,)."""
     n, c = draw(st.integers(2, 12)), draw(st.integers(1, 3))
     shape = (n, c, draw(st.integers(max(c, 2), 9)))
@@ -301,7 +301,7 @@ def test_a_file_that_changes_while_it_is_read_is_a_fault(tmp_path, monkeypatch):
     written = write(tmp_path, "files text", X, y, PLAIN)
     read = Path.read_bytes
 
-    def grow(path: Path) -> bytes:
+    def grow(path):
         content = read(path)
         if path == written.file:
             path.write_bytes(content + b"1")

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
@@ -43,6 +43,7 @@ recipes = st.builds(
 )
 
 
+@settings(suppress_health_check=[HealthCheck.too_slow])
 @given(recipes)
 def test_toml_gives_back_the_recipe(recipe):
     assert Recipe.from_toml(recipe.to_toml()) == recipe

@@ -156,6 +156,8 @@ def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path)
             assert engine.trace == STATED
     with DataEngine.open(store) as engine:
         assert engine.trace == STATED
+    with pytest.raises(SettingError, match="Expected the rate of the traces"):
+        DataEngine("pca", LIMITED)
 
 
 def ours(alpha: float = 0.2) -> ModelPrediction:
@@ -203,7 +205,7 @@ def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
         drive(engine, data, 0, 21)
     monkeypatch.delitem(sys.modules, "theirs")
 
-    def exit_codes(*calls: str) -> list[int]:
+    def exit_codes(*calls):
         return [dengine(*call.format(url).split(), "--cell", "a").exit_code for call in calls]
 
     assert exit_codes("status {}", "verify {}", "history {}", "explain {} last") == [0] * 4

@@ -63,11 +63,6 @@ def printed(cell: Any) -> str:
     )
 
 
-def test_the_index_names_every_notebook():
-    text = INDEX.read_text(encoding="utf-8")
-    assert [path.stem for path in NOTEBOOKS if f"/{path.stem}.ipynb)" not in text] == []
-
-
 @every_notebook
 def test_a_notebook_is_stored_as_it_ran_without_errors_and_paths(path):
     notebook = read(path)

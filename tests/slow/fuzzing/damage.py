@@ -43,7 +43,7 @@ def tries(share: float = 1.0) -> Callable[[Any], Any]:
 
 
 @st.composite
-def spoilt(draw: st.DrawFn, content: bytes) -> bytes:
+def spoilt(draw, content):
     """The content with bytes changed, cut, put in, or zeroed."""
     out = bytearray(content)
     for _ in range(draw(st.sampled_from([1, 1, 1, 2, 8]))):
