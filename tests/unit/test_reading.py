@@ -150,7 +150,7 @@ def write(
 TEXT_LAYOUTS = ("files text", "long text", "wide text")
 TABLES = ("long parquet", "long jsonl")
 LAYOUTS = (*TEXT_LAYOUTS, "files npz", "files json", "files jsonl", *TABLES)
-QUICK = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+QUICK = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 @st.composite
