@@ -6,14 +6,13 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from dengine import DataEngine, backup_store, load_dataset
+from dengine import DataEngine, Dataset, backup_store, load_dataset
 from dengine.cli import main
 from dengine.cli.output import INTERRUPTED
 from dengine.datasets import importing
@@ -36,15 +35,7 @@ LESS = {  # so that an example takes seconds; its own options are all read
 }
 OWN_REDUCERS = """
 import os, signal
-from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.decomposition import PCA
-
-class FirstAndLast(TransformerMixin, BaseEstimator):
-    def fit(self, X, y=None):
-        self.n_features_in_ = X.shape[1]
-        return self
-    def transform(self, X):
-        return X[:, [0, -1]]
 
 class Interrupting(PCA):
     fits = 0
@@ -56,24 +47,30 @@ class Interrupting(PCA):
 """
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """160 traces of 40 samples in two easy shapes, and their labels."""
-    path = tmp_path_factory.mktemp("data") / "easy.npz"
-    easy = easy_parts(160, 0)
-    np.savez(path, X=easy.X, y=easy.y)
+def save(path: Path, data: Dataset, **more: object) -> Path:
+    np.savez(path, X=data.X, y=data.y, **more)
     return path
 
 
 @pytest.fixture(scope="module")
-def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def data(tmp_path_factory):
+    """160 traces of 40 samples in two easy shapes, and their labels."""
+    return save(tmp_path_factory.mktemp("data") / "easy.npz", easy_parts(160, 0))
+
+
+def n_rows(table: Path) -> int:
+    return len(table.read_text().splitlines()) - 1
+
+
+@pytest.fixture(scope="module")
+def trained(data, tmp_path_factory):
     store = tmp_path_factory.mktemp("store") / "engine.db"
     succeed("train", "--data", data, "--store", store, "--reducer", "pca", *POLICY)
     return store
 
 
 @pytest.fixture
-def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def own_folder(tmp_path, monkeypatch):
     """A folder with reducers of one's own, in which the command is called."""
     (tmp_path / "his.py").write_text(OWN_REDUCERS)
     monkeypatch.chdir(tmp_path)
@@ -82,31 +79,27 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     sys.modules.pop("his", None)
 
 
-def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy() -> None:
+def test_python_m_dengine_shows_the_help_and_imports_nothing_heavy():
     command = [sys.executable, "-X", "importtime", "-m", "dengine", "-h"]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     # Where lines break depends on the length of the program's name.
     assert done.stdout.split() == succeed("-h").replace("Usage: main", "Usage: dengine").split()
     imported = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
-    assert {"dengine.cli.options", "numpy", "torch", "pandas", "rich", "sklearn"} & imported == {
-        "dengine.cli.options"
-    }
+    assert "dengine.cli.options" in imported
+    assert not {"numpy", "torch", "pandas", "rich", "sklearn"} & imported
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """What examples name: a trained engine.db of a part of the bundled set, backup.db, its copy, and
     cell.csv, a journal of two of its traces.
     """
-    folder = tmp_path_factory.mktemp("examples")
-    traces = load_dataset("insertion")
-    np.savez(folder / "parts.npz", X=traces.X[:200], y=traces.y[:200])
-    words = ["--data", folder / "parts.npz", "--store", folder / "engine.db", "--reducer", "pca"]
-    succeed("train", *words)
-    lines = [
-        f"part,p{i},{traces.y[i]},,verify,verify,uncertain,0.5,0.9,4,1,{','.join(f'{x:.9g}' for x in traces.X[i] + 1)}"
-        for i in range(2)
-    ]
+    folder, parts = tmp_path_factory.mktemp("examples"), load_dataset("insertion")
+    save(folder / "parts.npz", replace(parts, X=parts.X[:200], y=parts.y[:200], cause=None))
+    words = f"--data {folder}/parts.npz --store {folder}/engine.db --reducer pca"
+    succeed("train", *words.split())
+    line = "part,p{},{},,verify,verify,uncertain,0.5,0.9,4,1,{}"
+    lines = (line.format(i, parts.y[i], ",".join(map(str, parts.X[i] + 1))) for i in range(2))
     (folder / "cell.csv").write_bytes(cell_journal(*lines))
     backup_store(folder / "engine.db", folder / "backup.db")
     return folder
@@ -114,95 +107,47 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 # The example of serve is what `tests.support.serving.started` types.
 @pytest.mark.parametrize("verb", [verb for verb in VERBS if verb != "serve"])
-def test_every_help_ends_in_a_command_that_works(
-    verb: str, folder: Path, tmp_path: Path, monkeypatch, make_data
-) -> None:
+def test_every_help_ends_in_a_command_that_works(verb, folder, tmp_path, monkeypatch, make_data):
     if verb == "simulate":
         pytest.importorskip("mujoco")
     for file in () if verb in ("run", "train") else folder.iterdir():  # these two make a store
         shutil.copy(file, tmp_path)
     monkeypatch.chdir(tmp_path)
     if verb == "train":
-        parts = make_data(60)
-        np.savez(tmp_path / "small.npz", X=parts.X, y=parts.y)
+        save(tmp_path / "small.npz", make_data(60))
     program, named, *words = example_of(verb)
     assert (program, named) == ("dengine", verb)
     succeed(named, *words, *LESS.get(verb, "").split())
 
 
-def test_every_verb_is_listed_with_its_whole_sentence_speaks_json_and_explains_each_option() -> (
-    None
-):
-    shown = succeed("--help")
-    assert not [line for line in shown.splitlines()[1:] if line.endswith("...")]
-    for verb in VERBS:
-        assert f"  {verb} " in shown
-        options = [param for param in main.commands[verb].params if isinstance(param, click.Option)]
-        assert ("--json" in {name for option in options for name in option.opts}) == (
-            verb != "serve"
-        )
-        assert not {option.name for option in options if not option.help}
-
-
-def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(
-    data: Path, tmp_path: Path
-) -> None:
-    asked = f"replay --data {data} --reducer pca --alpha 0.2 --lower-bound 0.8 --repeats 2".split()
-    shown = line_of(*asked, "--cycles", 100, "--out", tmp_path, "--explain")
+def test_replay_prints_a_table_with_its_words_and_writes_csv_and_pictures(data, tmp_path):
+    asked = f"replay --data {data} --reducer pca --repeats 2 --cycles 100".split() + POLICY
+    shown = line_of(*asked, "--out", tmp_path, "--explain")
     for words in ("retrains, the worst in", "FP: bad parts accepted", "pca (local)"):
         assert words in shown
-    row = document(*asked, "--cycles", 100, "--check-seconds", 9)["rows"][0]
-    assert row["saved_s"] == 9 * row["certain"] > 0
-    assert len((tmp_path / "replays.csv").read_text().splitlines()) == 3
+    assert n_rows(tmp_path / "replays.csv") == 2
     assert {p.name for p in tmp_path.glob("*.png")} == {"curves.png", "map_pca.png"}
-    short = document(*asked[:5], "--in-order", "--cycles", 20)
-    row = short["rows"][0]
-    assert (short["in_order"], row["replays"]) == (True, 1)
+    row = document(*asked, "--check-seconds", 9)["rows"][0]
+    assert row["saved_s"] == 9 * row["certain"] > 0
+    row = document(*asked[:5], "--in-order", "--cycles", 20)["rows"][0]
+    assert row["replays"] == 1
     assert row["precision"] is row["promise_kept"] is None  # nothing was accepted
 
 
-@pytest.mark.merge
-def test_the_papers_grid_is_played_and_drawn_with_a_line_for_each_of_its_cells(
-    data: Path, tmp_path: Path
-) -> None:
-    asked = f"compare --data {data} --cycles 60 --reducers pca --paper --repeats 1".split()
-    assert "18 replays" in line_of(*asked, "--out", tmp_path)
-    rows = (tmp_path / "replays.csv").read_text("utf-8").splitlines()
-    assert len({tuple(row.split(",")[1:4]) for row in rows[1:]}) == 18
-    assert [path.name for path in tmp_path.glob("*.png")] == ["map_pca.png", "curves.png"]
-
-
-def test_a_character_that_the_screen_has_not_is_a_question_mark(
-    trained: Path, own_folder: Path
-) -> None:
-    shutil.copy(trained, own_folder / "Łódź.db")
-    screen = CliRunner(charset="cp1252")  # of Windows
-    assert "?ód?.db: overview" in screen.invoke(main, ["status", "Łódź.db"]).stdout
-    assert "Gda?sk.db" in screen.invoke(main, ["status", "Gdańsk.db"]).stderr
-
-
-def test_a_trained_store_holds_every_label_once_and_an_answering_version(
-    trained: Path, data: Path
-) -> None:
+def test_a_trained_store_holds_every_label_once_and_an_answering_version(trained, data):
     again = document("train", "--data", data, "--store", trained)["import"]
     assert (again["imported"], again["repeated"], again["resumed"]) == (0, 160, True)
-    shown = document("status", trained)
-    counts = shown["labels"], shown["sources"]["verification"], shown["reasons"]["no_model"]
-    assert counts == (160, 160, 160)
-    assert (shown["version"] >= 1, shown["safe_mode"]) == (True, "")
-    assert "Nothing can be said yet" in shown["certificate"]["sentence"]
-    text = line_of("status", trained)
-    for words in ("alpha 0.2, lower bound 0.8", "budget 450 ms", "rate unknown, unit unknown"):
+    shown, text = document("status", trained), line_of("status", trained)
+    assert (shown["labels"], shown["sources"]["verification"]) == (160, 160)
+    for words in ("alpha 0.2, lower bound 0.8", "rate unknown, unit unknown"):
         assert words in text
     with DataEngine.open(trained) as engine:
         assert engine.decide(easy_parts(1, 0).X[0]).predicted != "verify"
 
 
-def test_training_goes_on_after_retrains_without_a_step(tmp_path: Path, monkeypatch) -> None:
-    easy = easy_parts(20, 0)
-    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
-    words = ["train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db"]
-    deadline = Limits.deadline
+def test_training_goes_on_after_retrains_without_a_step(tmp_path, monkeypatch):
+    data, store = save(tmp_path / "easy.npz", easy_parts(20, 0)), tmp_path / "e.db"
+    words = f"train --data {data} --store {store}".split()
     with monkeypatch.context() as busy:
         # The attribute `data` of `dengine.cli` is the verb, not the module.
         busy.setattr(sys.modules["dengine.cli.data"], "MOST_EMPTY_RETRAINS", 2)
@@ -211,79 +156,43 @@ def test_training_goes_on_after_retrains_without_a_step(tmp_path: Path, monkeypa
         assert failed.exit_code == 1
         text = " ".join(failed.stderr.split())
         assert "60 training steps are missing: 2 retrains in a row had no time" in text
-        assert "If the machine is busy, repeat the command later" in text
-        assert "It was accepted; 60 steps to go;" in line_of("retrain", tmp_path / "e.db")
-    begun = []
-
-    def late_at_first(limits: Limits, begin: float) -> float:
-        begun.append(begin)
-        return begin - 1.0 if len(begun) == 1 else deadline(limits, begin)
-
-    monkeypatch.setattr(Limits, "deadline", late_at_first)
+        assert "It was accepted; 60 steps to go;" in line_of("retrain", store)
     again = document(*words)  # nothing is new, and all steps are missing
     assert (again["import"]["imported"], again["retrain"]["accepted"]) == (0, True)
-    assert len(begun) > 1
-    n_retrains = len(begun)
     assert "nothing was done" in line_of(*words)
-    assert len(begun) == n_retrains
 
 
-def test_training_on_too_few_labels_says_so(tmp_path: Path) -> None:
-    easy = easy_parts(10, 0)
-    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
-    failed = dengine("train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db")
+def test_training_on_too_few_labels_says_so(tmp_path):
+    data = save(tmp_path / "easy.npz", easy_parts(10, 0))
+    failed = dengine("train", "--data", data, "--store", tmp_path / "e.db")
     assert failed.exit_code == 1
     assert "Expected at least 20 traces, got 10" in failed.stderr
 
 
-def test_a_store_goes_on_with_a_reducer_of_this_folder(
-    data: Path, own_folder: Path, monkeypatch
-) -> None:
-    elsewhere = [folder for folder in sys.path if folder != str(own_folder)]
-    for words in (["--reducer", "his:FirstAndLast"], ["--allow-import"]):  # made, and opened again
-        monkeypatch.setattr(sys, "path", elsewhere[:])
-        sys.modules.pop("his", None)
-        out = line_of("train", "--data", data, "--store", "e.db", *words)
-        assert "his" in sys.modules
-        assert sys.path[-1] == str(own_folder)  # last: a module of this folder shadows nothing
-        assert "FirstAndLast answers" in out
-    assert "his:FirstAndLast" in succeed("status", "e.db")
-    asked = f"compare --data {data} --reducers pca,his:FirstAndLast --repeats 1 --cycles 100"
-    _, row = document(*asked.split(), *POLICY, "--out", "out")["rows"]
-    assert row["recipe"] == "FirstAndLast"
-    assert row["certain"] > 0
-    assert (own_folder / "out" / "map_FirstAndLast.png").is_file()
-
-
-def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(
-    data: Path, tmp_path: Path
-) -> None:
+def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data, tmp_path):
     store = tmp_path / "e.db"
-    words = ["run", "--cell", "replay", "--data", data, "--store", store, "--out", tmp_path]
+    words = f"run --cell replay --data {data} --store {store} --out {tmp_path} --force".split()
     first = document(*words, "--reducer", "pca", *POLICY, "--cycles", 110)
     shares = [part["verified_share"] for part in first["stretches"]]
     assert shares[0] == 1.0 > shares[-1]
     assert (tmp_path / "run.png").is_file()
-    assert len((tmp_path / "run.csv").read_text().splitlines()) == 111
-    assert "resumed" in document(*words, "--cycles", 30, "--force")["title"]
+    assert n_rows(tmp_path / "run.csv") == 110
+    assert "resumed" in document(*words, "--cycles", 30)["title"]
     with DataEngine.open(store) as engine:
         assert engine.status().ever.decisions == 140
         hashes = engine.store.labels.with_traces().hashes.tolist()
     assert len(hashes) == len({*hashes})
-    more = dengine(*words, "--cycles", 60, "--force")
+    more = dengine(*words, "--cycles", 60)
     assert more.exit_code == 1
     assert re.search(r"at most 2\d cycles, got 60", more.stderr)
 
 
-def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path: Path) -> None:
+def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path):
     pytest.importorskip("mujoco")
-    store = tmp_path / "e.db"
-    words = ["run", "--cell", "simulated", "--cycles", 2, "--reducer", "pca", "--store", store]
+    words = f"run --cell simulated --cycles 2 --reducer pca --store {tmp_path}/e.db".split()
     assert "simulated" in succeed(*words).lower()
-    shown = document(*words)  # and the resumed run sees new parts
-    assert shown["simulated"] is True
-    assert shown["total"]["parts_per_hour"] > 0
-    with DataEngine.open(store) as engine:
+    assert document(*words)["simulated"] is True
+    with DataEngine.open(tmp_path / "e.db") as engine:  # the resumed run saw new parts
         assert len({past.content_hash for past in engine.history()}) == 4
 
 
@@ -292,7 +201,7 @@ replay --data DATA --cycles 5000; replay --data DATA --channel FX; simulate --n 
 run --cell replay --data DATA --store e.db --reducer nowhere:Nothing"""
 
 
-def test_a_foreseen_failure_is_one_line_and_exit_code_1(data: Path, own_folder: Path) -> None:
+def test_a_foreseen_failure_is_one_line_and_exit_code_1(data, own_folder):
     for words in re.split("; |\n", FAILING):
         result = dengine(*words.replace("DATA", str(data)).split(), "--json")
         assert [path.name for path in own_folder.iterdir()] == ["his.py"]
@@ -300,7 +209,7 @@ def test_a_foreseen_failure_is_one_line_and_exit_code_1(data: Path, own_folder: 
         assert result.stderr.startswith("Error: Expected")
 
 
-def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected() -> None:
+def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected():
     for line in WRONG.strip().splitlines():
         words, expected = re.split("  +", line)
         result = dengine(*words.split())
@@ -308,110 +217,58 @@ def test_a_wrong_call_is_exit_code_2_and_says_what_was_expected() -> None:
         assert expected in " ".join(result.stderr.split())
 
 
-def test_limits_in_seconds_need_a_rate_that_the_recordings_or_an_option_state(
-    data: Path, tmp_path: Path
-) -> None:
-    data, store = shutil.copy(data, tmp_path / "parts.npz"), tmp_path / "new.db"
-    words = f"train --data {data} --reducer pca --store {store} --force-limit 0.01:0.02:-500:"
-    refused = dengine(*words.split())
-    assert refused.exit_code == 1
-    assert "state time.rate_hz of recordings" in refused.stderr
-    succeed("data", data, "--set", "time.rate_hz=100", "--set", "channels.X=kN", "--save")
-    succeed(*words.split())
-    with DataEngine.open(store) as engine:
-        assert (engine.trace.rate_hz, engine.trace.unit) == (100.0, "kN")
-        assert engine.policy.force_limits
-
-
-def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(
-    tmp_path: Path, monkeypatch
-) -> None:
+def test_without_mujoco_nothing_is_begun_and_the_error_names_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr("dengine.cli.options.find_spec", lambda name: None)
     monkeypatch.chdir(tmp_path)
     for words in ("run --cell simulated --cycles 3 --store e.db", "simulate --n 3 --out x.npz"):
-        result = dengine(*words.split())
-        assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (1, "", 1)
-        assert 'pip install "dengine[sim]"' in result.stderr
+        assert 'pip install "dengine[sim]"' in dengine(*words.split()).stderr
         assert not list(tmp_path.iterdir())
 
 
 def test_a_run_and_its_status_say_when_safe_mode_began_when_it_ended_and_what_is_certified(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     parts, store = easy_parts(700, 1, wave=slice(300, 400)), tmp_path / "engine.db"
-    data = tmp_path / "changing.npz"
-    np.savez(data, X=parts.X, y=parts.y, serial=parts.part)
+    data = save(tmp_path / "changing.npz", parts, serial=parts.part)
     succeed("data", data, "--set", "part.column=serial", "--set", "channels.X=N", "--save")
-    words = ["run", "--data", data, "--store", store, "--reducer", "pca"]
+    words = f"run --data {data} --store {store} --reducer pca".split()
     shown = document(*words, *KNOWN, "--audit-rate", 0.1, "--cycles", 320)
     (change,) = shown["safe_mode_changes"]
     assert 300 < change["cycle"] <= 320
     assert change["reason"] == shown["safe_mode"] == "too many traces were novel"
     assert shown["stretches"][-1]["safe_mode"] == 320 - change["cycle"] + 1
-    result, text = document("status", store), line_of("status", store)
-    assert result["certificate"] == shown["certificate"]
-    assert result["ever"]["novel"] == sum(part["novel"] for part in shown["stretches"])
-    for name in ("sentence", "sentence_on_rejects"):
-        assert shown["certificate"][name] in text
+    text, certificate = line_of("status", store), shown["certificate"]
+    assert document("status", store)["certificate"] == certificate
+    assert certificate["sentence"] in text
+    assert certificate["sentence_on_rejects"] in text
     assert re.search(r"safe mode too many .* safe mode time \d{4}-\d\d-\d\d ", text)
     ended = well(*words[:-2], "--cycles", 380)  # the store knows its reducer
     assert re.search(r"(?m)^After cycle \d+: safe mode ended\.$", ended.stdout)
-    assert "safe mode ended." in ended.stderr
     assert "safe mode too" not in line_of("status", store)
 
 
-def test_an_interrupted_replay_reports_what_was_finished(data: Path, own_folder: Path) -> None:
+def test_an_interrupted_replay_reports_what_was_finished(data, own_folder):
     words = f"replay --data {data} --reducer his:Interrupting --cycles 60 --repeats 50 --out out"
     result = dengine(*words.split(), *POLICY)
     assert result.exit_code == INTERRUPTED
     assert "Interrupted: 2 of 50 replays were finished; the table shows those." in result.stderr
     assert "2 replays" in result.stdout
-    assert len((own_folder / "out" / "replays.csv").read_text().splitlines()) == 3
+    assert n_rows(own_folder / "out" / "replays.csv") == 2
     assert (own_folder / "out" / "curves.png").is_file()
 
 
-def test_an_interrupted_run_keeps_every_cycle_that_it_names(data: Path, own_folder: Path) -> None:
+def test_an_interrupted_run_keeps_every_cycle_that_it_names(data, own_folder):
     words = f"run --cell replay --data {data} --cycles 160 --store e.db --reducer his:Interrupting"
     result = dengine(*words.split(), "--lower-bound", 0.99, "--out", "out")
     assert result.exit_code == INTERRUPTED
     done = int(re.search(r"Interrupted: (\d+) of 160 cycles were done", result.stderr)[1])
     rest = f"Everything up to cycle {done} is in e.db; the same command with --cycles {160 - done}"
-    assert rest in result.stderr
     assert f"{rest} and another folder for --out continues there." in result.stderr
-    assert f"1 to {done}" in result.stdout
-    assert document("status", "e.db")["ever"]["decisions"] == done > 0
     rest = f"run --data {data} --cycles {160 - done} --store e.db --allow-import --out".split()
-    refused = dengine(*rest, "out")
-    assert (refused.exit_code, refused.stdout) == (1, "")
-    assert "run.csv exists" in refused.stderr
+    assert "run.csv exists" in dengine(*rest, "out").stderr
     assert document("status", "e.db")["ever"]["decisions"] == done  # no part was played
     succeed(*rest, "rest")
-    n_rows = [
-        len((own_folder / name / "run.csv").read_text().splitlines()) - 1
-        for name in ("out", "rest")
-    ]
-    assert n_rows == [done, 160 - done]
-
-
-@pytest.mark.parametrize("file", ["replays.csv", "curves.png"])
-def test_a_file_in_the_way_of_an_interrupted_grid_is_refused_before_the_first_replay(
-    file: str, data: Path, own_folder: Path
-) -> None:
-    words = f"compare --data {data} --reducers his:Interrupting --cycles 60 --repeats 3".split()
-    words += [*POLICY, "--keep", "kept", "--out", "out"]
-    assert dengine(*words).exit_code == INTERRUPTED
-    n_kept = len(list((own_folder / "kept").rglob("*.npz")))
-    assert n_kept
-    for path in (own_folder / "out").iterdir():
-        if path.name != file:
-            path.unlink()
-    refused = dengine(*words)
-    assert (refused.exit_code, refused.stdout) == (1, "")
-    assert f"{file} exists" in refused.stderr
-    assert "--force" in refused.stderr
-    assert len(list((own_folder / "kept").rglob("*.npz"))) == n_kept
-    assert document(*words, "--force")["costs"]["kept"] == n_kept
-    assert len((own_folder / "out" / "replays.csv").read_text().splitlines()) == 4
+    assert [n_rows(Path(name, "run.csv")) for name in ("out", "rest")] == [done, 160 - done]
 
 
 WRONG = """
@@ -429,30 +286,25 @@ train                             Missing option
 """
 
 
-def test_an_interrupted_import_says_how_far_it_came_and_goes_on_there(
-    tmp_path: Path, monkeypatch
-) -> None:
+def test_an_interrupted_import_says_how_far_it_came_and_goes_on_there(tmp_path, monkeypatch):
     easy = easy_parts(160, 0)
     easy.X[0, 3], easy.X[1], easy.X[2:8] = np.nan, 7.0, easy.X[2]  # bad, and equal ones
-    np.savez(tmp_path / "easy.npz", X=easy.X, y=easy.y)
+    data, store = save(tmp_path / "easy.npz", easy), tmp_path / "e.db"
 
-    def interrupted(*args: object) -> object:
+    def interrupted(*args):
         os.kill(os.getpid(), signal.SIGINT)
         return import_labelled(*args)
 
-    words = ["train", "--data", tmp_path / "easy.npz", "--store", tmp_path / "e.db"]
+    words = f"train --data {data} --store {store} --reducer pca".split()
     with monkeypatch.context() as patched:
         patched.setattr(importing, "CHUNK", 70)
         patched.setattr(importing, "import_labelled", interrupted)
-        result = dengine(*words, "--reducer", "pca")
+        result = dengine(*words)
     assert result.exit_code == INTERRUPTED
-    text = " ".join(result.stderr.split())
-    done = re.search(r"Interrupted: (\d+) of 160 traces are in .*the same command", text)[1]
-    stored = document("status", tmp_path / "e.db")
-    assert (stored["version"], stored["labels"]) == (0, int(done))
+    done = re.search(r"Interrupted: (\d+) of 160 traces\s+are in", result.stderr)[1]
+    assert document("status", store)["labels"] == int(done)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    again = document(*words)["import"]
-    assert again["imported"] + again["repeated"] + again["quarantined"] == 160, again
-    with DataEngine.open(tmp_path / "e.db") as engine:
+    succeed(*words)
+    with DataEngine.open(store) as engine:
         kept = engine.store.labels.with_traces().labels
     assert kept.tolist() == easy.y[2:].tolist()  # bad ones are kept, and never trained on

@@ -16,6 +16,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,23 +58,10 @@ CPP = ("cmake", "build/")
 HAS_CPP = all(shutil.which(tool) for tool in ("cmake", "g++"))
 PYTHON = ("dengine ", "python training/", "python -m tests.", "python snippet.py")
 SPAWNS = "python training/benchmark_fleet.py"  # its processes need a `__main__` of their own
-HEAVY = (
-    "matplotlib.pyplot",
-    "pandas",
-    "rich.table",
-    "scipy.special",
-    "sklearn.linear_model",
-)
+PRELOADED = """dengine.cli dengine.engine.engine dengine.experiments.grid dengine.store.sql
+matplotlib.pyplot pandas rich.table scipy.special sklearn.linear_model"""
 FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(
-    [
-        "dengine.cli",
-        "dengine.engine.engine",
-        "dengine.experiments.grid",
-        "dengine.store.sql",
-        *HEAVY,
-    ]
-)
+FORKS.set_forkserver_preload(PRELOADED.split())
 RUNS, STEP_S = 80, 0.0012  # of the recordings that stand in for the public ones
 
 
@@ -87,19 +75,13 @@ class Block(NamedTuple):
     @property
     def commands(self) -> list[str]:
         """The lines of a shell block, without comments."""
-        return [
-            line
-            for line in re.sub(r"\s+#.*$", "", self.text, flags=re.M).splitlines()
-            if line.strip()
-        ]
+        lines = re.sub(r"\s+#.*$", "", self.text, flags=re.M).splitlines()
+        return [line for line in lines if line.strip()] if self.language == "sh" else []
 
 
 def blocks(page: Path) -> list[Block]:
     fenced = r'^```(sh|python)(?: title="([^"]+)")?\n(.*?)^```$'
-    return [
-        Block(*match)
-        for match in re.findall(fenced, page.read_text(encoding="utf-8"), flags=re.S | re.M)
-    ]
+    return [Block(*match) for match in re.findall(fenced, page.read_text("utf-8"), re.S | re.M)]
 
 
 def name(page: Path) -> str:
@@ -107,12 +89,11 @@ def name(page: Path) -> str:
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Path:
+def desk(tmp_path):
     """A folder that keeps what the commands write, with nothing in it but a small set."""
     X, y = recordings()
-    np.savez(
-        tmp_path / "small.npz", X=X[:, ::5], y=y, workpiece=np.arange(len(y))
-    )  # in the place of a large set
+    # In the place of a large set.
+    np.savez(tmp_path / "small.npz", X=X[:, ::5], y=y, workpiece=np.arange(len(y)))
     return tmp_path
 
 
@@ -130,12 +111,9 @@ def record(folder: Path) -> None:
     time = (np.arange(500) * STEP_S).tolist()
     for i, (torque, good) in enumerate(zip(*recordings(), strict=True)):
         graph = {"graph": {"time values": time, "torque values": torque.tolist()}}
-        run = {
-            "id code": str(i // 10),
-            "result": "OK" if good else "NOK",
-            "tightening steps": [graph],
-        }
-        (folder / f"Ch_{i:012d}.json").write_text(json.dumps(run), encoding="utf-8")
+        run = {"id code": str(i // 10), "result": "OK" if good else "NOK"}
+        text = json.dumps(run | {"tightening steps": [graph]})
+        (folder / f"Ch_{i:012d}.json").write_text(text, encoding="utf-8")
 
 
 def shell(command: str, desk: Path) -> None:
@@ -144,12 +122,11 @@ def shell(command: str, desk: Path) -> None:
     if command.startswith(PYTHON) and not command.startswith(SPAWNS) and is_plain:
         python(shlex.split(command.removeprefix("python ")), desk)
         return
-    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     env = os.environ | {"PATH": path, "OMP_NUM_THREADS": "1", "COLUMNS": "80"}
-    done = subprocess.run(
-        ["bash", "-c", command], cwd=desk, env=env, capture_output=True, text=True, timeout=300
-    )
-    assert done.returncode == 0, f"{command}\n{done.stdout[-2000:]}\n{done.stderr[-3000:]}"
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    done = subprocess.run(["bash", "-c", command], cwd=desk, env=env, timeout=300, **pipes)
+    assert done.returncode == 0, f"{command}\n{done.stdout[-4000:]}"
 
 
 def python(words: list[str], desk: Path) -> None:
@@ -158,11 +135,8 @@ def python(words: list[str], desk: Path) -> None:
     """
     text, typed = desk / "said.txt", REPO / "tests" / "support" / "typed.py"
     given = {"WHERE": str(desk), "ARGV": words, "SAID": str(text)}
-    process = FORKS.Process(
-        target=runpy.run_path,
-        args=(str(typed),),
-        kwargs={"init_globals": given, "run_name": "typed"},
-    )
+    typed_run = partial(runpy.run_path, str(typed), init_globals=given, run_name="typed")
+    process = FORKS.Process(target=typed_run)
     process.start()
     process.join(900)
     process.kill()
@@ -171,12 +145,7 @@ def python(words: list[str], desk: Path) -> None:
 
 def smaller(command: str) -> str:
     """The command with its quick options, where it has any."""
-    return " ".join(
-        [
-            command,
-            *(options for beginning, options in SMALLER.items() if command.startswith(beginning)),
-        ]
-    )
+    return " ".join([command, *(SMALLER[start] for start in SMALLER if command.startswith(start))])
 
 
 def type_in(command: str, desk: Path) -> None:
@@ -200,16 +169,13 @@ def snippet(block: Block, desk: Path) -> None:
 
 def typed_pages() -> list:
     """The pages with something to type; those that are not quick are slow."""
-    marks = {
-        page: () if name(page) in QUICK else (pytest.mark.slow,) for page in PAGES if blocks(page)
-    }
-    return [pytest.param(page, marks=mark, id=name(page)) for page, mark in marks.items()]
+    pages = {name(page): page for page in PAGES if blocks(page)}
+    marks = {text: () if text in QUICK else pytest.mark.slow for text in pages}
+    return [pytest.param(page, marks=marks[text], id=text) for text, page in pages.items()]
 
 
 @pytest.mark.parametrize("page", typed_pages())
-def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(
-    page: Path, desk: Path
-) -> None:
+def test_every_command_and_snippet_of_a_page_runs_from_top_to_bottom(page, desk):
     type_page(page, desk)
 
 
@@ -220,48 +186,22 @@ def type_page(page: Path, desk: Path) -> None:
     for block in blocks(page):
         if block.language == "python":
             snippet(block, desk)
-        for command in block.commands if block.language == "sh" else ():
+        for command in block.commands:
             type_in(command, desk)
 
 
-def test_every_shortened_command_is_on_a_page() -> None:
-    commands = [
-        command
-        for page in PAGES
-        for block in blocks(page)
-        if block.language == "sh"
-        for command in block.commands
-    ]
+def test_every_shortened_command_is_on_a_page():
+    commands = [command for page in PAGES for block in blocks(page) for command in block.commands]
     assert [
-        beginning for beginning in SMALLER if not any(c.startswith(beginning) for c in commands)
+        key for key in SMALLER if not any(command.startswith(key) for command in commands)
     ] == []
 
 
 @pytest.mark.slow
-def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(
-    desk: Path,
-) -> None:
+def test_readme_tutorial_and_production_are_typed_one_after_the_other_in_one_folder(desk):
     (suggested,) = re.findall(
         r"Go on with:.*&& (dengine .*)'", (REPO / "Makefile").read_text("utf-8")
     )
     shell(suggested.replace("--cycles 600", "--cycles 80"), desk)
     for page in ("README.md", "docs/tutorials/first_part.md", "docs/howto/production.md"):
         type_page(REPO / page, desk)
-
-
-def test_the_readme_shows_what_the_demo_types() -> None:
-    (demo,) = re.findall(r"\$\(RUN\) (.*)", (REPO / "Makefile").read_text("utf-8"))
-    readme = PAGES[0].read_text("utf-8")
-    assert f"\ndengine {demo.replace('$(OUT)', 'out')}\n" in readme
-
-
-def test_each_page_has_stores_and_folders_of_its_own() -> None:
-    written = r"[\w./-]+\.db\b|(?<=--out )(?!recordings\b|screw_driving)\S+|(?<=--keep )\S+"  # two are made alike by several
-    names = {
-        name(page): set(re.findall(written, "\n".join(block.text for block in blocks(page))))
-        for page in PAGES
-    }
-    twice = [
-        (a, b, names[a] & names[b]) for a in names for b in names if a < b and names[a] & names[b]
-    ]
-    assert twice == []

@@ -2,8 +2,6 @@
 and not in silence.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -15,17 +13,10 @@ from tests.support.driving import learn
 BAD = {Reason.NOT_FINITE: np.full(7_000, np.nan), Reason.CONSTANT: np.zeros((3, 500))}
 
 
-@pytest.fixture(params=["memory", "sqlite"])
-def place(request: pytest.FixtureRequest, tmp_path: Path):
-    return None if request.param == "memory" else tmp_path / "engine.db"
-
-
 @pytest.mark.parametrize("reason", BAD, ids=str)
-def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(
-    place, reason: Reason, make_data
-) -> None:
+def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(tmp_path, reason, make_data):
     data = make_data(80)
-    with DataEngine("pca", retrain_every=60, store=place) as engine:
+    with DataEngine("pca", retrain_every=60, store=tmp_path / "engine.db") as engine:
         for _ in range(2):
             decision = engine.decide(BAD[reason])
             assert (decision.action, decision.reason, engine.trace) == (Action.VERIFY, reason, None)
@@ -37,14 +28,11 @@ def test_a_bad_first_trace_is_verified_and_the_contract_stays_open(
         assert engine.decide(data.X[0]).reason is not Reason.MODEL_ERROR
 
 
-@pytest.mark.parametrize("samples", [1, 2, 3, MIN_SAMPLES - 1])
-def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(
-    place, samples: int
-) -> None:
-    with DataEngine("pca", store=place) as engine:
-        with pytest.raises(
-            TraceError, match=rf"got 1 x {samples}; record longer, or start with DataEngine\(trace="
-        ):
+@pytest.mark.parametrize("samples", [1, MIN_SAMPLES - 1])
+def test_a_first_trace_of_a_few_samples_is_refused_and_nothing_is_stored(samples):
+    match = rf"got 1 x {samples}; record longer, or start with DataEngine\(trace="
+    with DataEngine("pca") as engine:
+        with pytest.raises(TraceError, match=match):
             engine.decide(np.arange(samples))
         assert (engine.trace, engine.store.decisions.counts()["decisions"]) == (None, 0)
         buffer = np.arange(MIN_SAMPLES)

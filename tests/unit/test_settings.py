@@ -3,25 +3,20 @@ reducers, models, stores.
 """
 
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 
 import numpy as np
 import pytest
 from sklearn.base import clone
 from sklearn.decomposition import PCA
-from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from dengine import (
     DataEngine,
-    Dataset,
     ModelPrediction,
     Policy,
-    Reason,
     Recipe,
     TraceSpec,
     WilsonRadiusClassifier,
@@ -36,7 +31,7 @@ from tests.support.driving import Counting, drive, learn
 POLICY = Policy(alpha=0.2, lower_bound=0.8, audit_rate=0.05)
 
 
-def test_what_is_given_beside_a_recipe_takes_its_place() -> None:
+def test_what_is_given_beside_a_recipe_takes_its_place():
     given = {"policy": POLICY, "radius": 0.07, "folds": 3, "retrain_every": 20, "budget": 0.3}
     engine, expected = DataEngine(recipe="conv", **given), replace(RECIPES["conv"], **given)
     assert engine.recipe == expected
@@ -71,30 +66,38 @@ REFUSED = [  # settings, and the words that say why not
 
 @pytest.mark.parametrize(("given", "words"), REFUSED)
 def test_what_contradicts_itself_or_has_no_effect_is_refused_and_spoils_no_store(
-    given, words: str, tmp_path: Path
-) -> None:
-    for begin in (DataEngine, DataEngine.open_or_create):
-        with pytest.raises(SettingError, match=words):
-            begin(store=tmp_path / "engine.db", **given)
+    given, words, tmp_path
+):
+    with pytest.raises(SettingError, match=words):
+        DataEngine.open_or_create(store=tmp_path / "engine.db", **given)
     assert DataEngine("pca", store=tmp_path / "engine.db").store.settings.read()
 
 
 def test_the_loops_settings_and_those_of_a_policy_that_are_no_rule_count_for_a_baseline_too(
-    tmp_path: Path,
-) -> None:
+    tmp_path,
+):
     policy = Policy(audit_rate=0.3, label_within=200)
     given = {"model": Counting(), "store": tmp_path / "e.db", "retrain_every": 7, "budget": 0.2}
     with DataEngine(policy=policy, **given) as engine:
         assert engine.policy == policy
         assert (engine.recipe.retrain_every, engine.recipe.budget) == (7, 0.2)
-        assert engine.store.settings.read()["model"] == "Counting"
     with pytest.raises(SettingError, match=r"\(label_within 200\), got label_within 300"):
         DataEngine.open_or_create(policy=replace(policy, label_within=300), **given)
-    with DataEngine.open_or_create(policy=replace(policy, shadow=True), **given) as engine:
-        assert engine.policy == policy  # the shadow mode is an operator's
+    # The shadow mode is an operator's.
+    DataEngine.open_or_create(policy=replace(policy, shadow=True), **given).close()
 
 
-def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None:
+OTHERS = {
+    "policy": Policy(0.1, 0.9),
+    "radius": 0.3,
+    "reducer": "conv",
+    "recipe": "umap",
+    "seed": 4,
+    "trace": TraceSpec(99),
+}
+
+
+def test_the_same_line_begins_and_goes_on_and_another_is_an_error_that_names_both(data, tmp_path):
     url, given = tmp_path / "engine.db", {"reducer": "pca", "policy": POLICY, "retrain_every": 30}
     for start in (0, 20, 40):
         with DataEngine.open_or_create(url, **given) as engine:
@@ -102,22 +105,9 @@ def test_the_same_line_begins_and_goes_on(data: Dataset, tmp_path: Path) -> None
             assert engine.store.decisions.counts()["decisions"] == start
             drive(engine, data, start, start + 20)
     assert engine.version > 0
-
-
-def test_other_settings_than_the_stores_are_an_error_that_names_both(
-    data: Dataset, tmp_path: Path
-) -> None:
-    url, given = tmp_path / "engine.db", {"reducer": "pca", "policy": POLICY, "radius": 0.5}
-    with DataEngine.open_or_create(url, **given) as engine:
-        engine.decide(data.X[0])
-    for name, other, named in (
-        ("policy", Policy(0.1, 0.9), "lower_bound"),
-        ("radius", 0.3, "radius"),
-        ("reducer", "conv", "reducer"),
-        ("recipe", "umap", "reducer"),
-        ("seed", 4, "seed"),
-        ("trace", TraceSpec(99), "trace"),
-    ):
+    names = {"policy": "lower_bound", "recipe": "reducer"}
+    for name, other in OTHERS.items():
+        named = names.get(name, name)
         match = rf"the store's own settings \(.*{named} .*\), got .*{named} "
         with pytest.raises(SettingError, match=match):
             DataEngine.open_or_create(url, **{name: other})
@@ -130,33 +120,25 @@ STATED = TraceSpec(100, 1000.0, 2, ("N", "mm"), columns=("force", "path"))
 
 
 @pytest.mark.parametrize("first", [FIRST, None], ids=["a contract", "the first trace"])
-def test_a_rate_is_stated_later_and_contradicted_never(
-    first: TraceSpec | None, make_data, tmp_path: Path
-) -> None:
+def test_a_rate_is_stated_later_and_contradicted_never(first, make_data, tmp_path):
     url = tmp_path / "engine.db"
     with DataEngine("pca", store=url, trace=first) as engine:
         engine.decide(make_data(1, channels=2).X[0])
         assert engine.trace == FIRST
-    nothing = (None, FIRST, TraceSpec(100, channels=2, unit="N, "))  # they ask for nothing
-    for asked in (STATED, *nothing):
-        for begin in (DataEngine.open_or_create, DataEngine.open)[: 1 + (asked is STATED)]:
-            with begin(url, trace=asked) as engine:
-                assert engine.trace == STATED
+    for asked in (STATED, None, FIRST, replace(FIRST, unit="N, ")):  # the others ask for nothing
+        with DataEngine.open_or_create(url, trace=asked) as engine:
+            assert engine.trace == STATED
     for other in ({"rate_hz": 500.0}, {"unit": "N"}, {"samples": 99}, {"columns": ("a", "b")}):
         with pytest.raises(SettingError, match=r"the store's own settings \(trace TraceSpec"):
             DataEngine.open(url, trace=replace(STATED, **other))
 
 
-def stored(url: Path, **settings: str) -> Path:
-    """A store whose settings an older version wrote."""
-    with DataEngine("pca", store=url) as engine:
-        engine.store.settings.save(engine.store.settings.read() | settings)
-    return url
-
-
-def test_a_store_keeps_the_rate_that_it_holds(make_data, tmp_path: Path) -> None:
+def test_a_store_keeps_the_rate_that_an_older_version_wrote(make_data, tmp_path):
     old = '{"samples": 100, "rate_hz": 500.0, "channels": 1, "unit": "N", "limit": null, "columns": []}'
-    url = stored(tmp_path / "engine.db", trace=old, inferred="true")
+    url = tmp_path / "engine.db"
+    with DataEngine("pca", store=url) as engine:
+        settings = engine.store.settings
+        settings.save(settings.read() | {"trace": old, "inferred": "true"})
     with DataEngine.open_or_create(url, trace=TraceSpec(100)) as engine:
         engine.decide(make_data(1).X[0])
         assert engine.trace == TraceSpec(100, 500.0, unit="N")
@@ -167,24 +149,15 @@ def test_a_store_keeps_the_rate_that_it_holds(make_data, tmp_path: Path) -> None
 LIMITED = Policy(force_limits=("0.02:0.1::1e9",))
 
 
-def test_limits_that_an_older_version_took_without_a_rate_wait_for_it_to_be_stated(
-    make_data, tmp_path: Path
-) -> None:
-    url = stored(tmp_path / "engine.db", recipe=Recipe("pca", policy=LIMITED).to_toml())
-    for begin in (DataEngine.open, DataEngine.open_or_create):
-        with pytest.raises(SettingError, match="Expected the rate of the traces"):
-            begin(url)
-    with DataEngine.open(url, trace=TraceSpec(100, 1000.0)) as engine:
-        assert engine.decide(make_data(1).X[0]).reason is Reason.NO_MODEL
-
-
-def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path: Path) -> None:
-    url = tmp_path / "line.db"
+def test_a_new_cell_with_limits_in_seconds_has_the_rate_of_its_product(tmp_path):
     for cell, trace in (("a", STATED), ("b", None)):
-        with DataEngine("pca", LIMITED, store=address(url, cell, "nut"), trace=trace) as engine:
+        store = address(tmp_path / "line.db", cell, "nut")
+        with DataEngine("pca", LIMITED, store=store, trace=trace) as engine:
             assert engine.trace == STATED
-    with DataEngine.open(address(url, "b", "nut")) as engine:
+    with DataEngine.open(store) as engine:
         assert engine.trace == STATED
+    with pytest.raises(SettingError, match="Expected the rate of the traces"):
+        DataEngine("pca", LIMITED)
 
 
 def ours(alpha: float = 0.2) -> ModelPrediction:
@@ -195,16 +168,11 @@ def ours(alpha: float = 0.2) -> ModelPrediction:
     ("first", "then"),
     [
         ({"model": ours(), "policy": Policy(audit_rate=0.1)}, {"model": ours(alpha=0.5)}),
-        ({"model": Counting()}, {"model": ours()}),
         ({"reducer": "pca"}, {"model": ours()}),
         ({"recipe": Recipe(PCA(2), policy=POLICY)}, {"reducer": PCA(3)}),
-        ({"reducer": PCA(2)}, {"reducer": LinearDiscriminantAnalysis()}),
-        ({"reducer": make_pipeline(StandardScaler(), PCA(2))}, {"reducer": make_pipeline(PCA(3))}),
     ],
 )
-def test_a_used_store_takes_the_object_it_was_made_with_and_no_other(
-    first, then, data: Dataset, tmp_path: Path
-) -> None:
+def test_a_used_store_takes_the_object_it_was_made_with_and_no_other(first, then, data, tmp_path):
     url, given = tmp_path / "engine.db", first | {"retrain_every": 20}
     with DataEngine.open_or_create(url, **given) as engine:
         drive(engine, data, 0, 21)
@@ -223,70 +191,54 @@ class Rule(DecisionRule): ...
 """
 
 
-@pytest.fixture
-def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """A reducer in a module of somebody else's."""
-    (tmp_path / "theirs.py").write_text(OUTSIDE, encoding="utf-8")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    yield "theirs:Own"
-    sys.modules.pop("theirs", None)
-
-
 @pytest.mark.parametrize(
     "mine", [{"reducer": "theirs:Own"}, {"policy": replace(POLICY, guarantee="theirs:Rule")}]
 )
 def test_what_a_store_names_is_imported_only_where_its_caller_says_so(
-    outside, mine, data, tmp_path, monkeypatch
-) -> None:
-    module, ran, url = tmp_path / "theirs.py", tmp_path / "ran", str(tmp_path / "engine.db")
+    mine, data, tmp_path, monkeypatch
+):
+    module, url = tmp_path / "theirs.py", str(tmp_path / "engine.db")
+    module.write_text(OUTSIDE)
+    monkeypatch.syspath_prepend(str(tmp_path))
     a, b = (address(url, cell, "nut") for cell in "ab")
     with DataEngine(store=a, **{"reducer": "pca", "retrain_every": 20, **mine}) as engine:
         drive(engine, data, 0, 21)
     monkeypatch.delitem(sys.modules, "theirs")
-    module.write_text(f"{OUTSIDE}open({str(ran)!r}, 'w').close()\n")
 
-    def exit_codes(*calls: str) -> list[int]:
+    def exit_codes(*calls):
         return [dengine(*call.format(url).split(), "--cell", "a").exit_code for call in calls]
 
     assert exit_codes("status {}", "verify {}", "history {}", "explain {} last") == [0] * 4
     assert exit_codes("retrain {}", "policy {}") == [2] * 2
     match = r"theirs:.*, which .* names: name it again .*allow_import=True"
-    for opened in (DataEngine.open, DataEngine.open_or_create):
-        with pytest.raises(ImportRefusedError, match=match):
-            opened(address(url, "a"))
+    with pytest.raises(ImportRefusedError, match=match):
+        DataEngine.open(address(url, "a"))
     with pytest.raises(ImportRefusedError, match=r"theirs:.*, which a peer"):
         DataEngine.open_or_create(b)
-    assert not ran.exists()
+    assert "theirs" not in sys.modules
     assert exit_codes("policy {} --allow-import") == [0]
-    assert ran.exists()
     monkeypatch.delitem(sys.modules, "theirs")
     DataEngine.open_or_create(address(url, "a"), **mine).close()
     DataEngine.open_or_create(b, allow_import=True).close()
+    monkeypatch.delitem(sys.modules, "theirs")
 
 
-def test_an_object_without_a_name_runs_and_is_handed_in_again(
-    data: Dataset, tmp_path: Path
-) -> None:
+def test_an_object_without_a_name_runs_and_is_handed_in_again(data, tmp_path):
     for params in ({"segments": [1]}, {"a b": 1}, {"inner": PCA(2)}):  # that TOML cannot say
         with pytest.raises(SettingError, match="params of plain names and values"):
             Recipe("conv", params)
-    store, pipeline = (
-        tmp_path / "engine.db",
-        make_pipeline(StandardScaler(), PCA(2, random_state=0)),
-    )
+    store = tmp_path / "engine.db"
+    pipeline = make_pipeline(StandardScaler(), PCA(2, random_state=0))
     with DataEngine(pipeline, POLICY, store=store) as engine:
-        actions = {cycle.decision.action for cycle in drive(engine, data, 0, 100)}
+        drive(engine, data, 0, 100)
         before = engine.decide(data.X[170])
-    assert actions >= {"verify", "accept"}
     with pytest.raises(SettingError, match=r"object Pipeline, has no name in TOML: hand it in"):
         DataEngine.open(store)
     with DataEngine.open(store, reducer=clone(pipeline)) as engine:
-        assert engine.decide(data.X[170]).embedding == before.embedding
+        assert engine.decide(data.X[170]).embedding == before.embedding is not None
 
 
-def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was_handed_in(
-    data: Dataset,
-) -> None:
+def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was_handed_in(data):
     for steps in (1, 3):
         engine = DataEngine(recipe=replace(RECIPES["conv"], max_steps=steps), replaying=True)
         drive(engine, data, 0, 31)
@@ -301,8 +253,9 @@ def test_a_retrain_stops_on_its_steps_in_a_replay_and_else_on_the_clock_that_was
     assert report.seconds in range(2, next(ticks) - before)  # whole seconds: of no other clock
 
 
-@pytest.mark.parametrize("name", ["seed", "policy_since", "evidence_since", "began_in"])
-def test_a_damaged_number_among_the_stores_settings_is_named(name: str) -> None:
-    texts = EngineSettings(Recipe("pca")).to_store() | {name: "3x"}
-    with pytest.raises(StoreError, match=f"Expected a {name} in the store's settings, got '3x'"):
+def test_a_damaged_number_among_the_stores_settings_is_named():
+    texts = EngineSettings(Recipe("pca")).to_store() | {"policy_since": "3x"}
+    with pytest.raises(
+        StoreError, match="Expected a policy_since in the store's settings, got '3x'"
+    ):
         EngineSettings.from_store(texts, "cell.db")

@@ -3,10 +3,9 @@ verified.
 """
 
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +19,9 @@ from dengine import (
     TraceSpec,
     describe,
     load_dataset,
-    open_store,
 )
-from dengine.datasets.importing import import_labelled
 from dengine.export.cell_journal import read_journal
+from dengine.records import FITS
 from dengine.testing import toy_traces
 from tests.support.command_line import dengine
 from tests.support.exports import cell_journal
@@ -33,25 +31,19 @@ from .damage import SAMPLES, anything, spoilt, traces, tries
 pytestmark = pytest.mark.filterwarnings("ignore")
 X, Y = toy_traces(70, SAMPLES)
 X = X[:, 0]
-SOUND = st.integers(0, len(X) - 1).flatmap(
-    lambda i: st.floats(0.0, 1.0).map(lambda offset: X[i] + np.float32(offset))
-)
+SOUND = st.builds(lambda i, offset: X[i] + offset, st.integers(0, 69), st.floats(0, 1, width=32))
 SPEC = TraceSpec(SAMPLES)
 RECIPES = [Recipe.load(name).to_toml() for name in ("conv", "pca", "rocket", "umap")]
 SETTINGS = '0 1 -1 true nan inf 1e400 "" "x" "none" [] [[1]] {} {a=1} 1979-05-27 07:32:00 "a:b" "\\u0000" 0.05 0.9'
 TOML = [*SETTINGS.split(), "9" * 5000, "[" * 300, "'''", "0x7fffffffffffffffffff", "\x80", "\0"]
-TABLE = [
-    "FZ_0,FZ_1,FZ_2,label",
-    *(
-        f"{','.join(map(str, x[:3]))},{'OK' if y else 'NOK'}"
-        for x, y in zip(X[:4], Y, strict=False)
-    ),
-]
-RECORDING = ["timestamp,FZ_Base", *(f"{i / 500},{value}" for i, value in enumerate(X[0]))]
-PARTS = [
-    f"part,a-{i},{int(y)},7,verify,verify,uncertain,0.2,1.0,3,0,{','.join(map(str, X[i] + 1))}"
-    for i, y in enumerate(Y[:3])
-]
+ROWS = [",".join(map(str, x)) for x in X + 1]
+TABLE = "\n".join(
+    ["FZ_0,FZ_1,FZ_2,label"]
+    + [f"{','.join(ROWS[i].split(',')[:3])},{('NOK', 'OK')[y]}" for i, y in enumerate(Y[:4])]
+)
+RECORDING = "timestamp,FZ_Base\n" + "\n".join(f"{i / 500},{v}" for i, v in enumerate(X[0]))
+PART = "part,a-{},{:d},7,verify,verify,uncertain,0.2,1.0,3,0,{}"
+PARTS = "\n".join(map(PART.format, range(3), Y.tolist(), ROWS)).encode()
 TYPED = "x -1 0 nan inf 1e400 1.5 - -- --out --json é , ,, a,b . / .. /dev/null missing/file %s {} a:b : http://x"
 WORDS = [*TYPED.split(), "", "\ud800", "a b", "x" * 300, "sqlite://", "none", "=", "*"]
 COMMANDS = """status store.db --json
@@ -72,8 +64,8 @@ def saved(write: Callable[..., None]) -> bytes:
 
 FILES = {  # by what reads them
     "data.npz": [saved(np.savez), saved(np.savez_compressed)],
-    "table.csv": ["\n".join(TABLE).encode()],
-    "cell/1_OK.csv": ["\n".join(RECORDING).encode()],
+    "table.csv": [TABLE.encode()],
+    "cell/1_OK.csv": [RECORDING.encode()],
     "labels.csv": [b"file,label,part\n1_OK.csv,OK,7\n"],
 }
 
@@ -87,13 +79,10 @@ def learned(store: Path | None = None) -> DataEngine:
 
 
 @pytest.fixture(scope="module")
-def engines() -> Iterator[list[DataEngine]]:
+def engines():
     """With a model, without one, and of an open contract; each works after all that was tried."""
-    items = [
-        learned(),
-        DataEngine("pca", trace=SPEC),
-        DataEngine("pca", trace=TraceSpec(SAMPLES, fit="resample")),
-    ]
+    untrained = [DataEngine("pca", trace=TraceSpec(SAMPLES, fit=fit)) for fit in FITS[::3]]
+    items = [learned(), *untrained]
     yield items
     for engine in items:
         id_ = engine.decide(X[0] * -9.0).id
@@ -103,10 +92,10 @@ def engines() -> Iterator[list[DataEngine]]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     created = tmp_path_factory.mktemp("fuzz")
     (created / "small.npz").write_bytes(FILES["data.npz"][0])
-    (created / "cell.csv").write_bytes(journal("\n".join(PARTS).encode()))
+    (created / "cell.csv").write_bytes(journal(PARTS))
     learned(created / "store.db").close()
     return created
 
@@ -118,9 +107,7 @@ def journal(lines: bytes) -> bytes:
 
 @given(value=traces, which=st.integers(0, 2))
 @tries(3.0)
-def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(
-    engines, value: Any, which: int
-) -> None:
+def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(engines, value, which):
     with suppress(DengineError):
         engines[which].decide(value)
 
@@ -130,9 +117,7 @@ def test_anything_in_the_place_of_a_trace_is_decided_on_or_refused(
     x=SOUND,
 )
 @tries(3.0)
-def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
-    engines, value: Any, x: np.ndarray
-) -> None:
+def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(engines, value, x):
     engine = engines[0]
     id_, before = engine.decide(x * -3.0).id, engine.state.new_labels
     try:
@@ -140,21 +125,17 @@ def test_a_label_is_a_bool_or_exactly_1_or_0_and_else_leaves_nothing(
     except DengineError:
         assert (engine.find(id_).success, engine.state.new_labels) == (None, before)
     else:
-        assert isinstance(value, bool | int | float | np.generic | np.ndarray)
         assert value in (0, 1)
         assert engine.find(id_).success is bool(value)
 
 
-@given(value=anything, x=SOUND, decides=st.booleans(), good=st.booleans())
+@given(value=anything, x=SOUND)
 @tries(2.0)
-def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(
-    engines, value, x, decides: bool, good
-) -> None:
+def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(engines, value, x):
     with suppress(DengineError):
-        if decides:
-            engines[0].decide(x, part=value)
-        else:
-            engines[0].report(value, good)
+        engines[0].report(value, True)
+    with suppress(DengineError):
+        engines[0].decide(x, part=value)
 
 
 @given(
@@ -162,8 +143,8 @@ def test_anything_in_the_place_of_an_id_or_a_part_is_taken_or_refused(
 )
 @tries()
 def test_a_recipe_with_another_value_or_damaged_makes_an_engine_or_is_refused(
-    folder: Path, data, value, lines
-) -> None:
+    folder, data, value, lines
+):
     at = data.draw(st.sampled_from([i for i, line in enumerate(lines) if " = " in line]))
     lines[at] = lines[at].partition(" = ")[0] + " = " + value
     content = "\n".join(lines).encode("utf-8", "surrogatepass")
@@ -175,7 +156,7 @@ def test_a_recipe_with_another_value_or_damaged_makes_an_engine_or_is_refused(
 @pytest.mark.parametrize("name", FILES)
 @given(data=st.data())
 @tries(0.3)
-def test_a_damaged_file_of_data_is_read_or_refused(name: str, tmp_path_factory, data) -> None:
+def test_a_damaged_file_of_data_is_read_or_refused(name, tmp_path_factory, data):
     here = tmp_path_factory.mktemp("data")
     cell = here / "cell"
     cell.mkdir()
@@ -186,25 +167,12 @@ def test_a_damaged_file_of_data_is_read_or_refused(name: str, tmp_path_factory, 
         load_dataset(source, describe(source))
 
 
-@given(
-    content=spoilt("\n".join(PARTS).encode()).map(journal)
-    | spoilt(journal("\n".join(PARTS).encode()))
-)
+@given(content=spoilt(PARTS).map(journal) | spoilt(journal(PARTS)))
 @tries()
-def test_a_damaged_journal_is_read_or_refused(folder: Path, content: bytes) -> None:
+def test_a_damaged_journal_is_read_or_refused(folder, content):
     (folder / "damaged.csv").write_bytes(content)
     with suppress(DengineError):
         read_journal(folder / "damaged.csv", SPEC)
-
-
-@given(
-    labels=st.lists(st.sampled_from([0, 1]) | anything, min_size=3, max_size=3),
-    X=st.just(X[:3]) | traces,
-)
-@tries(0.3)
-def test_odd_arrays_and_labels_are_imported_or_refused(labels: list[Any], X: Any) -> None:
-    with suppress(DengineError):
-        import_labelled(open_store(None), (X, labels), recipe="pca")
 
 
 def must_be_one_line(words: list[str]) -> None:
@@ -217,9 +185,7 @@ def must_be_one_line(words: list[str]) -> None:
 
 @given(data=st.data(), words=st.sampled_from(COMMANDS.splitlines()).map(str.split))
 @tries(0.1)
-def test_a_command_with_other_words_works_or_says_one_error(
-    folder: Path, data, words: list[str]
-) -> None:
+def test_a_command_with_other_words_works_or_says_one_error(folder, data, words):
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(1, len(words)))
         words[at : at + data.draw(st.integers(0, 1))] = data.draw(
@@ -232,9 +198,7 @@ def test_a_command_with_other_words_works_or_says_one_error(
 
 @given(data=st.data(), shown=st.booleans())
 @tries(0.1)
-def test_a_damaged_store_is_opened_and_decides_or_is_refused(
-    folder: Path, tmp_path_factory, data, shown: bool
-) -> None:
+def test_a_damaged_store_is_opened_and_decides_or_is_refused(folder, tmp_path_factory, data, shown):
     path = tmp_path_factory.mktemp("damaged") / "cell.db"
     path.write_bytes(data.draw(spoilt((folder / "store.db").read_bytes())))
     if shown:
