@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from dengine.export import import_journal
 from dengine.export.cell_journal import read_journal
 from dengine.folds import part_hash
 from dengine.records import Reason
+from dengine.store import Outcomes
 from dengine.store.opening import open_store
 from tests.support.command_line import line_of
 from tests.support.exports import cell_journal, trained
@@ -22,11 +24,8 @@ from tests.support.exports import cell_journal, trained
 DECIDED = "verify,verify,uncertain,0,1,0,0"
 
 
-NewStore = Callable[..., str]
-
-
 @pytest.fixture(scope="module")
-def new_store(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> NewStore:
+def new_store(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
     """Copies an engine's store, after its first retrain, to a path."""
 
     @cache
@@ -39,7 +38,7 @@ def new_store(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> NewSto
 
 
 @pytest.fixture
-def store(new_store: NewStore, tmp_path: Path) -> str:
+def store(new_store, tmp_path: Path) -> str:
     return new_store(tmp_path / "engine.db")
 
 
@@ -54,9 +53,8 @@ def write_lines(path: Path, X: np.ndarray, lines: Iterable[str]) -> Path:
     """
     traces, whole = iter(X.reshape(len(X), -1)), []
     for line in lines:
-        if line.startswith("part,") and ",reject," not in line:
-            line += "".join(f",{v:.9g}" for v in next(traces))
-        whole.append(line)
+        has_trace = line.startswith("part,") and ",reject," not in line
+        whole.append(line + "".join(f",{v:.9g}" for v in next(traces)) if has_trace else line)
     path.write_bytes(cell_journal(*whole))
     Path(f"{path}.head").write_bytes(b"%d %s\n" % (len(whole) + 1, path.read_bytes()[-9:-1]))
     return path
@@ -68,36 +66,24 @@ def write(path: Path, data: Dataset, n: int | None = None) -> Path:
     return write_lines(path, data.X, lines)
 
 
-def test_each_line_counts_once(
-    store: str, make_data: Callable[..., Dataset], tmp_path: Path
+def test_each_line_counts_once_also_in_a_store_that_was_passed_open_and_stays_so(
+    store: str, make_data, tmp_path: Path
 ) -> None:
-    new, counts = make_data(30, seed=4), []
+    new, counts, empty = make_data(30, seed=4), [], tmp_path / "none.csv"
     new.X[3, 5] = np.nan
-    for n in (20, 30):
-        report = import_journal(store, write(tmp_path / "cell.csv", new, n))
-        counts.append((report.imported, report.quarantined, report.repeated))
-    assert counts == [(19, 1, 0), (10, 0, 20)]
-    with DataEngine.open(store) as engine:
-        assert engine.retrain().n_traces == 200 + 29
-
-
-def test_a_store_that_was_passed_open_stays_open_and_gives_the_cell_up(
-    store: str, make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
-    journal = write(tmp_path / "cell.csv", make_data(20, seed=4))
-    (tmp_path / "none.csv").write_text("no journal")
+    empty.write_text("no journal")
     with open_store(store) as opened:
         with pytest.raises(DataError, match="Expected a journal"):
-            import_journal(opened, tmp_path / "none.csv")
-        assert import_journal(opened, journal).imported == 20
-        assert import_journal(opened, journal).repeated == 20
+            import_journal(opened, empty)
+        for n, target in ((20, opened), (30, opened)):
+            report = import_journal(target, write(tmp_path / "cell.csv", new, n))
+            counts.append((report.imported, report.quarantined, report.repeated))
+        assert counts == [(19, 1, 0), (10, 0, 20)]
         with DataEngine.open(opened) as engine:
-            assert engine.retrain().n_traces == 220
+            assert engine.retrain().n_traces == 200 + 29
 
 
-def test_a_journal_reads_as_it_was_written(
-    make_data: Callable[..., Dataset], tmp_path: Path
-) -> None:
+def test_a_journal_reads_as_it_was_written(make_data, tmp_path: Path) -> None:
     new = make_data(10, 40, 3)
     back = read_journal(write(tmp_path / "cell.csv", new), TraceSpec(40, channels=3)).lines
     np.testing.assert_array_equal([line.trace for line in back], new.X)
@@ -106,29 +92,29 @@ def test_a_journal_reads_as_it_was_written(
 
 
 # Of each line: the part, and its label's bound, success, how many were silent before it, novelty.
-CELL = {
-    "part,a-1,1,P1,verify,verify,uncertain,0.25,0.75,5,5": ("P1", (0.25, True, 0, False)),
-    "part,a-2,,P2,accept,accept,certain,0.925,1,30,0": ("P2", (0.925, True, 0, False)),
-    "part,a-3,0,P3,accept,accept,certain,0.9375,1,31,0": ("P3", (0.9375, False, 0, False)),
-    "part,a-4,1,P6,accept,accept,certain,0.9375,1,31,0": ("P6", (0.9375, True, 0, False)),
-    "part,a-5,0,P4,verify,accept,audit,0.9375,1,31,0": ("P4", (0.9375, False, 0, False)),
-    "part,a-6,0,P1,verify,verify,novel,0,1,0,0": ("P1", (0.0, False, 0, True)),
-    "part,a-7,,P5,accept,accept,certain,0.95,1,40,0": None,
-}
+# Of each line: the part, and its label's bound, success and novelty; none is known of the last, and
+# of the second only where all stops are reported.
+CELL = """
+part,a-1,1,P1,verify,verify,uncertain,0.25,0.75,5,5  0.25 True False
+part,a-2,,P2,accept,accept,certain,0.925,1,30,0      0.925 True False
+part,a-3,0,P3,accept,accept,certain,0.9375,1,31,0    0.9375 False False
+part,a-4,1,P6,accept,accept,certain,0.9375,1,31,0    0.9375 True False
+part,a-5,0,P4,verify,accept,audit,0.9375,1,31,0      0.9375 False False
+part,a-6,0,P1,verify,verify,novel,0,1,0,0            0.0 False True
+part,a-7,,P5,accept,accept,certain,0.95,1,40,0
+"""
 
 
-@pytest.mark.parametrize("cuts", [[7], range(1, 8)], ids=["at once", "as it grew"])
-@pytest.mark.parametrize("stops", ["some", "all"])
-def test_a_journal_brings_bounds_parts_and_sources(
-    new_store: NewStore, make_data, X: np.ndarray, tmp_path: Path, stops: str, cuts: Any
+@pytest.mark.parametrize(("stops", "cuts"), [("some", [7]), ("all", range(1, 8))])
+def test_a_journal_brings_bounds_parts_and_sources_at_once_or_as_it_grew(
+    new_store, make_data, X: np.ndarray, tmp_path: Path, stops: str, cuts: Any
 ) -> None:
     path, journal = new_store(tmp_path / "engine.db", stops), tmp_path / "cell.csv"
-    expected = [*filter(None, CELL.values())]
-    if stops == "some":  # of the second nothing is known
-        expected[1:3] = [("P3", (0.9375, False, 1, False))]
-    n = len(expected)
+    rows = [line.split() for line in CELL.strip().splitlines()]
+    known = [row for row in rows[:-1] if stops == "all" or ",a-2," not in row[0]]
+    n, lines = len(known), [row[0] for row in rows]
     reports = [  # the same file twice counts nothing twice
-        import_journal(path, write_lines(journal, X, [*CELL][:cut])) for cut in (*cuts, 7)
+        import_journal(path, write_lines(journal, X, lines[:cut])) for cut in (*cuts, 7)
     ]
     assert sum(report.imported for report in reports) == reports[-1].repeated == n
     with DataEngine.open(path) as engine:
@@ -139,14 +125,17 @@ def test_a_journal_brings_bounds_parts_and_sources(
         engine.decide(X[0])
         unlike = engine.decide(make_data(1, seed=8, noise=9.0).X[0])
         engine.report(unlike.id, True)  # silence adds up: no StoreError
-    answers = [(item.lower, item.success, item.silent, item.novel) for item in records]
-    assert answers == [answer for _, answer in expected]
-    assert hashes.tolist() == [part_hash(part) for part, _ in expected]
-    assert (outcomes.false_accepts, outcomes.audited_accepts) == (1, 1)
-    assert outcomes.audited_accepts_bad == 1
-    assert (outcomes.accepted, outcomes.confirmed) == ((3, 2) if stops == "all" else (4, 1))
-    known = {"verification": 202, "audit": 1, "stop": 1, "inspection": 0}
-    assert sources == known | {"confirmed": outcomes.confirmed}
+    assert [[str(v) for v in (r.lower, r.success, r.novel)] for r in records] == [
+        row[1:] for row in known
+    ]
+    assert [r.seq - 200 for r in records if r.silent] == ([] if stops == "all" else [2])
+    assert hashes.tolist() == [part_hash(row[0].split(",")[3]) for row in known]
+    accepted, confirmed = (3, 2) if stops == "all" else (4, 1)
+    expected = Outcomes(accepted, 1, confirmed, audited_accepts=1, audited_accepts_bad=1)
+    assert replace(outcomes, rejected=0, audited_rejects=0, audited_rejects_good=0) == expected
+    assert [
+        sources[name] for name in ("verification", "audit", "stop", "inspection", "confirmed")
+    ] == [202, 1, 1, 0, confirmed]
 
 
 LATE = [
@@ -163,22 +152,9 @@ LATE = [
 ]
 
 
-def test_labels_that_came_late_stand_where_they_came(X: np.ndarray, tmp_path: Path) -> None:
-    journal = read_journal(write_lines(tmp_path / "cell.csv", X, LATE), TraceSpec(100))
-    assert [(line.decision.id, line.label, line.late) for line in journal.lines] == [
-        ("a-1", True, True),
-        ("a-2", None, False),  # went on, when the next part came
-        ("a-2", False, True),  # its stop
-        ("a-4", None, False),
-        ("a-5", True, False),
-        ("a-4", True, True),
-    ]
-    assert (journal.sum, journal.cut, journal.pending) == ("0123", 0, None)
-
-
 @pytest.mark.parametrize("stops", ["some", "all"])
 def test_late_labels_are_imported_once_by_their_own_ids(
-    new_store: NewStore, X: np.ndarray, tmp_path: Path, stops: str
+    new_store, X: np.ndarray, tmp_path: Path, stops: str
 ) -> None:
     path, journal, counts = new_store(tmp_path / "engine.db", stops), tmp_path / "cell.csv", []
     contrary = [line.replace("label,a-5,1", "label,a-5,0") for line in LATE]
@@ -187,10 +163,9 @@ def test_late_labels_are_imported_once_by_their_own_ids(
         counts.append((report.imported, report.repeated, report.contradicted))
     assert counts == [(4, 0, 0), (0, 4, 0), (0, 3, 1)]
     with DataEngine.open(path) as engine:
-        stored = [engine.store.decisions.get(f"a-{i}") for i in (1, 2, 3, 4, 5, 6)]
-        successes = [records and records.success for records in stored]
+        stored = [engine.store.decisions.get(f"a-{i}") for i in range(1, 7)]
         outcomes = engine.store.decisions.tally().outcomes
-    assert successes == [True, False, None, True, True, None]
+    assert [item and item.success for item in stored] == [True, False, None, True, True, None]
     assert (outcomes.accepted, outcomes.false_accepts, outcomes.confirmed) == (3, 1, 2)
 
 
@@ -215,17 +190,15 @@ def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_t
     path = write_lines(tmp_path / "cell.csv", X, LATE)
     lines, rng = path.read_bytes().splitlines(), np.random.default_rng(0)
 
+    def take(said: str, *changed: bytes) -> list:
+        path.write_bytes(b"\n".join([*changed, b""]))
+        journal = read_journal(path, TraceSpec(100))
+        assert said in journal.set_aside
+        return [(line.decision.id, line.label, line.late) for line in journal.lines]
+
     def must_take(number: int, *changed: bytes) -> None:
-        taken = []
-        for some, said in (
-            (changed[: number - 1], "does not hold line 11, which its head knows"),
-            (changed, f"line {number} of"),
-        ):
-            path.write_bytes(b"\n".join([*some, b""]))
-            journal = read_journal(path, TraceSpec(100))
-            assert said in journal.set_aside
-            taken.append([(line.decision.id, line.label, line.late) for line in journal.lines])
-        assert taken[0] == taken[1]
+        before = take("does not hold line 11, which its head knows", *changed[: number - 1])
+        assert take(f"line {number} of", *changed) == before
 
     for i in range(4, len(lines) - 1):  # before the fourth line nothing is labelled
         before, line, rest = lines[:i], lines[i], lines[i + 1 :]
