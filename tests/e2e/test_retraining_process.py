@@ -16,7 +16,7 @@ import torch
 from dengine import DataEngine, Dataset, Policy, Recipe
 from dengine.engine import trainer
 from dengine.serve.retraining import RetrainingProcess
-from tests.support.driving import learn
+from tests.support.driving import evidence, learn
 
 CONV = replace(
     Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9)
@@ -39,11 +39,6 @@ def process(running: list[RetrainingProcess]) -> RetrainingProcess:
         running.append(RetrainingProcess())
         running[0].submit(os.getpid).result(300)
     return running[0]
-
-
-def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
-    learn(engine, data, range(40))
-    settle(engine)
 
 
 def settle(engine: DataEngine) -> None:
@@ -69,36 +64,19 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
     assert process.submit(divmod, 17, 5).result(300) == (3, 2)
 
 
-def test_many_calls_at_once_are_all_answered(process: RetrainingProcess) -> None:
-    calls = [process.submit(int, i) for i in range(500)]
-    assert [call.result(60) for call in calls] == list(range(500))
-
-
 def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(
-    process: RetrainingProcess, data: Dataset
-) -> None:
-    decided = []
-    with ThreadPoolExecutor(1) as thread:
-        for executor in (process, thread):
-            engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
-            learn_and_settle(engine, data)
-            assert engine.version == 1
-            decided.append(
-                [
-                    (item.embedding, item.lower, item.upper)
-                    for item in map(engine.decide, data.X[40:60])
-                ]
-            )
-    assert decided[0] == decided[1]  # bit for bit
-
-
-def test_the_log_tells_when_the_first_retrain_begins(
     process: RetrainingProcess, data: Dataset, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with caplog.at_level(logging.INFO, "dengine"):
-        learn_and_settle(DataEngine(recipe=CONV, executor=process), data)
-    (begun,) = [line for line in caplog.messages if "retrain begins" in line]
-    assert "the first retrain begins, on 30 labels" in begun
+    decided = []
+    with ThreadPoolExecutor(1) as thread, caplog.at_level(logging.INFO, "dengine"):
+        for executor in (process, thread):
+            engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
+            learn(engine, data, range(40))
+            settle(engine)
+            assert engine.version == 1
+            decided.append([evidence(engine.decide(x)) for x in data.X[40:60]])
+    assert decided[0] == decided[1]  # bit for bit
+    assert caplog.text.count("the first retrain begins, on 30 labels") == 2
 
 
 @pytest.mark.merge
