@@ -199,23 +199,19 @@ def test_events_are_numbered_from_one_and_keep_any_text(store: SqlStore) -> None
 
 def test_the_newest_accepted_version_returns_bit_for_bit(store: SqlStore) -> None:
     state = {
-        "encoder.stem.weight": trace(3, (4, 1, 5)),
-        "references/0": np.asfortranarray(trace(4, (6, 2))),
-        "labels": np.array([1, 0], dtype=np.int8),
+        "encoder.stem.weight": np.asfortranarray(trace(3, (4, 1, 5))),
         "ids": np.array(["a", "bc"]),
         "file": np.array(2.5),
-        "empty": np.zeros((0, 3), dtype=np.float32),
+        "empty": np.zeros((0, 3), dtype=np.int8),
     }
-    reports = [report(1), report(2), report(2, accepted=False)]
-    for made, seq, arrays in zip(
-        reports, (10, 20, 30), ({"w": np.zeros(2)}, state, None), strict=True
-    ):
-        store.versions.put(made, seq, arrays)
+    store.versions.put(report(1), 10, {"w": np.zeros(2)})
+    store.versions.put(report(2), 20, state)
+    store.versions.put(report(2, accepted=False), 30, None)
     last = store.versions.newest()
     assert (last.version, last.last_seq, last.state.keys()) == (2, 20, state.keys())
     for name, values in state.items():
         np.testing.assert_array_equal(last.state[name], values, strict=True)
-    assert store.versions.retrains() == reports
+    assert store.versions.retrains() == [report(1), report(2), report(2, accepted=False)]
 
 
 @pytest.mark.parametrize(
@@ -280,15 +276,6 @@ def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_
         read: list[int] = []
         result = verify_history(*place, on_rows=read.append)
         assert (result.ok, result.cells[0].rows, sum(read)) == (True, 120, 120)  # one chain
-
-
-def test_a_closed_store_says_so_and_closes_twice(place: tuple[str, str]) -> None:
-    store = SqlStore(*place)
-    store.close()
-    store.close()
-    for call in (lambda: put_decision(store, "a"), store.settings.read, store.flush):
-        with pytest.raises(StoreError, match="after close"):
-            call()
 
 
 # The cells of a product are looked up among a few settings, and their labels are sorted.

@@ -13,7 +13,6 @@ from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from dengine import Action, DataEngine, Dataset, Reason, Recipe
 from dengine.errors import SettingError
-from dengine.folds import fold_of
 from tests.support.driving import RECIPE, Counting, evidence, make
 from tests.support.driving import drive as play
 
@@ -127,33 +126,6 @@ def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data: Datas
     assert asked(again(engine, reducer=custom), data) == asked(engine, data)
     engine.rollback(1)
     assert asked(again(engine, reducer=custom), data) == asked(engine, data)
-
-
-@pytest.mark.parametrize("end", ["release", "retrain", "forget"])
-def test_a_version_that_was_rolled_back_to_stays_until_somebody_ends_that(
-    end: str, data: Dataset, tmp_path: Path
-) -> None:
-    recipe = replace(RECIPE, retrain_every=20)
-    with make(recipe, store=tmp_path / "engine.db") as made:
-        trained = play(made, data, 0, 50, confirm=True)[0].decision.id
-        made.rollback(1)
-        pinned, n = made.version, len(made.model.index)
-    with DataEngine.open(tmp_path / "engine.db", replaying=True) as engine:
-        cycles = play(engine, data, 50, 95, confirm=True)
-        assert (engine.version, engine.state.new_labels) == (pinned, len(engine.model.index) - n)
-        assert engine.state.new_labels > 2 * recipe.retrain_every
-        unseen = next(c for c in cycles[::-1] if c.success is not None).decision.id
-        assert "pinned" not in engine.forget(unseen).text  # the version was not trained with it
-        engine.set_policy(replace(engine.policy, lower_bound=0.85))
-        play(engine, data, 95, 100, confirm=True)
-        assert (engine.version, engine.status().pinned) == (pinned + 1, 1)
-        if end == "retrain":
-            assert engine.retrain().version == pinned + 3  # after the version that is released
-        else:
-            change = engine.forget(trained) if end == "forget" else engine.release()
-            assert "pinned no more" in change.text
-            assert engine.poll() is not None  # that is due
-        assert (engine.version, engine.status().pinned) == (pinned + 3, 0)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 certificate.
 """
 
-import shutil
 import time
 from dataclasses import replace
 from itertools import takewhile
@@ -143,60 +142,26 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
         assert (engine.find(id_).source, engine.find(id_).success) == (Source.STOP, False)
 
 
-def test_a_check_that_is_not_reported_in_time_counts_as_a_wrong_decision_until_it_is(
-    stream: Dataset, tmp_path
-) -> None:
-    audited = replace(POOLED, stops="some", audit_rate=0.3, label_within=20)
-    engine, owed = make(audited, store=tmp_path / "owed.db"), {}
-    for i, (x, y) in enumerate(zip(stream.X[:350], stream.y[:350] == 1, strict=True)):
-        decision = engine.decide(x)
-        if decision.audit and i % 2 == 0:
-            owed[decision.id] = bool(y)
-        elif decision.action is Action.VERIFY:
-            engine.report(decision.id, y)
-    told, overdue = outcomes(engine), outcomes(engine, within=20).overdue_audited_accepts
-    assert overdue > 3 > told.overdue_audited_accepts == 0
-    assert engine.certificate().accepted.n_bad == overdue + told.audited_accepts_bad
-    assert beyond(engine) == [overdue, overdue]
-    engine.close()
-    shutil.copytree(tmp_path, tmp_path / "other")
-    engine = DataEngine.open(tmp_path / "owed.db", replaying=True)
-    assert beyond(engine) == [overdue, overdue]
-    for item in owed.items():
-        engine.report(*item)
-    engine.flush()
-    engine.decide(stream.X[0])  # what was told before is told anew once the labels are stored
-    assert beyond(engine) == [0, 0]
-    assert engine.certificate().accepted.n_bad == outcomes(engine).audited_accepts_bad
-    engine = DataEngine.open(tmp_path / "other" / "owed.db", replaying=True)
-    engine.set_policy(replace(engine.policy, alpha=0.2))
-    engine.report(*item)  # the rule is told anew, of nothing that was owed under another policy
-    engine.flush()
-    engine.decide(stream.X[0])
-    assert engine.model.rule.evidence.level_totals.sum() == 0
-
-
 # With audits there are overdue checks of either kind; without them the long run is the same again.
 
 
 def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_not_know_of_overdue_checks(
     stream: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, checks = tmp_path / "e.db", 0
+    def earlier(*given, overdue_to, seq) -> NewLabel:
+        return NewLabel(*given, seq=seq)
+
+    store = tmp_path / "e.db"
     with monkeypatch.context() as patch:
-        earlier = lambda *given, overdue_to, seq: NewLabel(*given, seq=seq)  # noqa: E731
         patch.setattr(feedback, "NewLabel", earlier)
         with make(replace(POOLED, label_within=50), store=store) as engine:
-            for x, y in zip(stream.X[:250], stream.y[:250] == 1, strict=True):
-                decision = engine.decide(x)
-                checks += decision.action is Action.VERIFY
-                if not y if decision.action is Action.ACCEPT else checks % 10:
-                    engine.report(decision.id, y)
+            decisions = [engine.decide(x) for x in stream.X[:10]]  # of which nothing is reported
+            play(engine, stream, 0, 250)
     execute(store, "ALTER TABLE label DROP COLUMN overdue_to")
     assert verify_history(str(store)).ok
     with DataEngine.open(store, replaying=True) as engine:
         assert engine.safe_mode == ""
-        assert engine.store.decisions.overdue_to(50) > 0
+        assert engine.store.decisions.overdue_to(50) >= len(decisions)
         answers = [item.seq for item in engine.store.labels.outcomes_since(0, 0, 200)]
         assert answers[-5:] == sorted(answers[-5:])  # not last, in one burst
         engine.report(engine.decide(stream.X[0]).id, True)
@@ -223,14 +188,12 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
     reason = "accepted parts failed more often than the tolerance"
     assert heard == [reason] == [e.text for e in engine.store.events.newest()]
     assert engine.safe_mode == reason == cycles[-1].safe_mode
-    first = next(i for i, c in enumerate(cycles) if c.safe_mode)
     assert sum(c.decision.action is Action.ACCEPT for c in cycles) <= 7
-    after = [c.decision for c in cycles[first + 1 :]]
+    _, *after = [c.decision for c in cycles if c.safe_mode]  # the first raised the alarm
     assert {decision.action for decision in after} == {Action.VERIFY}
     assert Reason.SAFE_MODE in {decision.reason for decision in after}
     recovery = engine.status(watching=True).watch.recovery
-    n_parts = len(cycles) - first  # with the part that raised the alarm
-    assert f" of {n_parts} parts since the alarm count as evidence, " in recovery
+    assert f" of {len(after) + 1} parts since the alarm count as evidence, " in recovery
     assert recovery.endswith("if this goes on, safe mode does not end")
     fresh = ReplayCell(make_data(800, samples=60, seed=9))  # the bad ones were learned
     for _ in takewhile(lambda _: engine.safe_mode, engine.run(fresh, 800)):
@@ -315,16 +278,11 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
             engine.report(good, False)
         engine.correct(good, False)
         assert engine.status().ever.false_rejects == 0
-        engine.correct(good, True)
-        probe = [engine.decide(x).action for x in stream.X[:40]]
         engine.flush()
         rule = told(engine)
     with DataEngine.open(tmp_path / "engine.db", replaying=True) as engine:
-        stored = engine.find(good)
-        assert (stored.success, stored.source) == (True, Source.INSPECTION)
-        assert engine.status().ever.false_rejects == 1
+        assert (engine.find(good).success, engine.find(good).source) == (False, Source.INSPECTION)
         assert told(engine) == rule
-        assert [engine.decide(x).action for x in stream.X[:40]] == probe
 
 
 def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_they_are_many(

@@ -447,19 +447,3 @@ def test_every_verb_that_names_a_store_names_a_cell(
         cell,
         peer,
     ]
-
-
-@pytest.mark.parametrize("has_decided", [True, False])
-def test_a_cell_that_was_given_a_reducer_object_saves_its_settings_again_after_a_restart(
-    fleet: Fleet, parts: Dataset, has_decided: bool
-) -> None:
-    # Its peers' settings have the object's description, which its own must keep.
-    cells = [fleet.engine(name, recipe=Recipe(PCA(n_components=2))) for name in "ab"]
-    if has_decided:
-        cells[1].decide(parts.X[0])
-    cells[1].close()
-    cells[0].decide(parts.X[1])  # sets the TraceSpec, if the other cell has not
-    second = DataEngine.open(fleet.store("b"), reducer=PCA(n_components=2))
-    fleet.opened.append(second)
-    second.set_policy(replace(second.policy, alpha=0.1))
-    assert (second.trace, second.policy.alpha) == (cells[0].trace, 0.1)
