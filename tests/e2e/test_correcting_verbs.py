@@ -109,13 +109,20 @@ def test_an_earlier_version_answers_again(store: Path) -> None:
     assert (failed.exit_code, "load one of these: 1, 2, 3," in failed.stderr) == (1, True)
 
 
+LIMITS = "0.05:0.1:-5:60:reject"
+POLICIES = f"""
+--alpha 0.2 => nothing changed
+ => alpha 0.2
+--force-limit {LIMITS} => force_limits none -> {LIMITS}. Event 2, by
+--shadow on --author kim => shadow False -> True
+--guarantee own_rule:Mine --shadow off => guarantee local -> own_rule:Mine
+"""
+
+
 def test_a_policy_is_changed_in_what_is_given_and_stays(
     store: Path, tmp_path: Path, monkeypatch
 ) -> None:
-    def policy(words: str) -> str:
-        return line_of("policy", store, *words.split())
-
-    policy("--alpha 0.2 --lower-bound 0.8 --stops all --audit-rate 0.1")
+    line_of(*f"policy {store} --alpha 0.2 --lower-bound 0.8 --stops all --audit-rate 0.1".split())
     with DataEngine.open(store) as engine:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
         assert engine.certificate().alpha == 0.2
@@ -123,15 +130,9 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(
     (tmp_path / "own_rule.py").write_text(rule)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", [*sys.path])
-    limits = "0.05:0.1:-5:60:reject"
-    for words, said in (
-        ("--alpha 0.2", "nothing changed"),
-        ("", "alpha 0.2"),
-        (f"--force-limit {limits}", f"force_limits none -> {limits}. Event 2, by"),
-        ("--shadow on --author kim", "shadow False -> True"),
-        ("--guarantee own_rule:Mine --shadow off", "guarantee local -> own_rule:Mine"),
-    ):
-        assert said in policy(words)
+    for line in POLICIES.strip("\n").splitlines():
+        words, said = line.split(" => ")
+        assert said in line_of("policy", store, *words.split())
     assert document("status", store)["shadow"] is False
 
 

@@ -63,12 +63,11 @@ def labelled(item: StoredDecision, success: bool) -> list[StoredDecision | NewLa
 
 def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
     """Labels of decisions that are there; returns their numbers, in the order given."""
-    now, taken = store.clock() if labels else 0.0, []
+    now, taken = store.clock(), []
     for label in labels:
         stored = store.decisions.get(label.decision_id, trace=False)
-        taken.append(
-            replace(label, time=now, content_hash=stored.content_hash, decided=stored.time)
-        )
+        known = {"content_hash": stored.content_hash, "decided": stored.time}
+        taken.append(replace(label, time=now, **known))
     numbers = dict(store.apply_records(taken))
     return [numbers[label.decision_id] for label in labels]
 
