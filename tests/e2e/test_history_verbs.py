@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dengine import Action, DataEngine, Dataset, Policy
+from dengine import Action, DataEngine, Policy
 from dengine.cli.history import TABLE_WIDTH
 from dengine.decision.intervals import wilson_interval
 from dengine.errors import outward
@@ -21,7 +21,7 @@ from tests.support.driving import RECIPE, drive, easy_parts
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def store(tmp_path_factory) -> Path:
     """700 parts; from the 301st to the 400th the sensor is hit by a wave, which puts the engine
     into safe mode.
     """
@@ -36,7 +36,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_history_fits_120_columns_and_shows_no_bound_as_a_threshold_that_it_misses(
-    store: Path, decisions: list[dict]
+    store, decisions
 ) -> None:
     shown = succeed("history", store, "--last", 700, "--events").splitlines()
     assert max(map(len, shown)) <= TABLE_WIDTH == 120
@@ -56,7 +56,7 @@ def test_a_history_fits_120_columns_and_shows_no_bound_as_a_threshold_that_it_mi
     assert outward(0.07, 0.29, 2) == (0.07, 0.29)  # 100 times these is not a whole number
 
 
-def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
+def test_a_historys_filters_are_those_of_the_document(store) -> None:
     words = "--last 1000 --since 1h --action accept --reason certain --label bad --model accept"
     names = ("action", "reason", "label", "predicted")
     found = document("history", store, *words.split())["decisions"]
@@ -67,7 +67,7 @@ def test_a_historys_filters_are_those_of_the_document(store: Path) -> None:
         assert succeed("history", store, *words.split()) == "No decision of that kind.\n"
 
 
-def test_a_wrong_word_is_a_wrong_call(store: Path) -> None:
+def test_a_wrong_word_is_a_wrong_call(store) -> None:
     for line in WRONG.strip().splitlines():
         call, expected = re.split("  +", line)
         code, verb, *words = call.split()
@@ -75,9 +75,7 @@ def test_a_wrong_word_is_a_wrong_call(store: Path) -> None:
         assert (result.exit_code, expected in result.stderr) == (int(code), True), line
 
 
-def test_an_explanations_document_is_its_record(
-    store: Path, decisions: list[dict], tmp_path: Path
-) -> None:
+def test_an_explanations_document_is_its_record(store, decisions, tmp_path) -> None:
     certain = next(item["id"] for item in decisions[::-1] if item["reason"] == "certain")
     out = tmp_path / "picture.png"
     result = document("explain", store, certain, "--neighbours", 4, "--out", out)
@@ -90,7 +88,7 @@ def test_an_explanations_document_is_its_record(
     assert last | {"label": decisions[-1]["label"]} == decisions[-1]
 
 
-def test_status_counts_the_newest_apart_from_all(store: Path, decisions: list[dict]) -> None:
+def test_status_counts_the_newest_apart_from_all(store, decisions) -> None:
     result = document("status", store, "--last", 200)
     for name, some in (("newest", decisions[-200:]), ("ever", decisions)):
         span, actions = result[name], Counter(item["action"] for item in some)
@@ -110,7 +108,7 @@ def test_status_counts_the_newest_apart_from_all(store: Path, decisions: list[di
 
 
 def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reasons(
-    tmp_path: Path,
+    tmp_path,
 ) -> None:
     file = tmp_path / "new.db"
     DataEngine("pca", store=file).close()
@@ -136,24 +134,23 @@ def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
 
 
 def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(
-    stream: Dataset, tmp_path: Path
+    stream, tmp_path
 ) -> None:
     store = tmp_path / "engine.db"
     with DataEngine(recipe=RECIPE, store=store) as engine:
         drive(engine, stream, 0, 30)
         assert "would accept none is known" in line_of("status", store)
         engine.set_shadow(True)
-        cycles = drive(engine, stream, 30, 300)
-    certain, result = [c for c in cycles if c.decision.audit], document("status", store)
-    ever = result["ever"]
-    for name, action in (("would_accept", Action.ACCEPT), ("would_reject", Action.REJECT)):
-        true = [cycle.success for cycle in certain if cycle.decision.predicted is action]
-        wrong = true.count(action is Action.REJECT)
-        # Whatever the policy's alpha is.
-        assert shares(ever[name], "n") == share_of(wrong, len(true), 0.05)
-    assert ever["would_accept"]["n"] > 50
-    assert ever["would_accept"]["verdict"] == "kept"
-    assert result["shadow"] is result["certificate"]["accepted"]["shadowed"] is True
+        certain = [cycle for cycle in drive(engine, stream, 30, 300) if cycle.decision.audit]
+    result = document("status", store)
+    for name, good in (("would_accept", True), ("would_reject", False)):
+        predicted = Action.ACCEPT if good else Action.REJECT
+        true = [cycle.success for cycle in certain if cycle.decision.predicted is predicted]
+        share = share_of(true.count(not good), len(true), 0.05)  # whatever the policy's alpha is
+        assert shares(result["ever"][name], "n") == share
+    ever, certified = result["ever"], result["certificate"]["accepted"]
+    assert (ever["would_accept"]["n"] > 50, ever["would_accept"]["verdict"]) == (True, "kept")
+    assert result["shadow"] is certified["shadowed"] is True
     assert ever["bad_accepts"]["n_known"] == 0  # nothing was accepted
     words = line_of("status", store, "--check-seconds", "60")
     assert f"decided {len(certain)} of the {ever['verified']} parts" in words
@@ -194,6 +191,6 @@ WRONG = """
 
 
 @pytest.fixture(scope="module")
-def decisions(store: Path) -> list[dict]:
+def decisions(store) -> list[dict]:
     """All decisions of the store, oldest first."""
     return document("history", store, "--last", 1000)["decisions"]

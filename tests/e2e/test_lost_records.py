@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dengine import DataEngine, Dataset
+from dengine import DataEngine
 from dengine.store import journal
 from dengine.store.verification import verify_history
 from tests.support.command_line import dengine, document
@@ -18,7 +18,7 @@ IN_STORE, IN_JOURNAL = 6, 10  # parts
 
 
 @pytest.fixture(scope="module")
-def left(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def left(data, tmp_path_factory) -> Path:
     """What a killed process leaves whose newest labels are in its journal alone.
 
     Beside it is `engine.db.cell.journal.head.old`, the head before the newest labels.
@@ -39,7 +39,7 @@ def left(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def store(left: Path, tmp_path: Path) -> Path:
+def store(left, tmp_path) -> Path:
     """A copy of what a killed process left."""
     return Path(shutil.copytree(left, tmp_path / "cell")) / "engine.db"
 
@@ -87,7 +87,7 @@ def damaged(kind: str, content: bytes) -> bytes:
 
 @pytest.mark.parametrize("kind", DAMAGES)
 def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it(
-    store: Path, kind: str
+    store, kind
 ) -> None:
     loss, file = DAMAGES[kind], Path(f"{store}.cell.journal")
     if kind == "deleted":
@@ -114,7 +114,7 @@ def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it
 @pytest.mark.parametrize(
     "kind", ["nothing", "an older head", "no head", "a damaged head", "a half"]
 )
-def test_what_a_killed_process_left_is_no_alarm(store: Path, kind: str) -> None:
+def test_what_a_killed_process_left_is_no_alarm(store, kind) -> None:
     file, head = Path(f"{store}.cell.journal"), Path(f"{store}.cell.journal.head")
     if kind == "an older head":
         shutil.copy(f"{head}.old", head)

@@ -67,7 +67,7 @@ def python(*words: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def stores(tmp_path_factory: pytest.TempPathFactory, make_data) -> dict[str, Path]:
+def stores(tmp_path_factory, make_data) -> dict[str, Path]:
     """The folder of a store in each state."""
     data, place = make_data(60, samples=80), tmp_path_factory.mktemp("made")
     with DataEngine("pca", retrain_every=30, store=str(place / "engine.db")) as engine:
@@ -82,7 +82,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory, make_data) -> dict[str, Pat
 
 
 @pytest.fixture
-def locked(stores: dict[str, Path], tmp_path: Path) -> Iterator[list[Path]]:
+def locked(stores, tmp_path) -> Iterator[list[Path]]:
     """A copy of a store for each of the `CASES`, which cannot be written."""
     copies = []
     for left, kind in CASES:
@@ -110,7 +110,7 @@ def content(store: Path) -> dict[str, bytes]:
 
 
 def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(
-    stores: dict[str, Path], tmp_path: Path
+    stores, tmp_path
 ) -> None:
     store, journal = tmp_path / "engine.db", tmp_path / "engine.db.cell.journal"
     shutil.copy(stores["closed"] / "engine.db", store)
@@ -137,9 +137,7 @@ policy STORE --alpha 0.2             writable
 """
 
 
-def test_what_only_reads_reads_it_and_leaves_it_as_it_is(
-    locked: list[Path], tmp_path: Path
-) -> None:
+def test_what_only_reads_reads_it_and_leaves_it_as_it_is(locked, tmp_path) -> None:
     before, commands = [content(store) for store in locked], []
     verbs = [re.split("  +", line) for line in VERBS.strip().splitlines()]
     for i, store in enumerate(locked):
@@ -157,6 +155,6 @@ def test_what_only_reads_reads_it_and_leaves_it_as_it_is(
             assert content(store) == files
 
 
-def test_a_write_to_it_is_refused_or_kept_and_never_lost(locked: list[Path]) -> None:
+def test_a_write_to_it_is_refused_or_kept_and_never_lost(locked) -> None:
     for line in python("-c", WRITE, *map(str, locked)).splitlines():
         assert line == "1" or "writable" in line

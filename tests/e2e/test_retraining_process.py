@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine import DataEngine, Policy, Recipe
 from dengine.engine import trainer
 from dengine.serve.retraining import RetrainingProcess
 from tests.support.driving import evidence, learn
@@ -34,7 +34,7 @@ def running() -> Iterator[list[RetrainingProcess]]:
 
 
 @pytest.fixture
-def process(running: list[RetrainingProcess]) -> RetrainingProcess:
+def process(running) -> RetrainingProcess:
     if not running:
         running.append(RetrainingProcess())
         running[0].submit(os.getpid).result(300)
@@ -48,7 +48,7 @@ def settle(engine: DataEngine) -> None:
 
 
 def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_arrive_writable(
-    process: RetrainingProcess,
+    process,
 ) -> None:
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], torch.empty(0), torch.nn.Linear(3, 4).weight, x.numpy()[:, ::2]
@@ -64,9 +64,7 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
     assert process.submit(divmod, 17, 5).result(300) == (3, 2)
 
 
-def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(
-    process: RetrainingProcess, data: Dataset, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(process, data, caplog) -> None:
     decided = []
     with ThreadPoolExecutor(1) as thread, caplog.at_level(logging.INFO, "dengine"):
         for executor in (process, thread):
@@ -81,7 +79,7 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(
 
 @pytest.mark.merge
 def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while_it_imports(
-    process: RetrainingProcess, data: Dataset, monkeypatch: pytest.MonkeyPatch
+    process, data, monkeypatch
 ) -> None:
     pids = [process.submit(os.getpid).result(300)]
     engine = DataEngine(recipe=PCA, executor=process)
@@ -114,9 +112,7 @@ def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while
     assert len({*pids}) == 3
 
 
-def test_it_ends_with_whoever_made_it_also_at_work(
-    process: RetrainingProcess, running: list[RetrainingProcess]
-) -> None:
+def test_it_ends_with_whoever_made_it_also_at_work(process, running) -> None:
     running.clear()
     with process:
         pid = process.submit(os.getpid).result(300)

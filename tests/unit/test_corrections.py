@@ -71,7 +71,7 @@ def break_stop_sensor(engine: DataEngine, data: Dataset) -> list[str]:
     return stopped
 
 
-def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
+def test_forgetting_never_makes_the_certificate_better(data) -> None:
     engine = make(RECIPE.with_policy(stops="all"))
     cycles = play(engine, data, confirm=True)
     stopped = [engine.decide(x) for x in data.X[data.y == 1][:3]]
@@ -89,7 +89,7 @@ def test_forgetting_never_makes_the_certificate_better(data: Dataset) -> None:
 
 @pytest.mark.parametrize("recipe", [RECIPE, replace(POOLED, window=60)], ids=["local", "pooled"])
 def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(
-    recipe, make_data, tmp_path: Path
+    recipe, make_data, tmp_path
 ) -> None:
     data = make_data(300, seed=3)
     with make(recipe, store=tmp_path / "engine.db") as engine:
@@ -116,7 +116,7 @@ def test_an_engine_that_is_opened_again_goes_on_as_the_one_that_went_on(
                     assert evidence(c.decision) == evidence(other.decision)
 
 
-def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data: Dataset) -> None:
+def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data) -> None:
     """Its labels are corrected and forgotten afterwards; its references stay where they were."""
     custom = LinearDiscriminantAnalysis()
     engine = DataEngine(custom, RECIPE.policy, retrain_every=20, replaying=True)
@@ -134,7 +134,7 @@ def test_a_transformer_that_is_fitted_again_is_fitted_on_what_it_saw(data: Datas
     ids=["first", "later"],
 )
 def test_after_forgetting_a_label_the_weights_are_as_if_it_had_been_another(
-    part: int, start: str, reopens: bool, data: Dataset, tmp_path: Path
+    part, start, reopens, data, tmp_path
 ) -> None:
     policy = replace(RECIPE.policy, alpha=0.001, lower_bound=0.999)  # that verifies them all
     recipe = Recipe("rocket", {"kernels": 6, "width": 8}, policy=policy, retrain_every=30)
@@ -154,7 +154,7 @@ def test_after_forgetting_a_label_the_weights_are_as_if_it_had_been_another(
 
 
 def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_labelled_now(
-    data: Dataset,
+    data,
 ) -> None:
     engine = DataEngine(model=Remembering(), retrain_every=40, replaying=True)
     cycles = play(engine, data, 0, 90, confirm=True)
@@ -174,7 +174,7 @@ def test_a_baseline_is_trained_anew_at_once_and_goes_back_to_traces_as_they_are_
     assert engine.policy.audit_rate == 0.5
 
 
-def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data: Dataset) -> None:
+def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data) -> None:
     engine = make(POOLED.with_policy(guarantee="local"))
     play(engine, data, 0, 170)
     rule, totals = engine.model.rule, engine.model.rule.evidence.level_totals.clone()
@@ -192,7 +192,7 @@ def test_the_audit_rate_alone_leaves_the_local_rule_as_it_is(data: Dataset) -> N
 
 
 def test_safe_mode_outlasts_a_change_of_policy_and_ends_by_the_labels_as_they_are_now(
-    tmp_path: Path, data: Dataset
+    tmp_path, data
 ) -> None:
     engine = make(RECIPE.with_policy(stops="all"), store=tmp_path / "engine.db")
     play(engine, data, 0, 120, confirm=True)
@@ -215,7 +215,7 @@ def test_safe_mode_outlasts_a_change_of_policy_and_ends_by_the_labels_as_they_ar
     assert engine.store.events.newest(1)[0].text == "the rule of the new policy has no safe mode"
 
 
-def test_silence_under_an_earlier_policy_never_becomes_a_success(data: Dataset) -> None:
+def test_silence_under_an_earlier_policy_never_becomes_a_success(data) -> None:
     engine = make()
     play(engine, data, 0, 150)
     silent = len(engine.store.decisions.unreported_accepts())

@@ -3,7 +3,6 @@
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from threading import Event
 from threading import enumerate as living_threads
 from unittest.mock import Mock
@@ -16,17 +15,11 @@ from dengine import (
     DataEngine,
     Dataset,
     Reason,
-    Recipe,
     ReplayCell,
     Source,
     TraceSpec,
-    load_dataset,
 )
-from dengine.datasets.importing import import_labelled
-from dengine.decision.scripting import script
 from dengine.errors import SettingError, StoreError
-from dengine.folds import COIN_BITS, audit_salt, content_hash, toss
-from dengine.model import neighbours
 from dengine.store import SqlStore
 from tests.support.driving import RECIPE, Counting, evidence, learn, make
 from tests.support.driving import drive as play
@@ -37,7 +30,7 @@ def good(data: Dataset, n: int = 1) -> np.ndarray:
 
 
 @pytest.fixture
-def trained(data: Dataset) -> DataEngine:
+def trained(data) -> DataEngine:
     engine = make()
     play(engine, data, 0, 90, confirm=True)
     return engine
@@ -49,7 +42,7 @@ def state(engine: DataEngine) -> tuple[int, ...]:
     return n_stored, len(engine.model.index), engine.state.new_labels, engine.version
 
 
-def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data: Dataset) -> None:
+def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data) -> None:
     asked: list[str] = []
 
     class Listening(ReplayCell):
@@ -72,7 +65,7 @@ def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part
         make().run(half, 1)
 
 
-def test_a_trace_that_comes_again_has_no_vote_on_itself(trained: DataEngine, data: Dataset) -> None:
+def test_a_trace_that_comes_again_has_no_vote_on_itself(trained, data) -> None:
     decision = trained.decide(good(data))
     trained.report(decision.id, success=False)
     assert decision.action is Action.ACCEPT
@@ -83,7 +76,7 @@ def test_a_trace_that_comes_again_has_no_vote_on_itself(trained: DataEngine, dat
         assert votes.n_failure == decision.n_failure + n_failure
 
 
-def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data: Dataset) -> None:
+def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data) -> None:
     engine, n = make(replace(RECIPE, retrain_every=20)), 0
     for x, y in zip(data.X[:90], data.y[:90] == 1, strict=True):
         decision = engine.decide(x)
@@ -94,23 +87,6 @@ def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data: Dat
             if report:
                 assert (report.version, report.n_traces, report.accepted) == (n // 20, n, True)
     assert engine.version == n // 20 > 1
-
-
-def test_an_audit_verifies_what_was_certain_by_a_coin_of_trace_and_seed_alone(
-    data: Dataset,
-) -> None:
-    cycles = play(make(RECIPE.with_policy(audit_rate=0.3), seed=5), data)
-    coins = toss(content_hash(data.X), audit_salt(5)) < int(0.3 * 2**COIN_BITS)
-    for c, coin in zip(cycles, coins, strict=True):
-        certain = c.decision.predicted is not Action.VERIFY
-        assert c.decision.propensity == (0.3 if certain else 1.0)
-        assert c.decision.audit == (coin and certain)
-        assert c.decision.audit or c.decision.predicted is c.decision.action
-        if c.decision.audit:
-            said = c.decision.action, c.decision.reason, c.source
-            assert said == (Action.VERIFY, Reason.AUDIT, Source.AUDIT)
-            assert c.success is not None
-    assert any(c.decision.audit for c in cycles)
 
 
 # Of the seventh sample, or of all of a trace.
@@ -126,9 +102,7 @@ def test_an_audit_verifies_what_was_certain_by_a_coin_of_trace_and_seed_alone(
         "constant 0",
     ],
 )
-def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(
-    line: str, data: Dataset
-) -> None:
+def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(line, data) -> None:
     reason, sample = line.split()
     limit = None if reason == "too_large" else 150.0
     engine = make(trace=TraceSpec(samples=100, limit=limit))
@@ -150,7 +124,7 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(
     ("at", "later"), [("add", Reason.UNCERTAIN), ("predict_interval", Reason.MODEL_ERROR)]
 )
 def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
-    data: Dataset, at: str, later: Reason, monkeypatch: pytest.MonkeyPatch
+    data, at, later, monkeypatch
 ) -> None:
     monkeypatch.setattr(Counting, at, Mock(side_effect=RuntimeError))
     engine = make(model=Counting())
@@ -161,7 +135,7 @@ def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
 
 
 def test_a_dropped_candidate_leaves_the_old_version_answering_and_three_are_an_alarm(
-    data: Dataset, tmp_path: Path
+    data, tmp_path
 ) -> None:
     with make(store=tmp_path / "e.db") as engine:
         play(engine, data, 0, 60)
@@ -183,7 +157,7 @@ def test_a_dropped_candidate_leaves_the_old_version_answering_and_three_are_an_a
 
 @pytest.mark.parametrize("where", ["insert", "verify", "proceed"])
 def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(
-    where, data, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    where, data, tmp_path, monkeypatch
 ) -> None:
     real, cycles = getattr(ReplayCell, where), []
 
@@ -204,7 +178,7 @@ def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(
 
 @pytest.mark.parametrize("interval", ["jeffreys", "wilson"])
 def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(
-    interval: str, data: Dataset, tmp_path: Path
+    interval, data, tmp_path
 ) -> None:
     url, recipe = tmp_path / "broken.db", RECIPE.with_policy(interval=interval)
     with make(recipe, seed=3) as engine:
@@ -223,7 +197,7 @@ def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(
 
 
 # That one in a process of its own does so too is in test_retraining_process.py.
-def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(data: Dataset) -> None:
+def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(data) -> None:
     said = []
     with ThreadPoolExecutor(1) as pool:
         for executor in (None, pool):
@@ -238,7 +212,7 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(data: Dataset) ->
     assert said[0] == said[1]
 
 
-def test_a_second_thread_in_an_engine_is_refused(data: Dataset) -> None:
+def test_a_second_thread_in_an_engine_is_refused(data) -> None:
     entered, leave = Event(), Event()
 
     class Slow(Counting):
@@ -259,25 +233,7 @@ def test_a_second_thread_in_an_engine_is_refused(data: Dataset) -> None:
         assert deciding.result().action is Action.VERIFY
 
 
-def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data: Dataset) -> None:
+def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data) -> None:
     with ThreadPoolExecutor(1) as pool, DataEngine("conv", executor=pool) as engine:
         next(engine.run(ReplayCell(data), 1))
         assert "dengine-warm-up" not in {thread.name for thread in living_threads()}
-
-
-def test_the_first_retrain_of_a_few_imported_labels_compiles_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Scripting takes longer than the time budget leaves; so too in a new cell of a product."""
-    data, recipe = load_dataset("insertion"), Recipe.load("conv")
-    parts = Dataset(data.X[:60, ..., :650], data.y[:60])  # no other test compiles for these
-    with SqlStore(tmp_path / "e.db", "first", product="gear") as store:
-        import_labelled(store, parts, recipe)
-    compiling = Mock(side_effect=script)
-    monkeypatch.setattr(neighbours, "script", compiling)
-    store = SqlStore(tmp_path / "e.db", "second", product="gear")
-    with DataEngine.open_or_create(store, recipe=recipe) as engine:
-        assert compiling.called
-        compiling.reset_mock()
-        assert engine.retrain().accepted
-    assert not compiling.called

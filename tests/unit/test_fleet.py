@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import count
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -64,7 +63,7 @@ SERVER = pytest.param("postgres", marks=[*DATABASES[1].marks, pytest.mark.slow])
 
 
 @pytest.fixture(params=["sqlite", SERVER])
-def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
+def fleet(request, tmp_path) -> Iterator[Fleet]:
     created = Fleet(url_of(request.param, tmp_path))
     yield created
     for engine in created.opened:
@@ -72,7 +71,7 @@ def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
 
 
 @pytest.fixture
-def pair(fleet: Fleet) -> list[DataEngine]:
+def pair(fleet) -> list[DataEngine]:
     """Two cells of one product."""
     return [fleet.engine(name) for name in "ab"]
 
@@ -137,7 +136,7 @@ def numbers(engine: DataEngine) -> list[int]:
     ids=["pca", "a reducer without arrays", "conv"],
 )
 def test_one_retrain_serves_all_and_a_new_cell_that_decides_at_once(
-    recipe: Recipe, fleet: Fleet, parts: Dataset, probe: np.ndarray
+    recipe, fleet, parts, probe
 ) -> None:
     cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
     for i in range(75):
@@ -153,9 +152,7 @@ def test_one_retrain_serves_all_and_a_new_cell_that_decides_at_once(
         assert engine.state.new_labels == 0
 
 
-def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(
-    fleet: Fleet, parts: Dataset
-) -> None:
+def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(fleet, parts) -> None:
     first = fleet.engine("a")
     second = fleet.engine("b", recipe=RECIPE.with_settings(retrain_every=1000))
     for start in range(0, 38, 2):
@@ -171,7 +168,7 @@ def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(
 
 
 def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
-    fleet: Fleet, parts: Dataset, probe
+    fleet, parts, probe
 ) -> None:
     waiting, may_train = RECIPE.with_settings(retrain_every=1000), threading.Event()
     with ThreadPoolExecutor(1) as executor:
@@ -193,7 +190,7 @@ def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
 
 @ON_BOTH
 def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
-    pair: list[DataEngine], parts, probe, monkeypatch: pytest.MonkeyPatch
+    pair, parts, probe, monkeypatch
 ) -> None:
     first, second = pair
     reports, put = [], second.store.versions.put
@@ -214,9 +211,7 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
 
 
 @ON_BOTH
-def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
-    fleet: Fleet, parts: Dataset, probe
-) -> None:
+def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet, parts, probe) -> None:
     first, second = taught(fleet, parts, 60)
     wrong, *gone = [past.decision.id for past in first.history(label="good")][20:24]
     first.correct(wrong, False)
@@ -239,7 +234,7 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(
 
 
 def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases_it(
-    fleet: Fleet, parts: Dataset
+    fleet, parts
 ) -> None:
     first, second = taught(fleet, parts, 60)
     with ThreadPoolExecutor(1) as executor:
@@ -261,9 +256,7 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
 
 
 @ON_BOTH
-def test_nothing_is_mixed_between_products_and_cells_without(
-    fleet: Fleet, parts: Dataset, probe: np.ndarray
-) -> None:
+def test_nothing_is_mixed_between_products_and_cells_without(fleet, parts, probe) -> None:
     products = {"a": "gear", "b": "gear", "c": "nut", "d": None}
     cells = [fleet.engine(name, product) for name, product in products.items()]
     alone = DataEngine(recipe=RECIPE, store=SqlStore(), clock=ticks(), replaying=True)
@@ -284,9 +277,7 @@ def test_nothing_is_mixed_between_products_and_cells_without(
 
 
 @ON_BOTH
-def test_label_numbers_are_unique_and_increase_over_the_product(
-    fleet: Fleet, parts: Dataset
-) -> None:
+def test_label_numbers_are_unique_and_increase_over_the_product(fleet, parts) -> None:
     waiting = RECIPE.with_settings(retrain_every=10_000)
     cells = [fleet.engine(name, recipe=waiting) for name in "abcd"]
     with ThreadPoolExecutor(4) as pool:
@@ -298,7 +289,7 @@ def test_label_numbers_are_unique_and_increase_over_the_product(
 
 @ON_BOTH
 def test_a_cell_without_news_goes_on_and_says_so_once(
-    fleet: Fleet, pair: list[DataEngine], parts: Dataset, probe: np.ndarray, caplog, monkeypatch
+    fleet, pair, parts, probe, caplog, monkeypatch
 ) -> None:
     first, second = pair
     versions, asked, lost = second.store.versions, [], []
@@ -333,7 +324,7 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
 
 
 def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(
-    fleet: Fleet, parts: Dataset, caplog
+    fleet, parts, caplog
 ) -> None:
     first, second = taught(fleet, parts, 60)
     version = second.version
@@ -357,9 +348,7 @@ def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(
         ({}, "seed 0"),
     ],
 )
-def test_what_decides_the_embedding_must_agree(
-    settings: dict[str, Any], named: str, fleet: Fleet
-) -> None:
+def test_what_decides_the_embedding_must_agree(settings, named, fleet) -> None:
     fleet.engine("a")
     with pytest.raises(SettingError, match=f"product.*{named}"):
         fleet.engine("b", recipe=replace(RECIPE, **settings), seed=0 if settings else 7)
@@ -367,9 +356,7 @@ def test_what_decides_the_embedding_must_agree(
         fleet.engine("b", recipe=Recipe("umap"))
 
 
-def test_the_first_trace_of_any_cell_sets_the_trace_spec(
-    fleet: Fleet, pair: list[DataEngine], parts: Dataset
-) -> None:
+def test_the_first_trace_of_any_cell_sets_the_trace_spec(fleet, pair, parts) -> None:
     first, second = pair
     first.decide(parts.X[0])
     with pytest.raises(TraceError, match="100 samples"):
@@ -378,7 +365,7 @@ def test_the_first_trace_of_any_cell_sets_the_trace_spec(
 
 
 @ON_BOTH
-def test_cells_are_listed_with_their_products_which_they_keep(fleet: Fleet, parts: Dataset) -> None:
+def test_cells_are_listed_with_their_products_which_they_keep(fleet, parts) -> None:
     cells = [fleet.engine(*names) for names in (("a", "gear"), ("b", "gear"), ("d", None))]
     learn(cells[0], parts, range(30))
     learn(cells[2], parts, [0])
@@ -406,9 +393,7 @@ export URL --cell TWO --out MODEL
 """
 
 
-def test_every_verb_that_names_a_store_names_a_cell(
-    fleet: Fleet, parts: Dataset, tmp_path: Path
-) -> None:
+def test_every_verb_that_names_a_store_names_a_cell(fleet, parts, tmp_path) -> None:
     names = {"DATA": tmp_path / "parts.npz", "MODEL": tmp_path / "model.ts", "URL": fleet.url}
     one, two, product = (f"{name}-{fleet.tag}" for name in ("a", "b", "gear"))
     names |= {"ONE": one, "TWO": two, "PRODUCT": product}

@@ -27,7 +27,7 @@ QUICK = ("local, all stops", "pooled, audits", "two cells, pooled")  # the other
     "name",
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.merge) for name in CASES],
 )
-def test_in_random_histories_every_count_is_the_recount_from_the_store(name: str) -> None:
+def test_in_random_histories_every_count_is_the_recount_from_the_store(name) -> None:
     row = check_history(name, 11)  # it is opened again while checks are overdue
     assert (row["faults"], row["fault"]) == (0, "")
     assert row["comparisons"] > 800
@@ -151,10 +151,6 @@ def pinned_version_replaced(patch):
     patch.setattr(LiveModel, "pinned", property(lambda self: 0))
 
 
-# With a history that shows it, and how the first difference begins. A restart that changes what an
-# engine has learned is a difference, too.
-
-
 # Each with a history that shows it, and how the first difference begins. A restart that changes what
 # an engine has learned is a difference, too.
 FAULTS = """
@@ -174,7 +170,7 @@ pinned_version_replaced              cost          pins
 
 @pytest.mark.merge
 @pytest.mark.parametrize("line", FAULTS.strip().splitlines(), ids=lambda line: line.split()[0])
-def test_a_planted_fault_is_found(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_planted_fault_is_found(line, monkeypatch) -> None:
     mutation, name, kind = re.split("  +", line)
     globals()[mutation](monkeypatch)
     row = check_history(name, 3 if mutation == "late_label_ignored" else 1)

@@ -32,7 +32,7 @@ KIND = ("action", "predicted", "reason", "audit")
 
 
 @pytest.fixture
-def store(store: SqlStore) -> SqlStore:
+def store(store) -> SqlStore:
     """60 decisions of all kinds, three of each moment; half of them labelled; a retrain after each
     tenth.
     """
@@ -58,9 +58,7 @@ def everything(store: SqlStore) -> list[StoredDecision]:
     return list(history(store))
 
 
-def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(
-    store: SqlStore, monkeypatch
-) -> None:
+def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store, monkeypatch) -> None:
     whole = everything(store)
     assert [past.decision.id for past in whole] == [f"d{i:03d}" for i in range(N)]
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 7)
@@ -69,7 +67,7 @@ def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(
         assert list(history(store, last=last)) == whole[-last:]
 
 
-def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch) -> None:
     now = [0.0]
     times, ids = [5.0, 9.0, 2.0, 2.0, 1.0, 7.0], ["d5", "d1", "d4", "d0", "d3", "d2"]
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 2)
@@ -84,9 +82,7 @@ def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch: pytest.Mo
         assert (newest.count(), newest.last) == (2, 7.0)
 
 
-def test_a_filter_takes_what_it_says_and_the_newest_of_that(
-    store: SqlStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_filter_takes_what_it_says_and_the_newest_of_that(store, monkeypatch) -> None:
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 4)
     whole = everything(store)
     middle = whole[N // 2].time
@@ -112,7 +108,7 @@ def test_a_filter_takes_what_it_says_and_the_newest_of_that(
         assert list(history(store, last=3, **asked)) == expected[-3:]
 
 
-def test_counts_of_a_store_are_those_of_its_history(store: SqlStore) -> None:
+def test_counts_of_a_store_are_those_of_its_history(store) -> None:
     whole = everything(store)
     for last in (None, 1, 10, 59, 500):
         some = whole if last is None else whole[-last:]
@@ -150,7 +146,7 @@ def counted(some: list[StoredDecision]) -> Stretch:
     return Stretch(len(some), some[-1].time, *counts)
 
 
-def test_stretches_are_consecutive_and_hold_everything(store: SqlStore) -> None:
+def test_stretches_are_consecutive_and_hold_everything(store) -> None:
     whole = everything(store)
     for n in (1, 7, 60, 500):
         length = max(1, -(-N // n))
@@ -161,7 +157,7 @@ def test_stretches_are_consecutive_and_hold_everything(store: SqlStore) -> None:
         assert store.decisions.stretches(seconds=10.0 * n) == shifts
 
 
-def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store: SqlStore) -> None:
+def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store) -> None:
     every = store.labels.past(0)
     assert [label.seq for label in every] == list(range(1, len(every) + 1))
     assert [label.seq for label in store.labels.past(3, 7)] == [4, 5, 6, 7]

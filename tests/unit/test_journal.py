@@ -22,7 +22,7 @@ DECIDED = "verify,verify,uncertain,0,1,0,0"
 
 
 @pytest.fixture(scope="module")
-def new_store(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Callable[..., str]:
+def new_store(data, tmp_path_factory) -> Callable[..., str]:
     """Copies an engine's store, after its first retrain, to a path."""
 
     @cache
@@ -35,12 +35,12 @@ def new_store(data: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Callab
 
 
 @pytest.fixture
-def store(new_store, tmp_path: Path) -> str:
+def store(new_store, tmp_path) -> str:
     return new_store(tmp_path / "engine.db")
 
 
 @pytest.fixture(scope="module", name="X")
-def traces_of_parts(make_data: Callable[..., Dataset]) -> np.ndarray:
+def traces_of_parts(make_data) -> np.ndarray:
     return make_data(9, seed=4).X
 
 
@@ -64,7 +64,7 @@ def write(path: Path, data: Dataset, n: int | None = None) -> Path:
 
 
 def test_each_line_counts_once_also_in_a_store_that_was_passed_open_and_stays_so(
-    store: str, make_data, tmp_path: Path
+    store, make_data, tmp_path
 ) -> None:
     new, counts, empty = make_data(30, seed=4), [], tmp_path / "none.csv"
     new.X[3, 5] = np.nan
@@ -80,7 +80,7 @@ def test_each_line_counts_once_also_in_a_store_that_was_passed_open_and_stays_so
             assert engine.retrain().n_traces == 200 + 29
 
 
-def test_a_journal_reads_as_it_was_written(make_data, tmp_path: Path) -> None:
+def test_a_journal_reads_as_it_was_written(make_data, tmp_path) -> None:
     new = make_data(10, 40, 3)
     back = read_journal(write(tmp_path / "cell.csv", new), TraceSpec(40, channels=3)).lines
     np.testing.assert_array_equal([line.trace for line in back], new.X)
@@ -104,7 +104,7 @@ part,a-7,,P5,accept,accept,certain,0.95,1,40,0
 
 @pytest.mark.parametrize(("stops", "cuts"), [("some", [7, 7]), ("all", [1, 2, 3, 4, 5, 6, 7, 7])])
 def test_a_journal_brings_bounds_parts_and_sources_at_once_or_as_it_grew(
-    new_store, make_data, X: np.ndarray, tmp_path: Path, stops: str, cuts: list[int]
+    new_store, make_data, X, tmp_path, stops, cuts
 ) -> None:
     path, journal = new_store(tmp_path / "engine.db", stops), tmp_path / "cell.csv"
     rows = [line.split() for line in CELL.strip().splitlines()]
@@ -146,9 +146,7 @@ LATE = [
 
 
 @pytest.mark.parametrize("stops", ["some", "all"])
-def test_late_labels_are_imported_once_by_their_own_ids(
-    new_store, X: np.ndarray, tmp_path: Path, stops: str
-) -> None:
+def test_late_labels_are_imported_once_by_their_own_ids(new_store, X, tmp_path, stops) -> None:
     path, journal, counts = new_store(tmp_path / "engine.db", stops), tmp_path / "cell.csv", []
     contrary = [line.replace("label,a-5,1", "label,a-5,0") for line in LATE]
     for lines in (LATE, LATE, contrary):
@@ -162,9 +160,7 @@ def test_late_labels_are_imported_once_by_their_own_ids(
     assert (outcomes.accepted, outcomes.false_accepts, outcomes.confirmed) == (3, 1, 2)
 
 
-def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(
-    store: str, X: np.ndarray, tmp_path: Path
-) -> None:
+def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(store, X, tmp_path) -> None:
     path = write_lines(tmp_path / "cell.csv", X, LATE[:9])
     text = path.read_text()
     write_lines(path, X, LATE[:8])  # the head is written after its line
@@ -178,7 +174,7 @@ def test_a_last_line_that_was_cut_anywhere_is_left_out_and_said(
 
 
 def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_taken(
-    X: np.ndarray, tmp_path: Path
+    X, tmp_path
 ) -> None:
     path = write_lines(tmp_path / "cell.csv", X, LATE)
     lines, rng = path.read_bytes().splitlines(), np.random.default_rng(0)
@@ -220,9 +216,7 @@ def test_a_changed_missing_moved_or_doubled_line_is_named_and_those_before_are_t
         (cell_journal() + b"label,a-1,1\n", "The checksum of line 2"),
     ],
 )
-def test_what_is_no_journal_or_a_line_that_does_not_fit_is_named(
-    tmp_path: Path, line: str | bytes, message: str
-) -> None:
+def test_what_is_no_journal_or_a_line_that_does_not_fit_is_named(tmp_path, line, message) -> None:
     path = tmp_path / "cell.csv"
     path.write_bytes(line if isinstance(line, bytes) else cell_journal(line))
     with pytest.raises(DataError, match=message):

@@ -2,12 +2,10 @@
 one.
 """
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Policy
+from dengine import DataEngine, Policy
 from dengine.errors import StoreError
 from dengine.experiments.baselines import AgreeingNeighbours
 from dengine.store import SqlStore, verify_history
@@ -24,7 +22,7 @@ def kept(store: SqlStore) -> list[int]:
     return [row.report.version for row in store.versions.all() if row.kept]
 
 
-def test_a_new_state_takes_the_room_of_those_that_are_not_kept_any_more(tmp_path: Path) -> None:
+def test_a_new_state_takes_the_room_of_those_that_are_not_kept_any_more(tmp_path) -> None:
     file = tmp_path / "a.db"
     state = np.random.default_rng(0).random(2**17)  # 1 MiB
     with SqlStore(str(file), keep_versions=2) as store:
@@ -35,7 +33,7 @@ def test_a_new_state_takes_the_room_of_those_that_are_not_kept_any_more(tmp_path
 
 
 def test_every_retrain_is_listed_for_ever_and_what_is_kept_is_loaded_by_its_number(
-    store: SqlStore,
+    store,
 ) -> None:
     put(store, 34)
     store.versions.put(report(34, accepted=False), 35, None)
@@ -58,7 +56,7 @@ def test_every_retrain_is_listed_for_ever_and_what_is_kept_is_loaded_by_its_numb
 
 
 def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall_back_on(
-    tmp_path: Path,
+    tmp_path,
 ) -> None:
     for keep, numbers in ((None, list(range(1, 13))), (8, [1, 5, 6, 7, 8, 9, 10, 11, 12])):
         file = str(tmp_path / f"{keep}.db")
@@ -72,7 +70,7 @@ def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall
 
 
 def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(
-    data, tmp_path: Path
+    data, tmp_path
 ) -> None:
     file = tmp_path / "engine.db"
     with DataEngine("pca", store=file, retrain_every=30) as engine:
@@ -90,7 +88,7 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
 
 
 def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(
-    data: Dataset, tmp_path: Path
+    data, tmp_path
 ) -> None:
     """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns
     anew.

@@ -4,7 +4,6 @@ is stored.
 
 import re
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -63,7 +62,7 @@ NO_PARTS = ["", "x" * (LONGEST + 1), "SN\0", "\ud800", "a\nb", 10**4200, 1.5, Tr
 
 
 def test_a_report_without_id_part_or_label_queues_nothing_and_the_store_goes_on(
-    tmp_path: Path, make_data
+    tmp_path, make_data
 ) -> None:
     x = make_data(2).X
     with DataEngine("pca", store=tmp_path / "engine.db") as engine:
@@ -143,7 +142,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
 def test_a_baseline_that_counts_nonsense_is_a_model_error_and_the_store_goes_on(
-    name: str, value, make_data
+    name, value, make_data
 ) -> None:
     data, engine = make_data(6), DataEngine(model=Baseline(**{name: value}), retrain_every=3)
     for x, y in zip(data.X, data.y, strict=True):

@@ -59,7 +59,7 @@ def write(store: SqlStore) -> SqlStore:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(tmp_path_factory) -> Path:
     file = tmp_path_factory.mktemp("history") / "engine.db"
     write(SqlStore(str(file))).close()
     execute(file, "PRAGMA wal_checkpoint(TRUNCATE)")
@@ -67,7 +67,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def file(written: Path, tmp_path: Path) -> Path:
+def file(written, tmp_path) -> Path:
     return Path(shutil.copy(written, tmp_path / "engine.db"))
 
 
@@ -75,7 +75,7 @@ def faults(file: Path) -> list[tuple[str, str]]:
     return [(fault.table, fault.key) for fault in verify_history(str(file)).faults]
 
 
-def test_what_a_store_wrote_is_whole_in_every_database(place: tuple[str, str]) -> None:
+def test_what_a_store_wrote_is_whole_in_every_database(place) -> None:
     odd = replace(decision("Ünïcode ✓", reason=Reason.CONSTANT), lower=-0.0, part="Stück 7\\0")
     with SqlStore(*place) as store:
         write(store)
@@ -89,29 +89,11 @@ def test_what_a_store_wrote_is_whole_in_every_database(place: tuple[str, str]) -
     assert result.cells[0].rows == 2 * 16 + 14 + 3 + 3 + 2
 
 
-def test_every_transaction_is_an_entry_and_an_empty_one_or_one_that_fails_is_none(
-    place: tuple[str, str],
-) -> None:
-    with SqlStore(*place) as store:
-        store.flush()
-        with pytest.raises(StoreError):
-            store.settings.save({"recipe": None})
-        for n in range(4):
-            result = verify_history(*place)
-            assert (result.ok, result.cells[0].entries) == (True, n)
-            if n == 0:
-                store.events.put("note", "one")
-            elif n == 1:
-                put_decision(store, "a")
-            else:
-                put_label(store, "a")
-
-
 CHANGED = """CASE typeof({0}) WHEN 'text' THEN 'x' || {0} WHEN 'blob' THEN CAST({0} || 'x' AS BLOB)
 WHEN 'real' THEN {0} * 1.0000001 + 1e-9 ELSE {0} + 1 END"""
 
 
-def test_a_value_changed_in_any_column_of_any_table_is_found(written: Path, tmp_path: Path) -> None:
+def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path) -> None:
     rng, missed, tried, file = random.Random(0), [], 0, tmp_path / "changed.db"
     with closing(sqlite3.connect(written)) as whole:
         query = "SELECT s.name, c.name FROM sqlite_master s, pragma_table_info(s.name) c"
@@ -157,12 +139,12 @@ def test_a_value_changed_in_any_column_of_any_table_is_found(written: Path, tmp_
         ("UPDATE ledger SET digest = zeroblob(32) WHERE number = 2", ("ledger", "entry 2")),
     ],
 )
-def test_what_is_wrong_is_named(file: Path, statement: str, named: tuple[str, str]) -> None:
+def test_what_is_wrong_is_named(file, statement, named) -> None:
     execute(file, statement)
     assert named in faults(file)
 
 
-def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file: Path) -> None:
+def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file) -> None:
     """Whoever changes a row can work out its sum anew, and the entry tells all the same."""
     with sqlite3.connect(file) as connection:
         connection.row_factory = sqlite3.Row
@@ -185,7 +167,7 @@ def cut_off(file: Path) -> None:
 
 
 def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere(
-    file: Path,
+    file,
 ) -> None:
     kept = verify_history(str(file)).cells[0].digest
     with SqlStore(str(file)) as store:
@@ -200,9 +182,7 @@ def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere
         verify_history(str(file), expect="newest")
 
 
-def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path, monkeypatch) -> None:
     file, key = tmp_path / "engine.db", str(make_key(tmp_path / "ledger.key"))
     monkeypatch.setenv(KEY_VARIABLE, key)
     write(SqlStore(str(file))).close()
@@ -228,7 +208,7 @@ def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(
     assert verify_history(str(file)).ok  # which is why it has to be keyed
 
 
-def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file: Path) -> None:
+def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file) -> None:
     with closing(sqlite3.connect(file)) as connection:
         query = "SELECT (rootpage - 1) * page_size FROM sqlite_master, pragma_page_size"
         (begin,) = connection.execute(f"{query} WHERE name = 'event'").fetchone()
@@ -237,7 +217,7 @@ def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file: Pa
     assert {("file", ""), ("event", "")} <= {*faults(file)}
 
 
-def test_another_cells_faults_are_its_own(file: Path) -> None:
+def test_another_cells_faults_are_its_own(file) -> None:
     with SqlStore(str(file), "other") as store:
         write(store)
     execute(file, "UPDATE event SET text = 'x' WHERE cell_id = 'other'")
@@ -248,7 +228,7 @@ def test_another_cells_faults_are_its_own(file: Path) -> None:
 
 
 @pytest.mark.parametrize("statement", ["", "CREATE TABLE t (id)"])
-def test_what_is_no_store_is_refused_and_nothing_is_made(statement: str, tmp_path: Path) -> None:
+def test_what_is_no_store_is_refused_and_nothing_is_made(statement, tmp_path) -> None:
     if statement:
         execute(tmp_path / "a.db", statement)
     with pytest.raises(StoreError, match="Expected a"):
@@ -256,7 +236,7 @@ def test_what_is_no_store_is_refused_and_nothing_is_made(statement: str, tmp_pat
     assert (tmp_path / "a.db").exists() == bool(statement)
 
 
-def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file: Path) -> None:
+def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file) -> None:
     with SqlStore(str(file)) as store:
         whole = store.labels.with_traces()
     changed, kept = "UPDATE trace SET data = zeroblob(800)", ~np.isin(whole.seq, [4, 5])
@@ -276,7 +256,7 @@ def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file: Pat
         assert len(store.labels.with_traces().traces) == 0
 
 
-def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file: Path) -> None:
+def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file) -> None:
     result = document("verify", file)
     digest = result["cells"][0]["digest"]
     assert (result["ok"], result["faults"]) == (True, [])

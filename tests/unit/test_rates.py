@@ -32,7 +32,7 @@ def test_the_rates_are_those_of_scikit_learn_over_what_was_decided(cycles) -> No
 
 @pytest.mark.parametrize("n_wrong", [0, 20])
 def test_different_traces_have_nearly_wilsons_interval_and_shuffles_of_the_same_make_it_no_narrower(
-    n_wrong: int,
+    n_wrong,
 ) -> None:
     played = replay_of(["accept"] * 400, np.arange(400) >= n_wrong)
     error, often = pooled_error([played]), pooled_error([played] * 30)
@@ -81,6 +81,6 @@ def test_an_accept_is_worth_the_risk_up_to_check_by_escape() -> None:
 @pytest.mark.parametrize(
     ("name", "value"), [("check", 0), ("escape", -1), ("false_reject", math.inf), ("check", "5")]
 )
-def test_a_cost_that_is_none_is_refused_by_its_name(name: str, value) -> None:
+def test_a_cost_that_is_none_is_refused_by_its_name(name, value) -> None:
     with pytest.raises(SettingError, match=name):
         Costs(**{name: value})

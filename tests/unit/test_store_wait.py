@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -23,9 +22,7 @@ def test_the_argument_comes_before_the_environment_before_the_default(
 
 
 @pytest.mark.parametrize("text", ["soon", "0", "nan"])
-def test_an_environment_that_says_no_seconds_is_named(
-    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_environment_that_says_no_seconds_is_named(text, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("DENGINE_STORE_WAIT", text)
     with pytest.raises(StoreError, match="Expected DENGINE_STORE_WAIT above 0 seconds"):
         DataEngine(store=tmp_path / "a.db")
@@ -55,7 +52,7 @@ print("closed")
 
 
 @pytest.mark.merge
-def test_on_a_full_disk_only_report_raises(tmp_path: Path) -> None:
+def test_on_a_full_disk_only_report_raises(tmp_path) -> None:
     store = tmp_path / "engine.db"
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, store], capture_output=True, text=True, check=False

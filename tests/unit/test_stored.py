@@ -1,7 +1,5 @@
 """A store as a data set: what was recorded in the shadow mode is replayed as recordings are."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,7 +16,7 @@ def stream(make_data) -> Dataset:
 
 
 def test_corrected_labels_count_and_forgotten_and_bad_traces_do_not_and_a_part_that_came_twice_is_one(
-    stream: Dataset, tmp_path: Path
+    stream, tmp_path
 ) -> None:
     path = tmp_path / "cell.db"
     with DataEngine(recipe=RECIPE, store=path) as engine:
@@ -37,7 +35,7 @@ def test_corrected_labels_count_and_forgotten_and_bad_traces_do_not_and_a_part_t
 
 
 def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_recording(
-    stream: Dataset, tmp_path: Path
+    stream, tmp_path
 ) -> None:
     path, spec = tmp_path / "cell.db", stream.spec
     with DataEngine(recipe=RECIPE, store=path, trace=spec) as engine:
@@ -52,7 +50,7 @@ def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_reco
     assert np.array_equal(*lower)
 
 
-def test_a_store_without_a_label_is_refused(tmp_path: Path) -> None:
+def test_a_store_without_a_label_is_refused(tmp_path) -> None:
     DataEngine(recipe=RECIPE, store=tmp_path / "new.db").close()
     with pytest.raises(DataError, match=r"labelled traces, .* has none; record some first"):
         load_dataset(tmp_path / "new.db")
