@@ -54,7 +54,7 @@ from tests.support.stores import (
 )
 def test_a_decision_returns_as_it_was_put_and_any_trace_bit_for_bit(
     store, values, content_hash, quarantined
-) -> None:
+):
     name, numbers = uuid.uuid4().hex, (0.9, 1.0, 40, 0, None, 3, Reason.AUDIT, True, 0.02)
     given = Decision(name, Action.VERIFY, Action.ACCEPT, *numbers, "Stück 7\\0")
     assert store.decisions.get(name) is None
@@ -66,7 +66,7 @@ def test_a_decision_returns_as_it_was_put_and_any_trace_bit_for_bit(
     assert (result.content_hash, result.quarantined) == (content_hash, quarantined)
 
 
-def test_labels_in_one_batch_are_numbered_in_the_order_given(store) -> None:
+def test_labels_in_one_batch_are_numbered_in_the_order_given(store):
     for name in "abcd":
         put_decision(store, name)
     assert put_label(store, "d") == 1
@@ -80,7 +80,7 @@ def test_labels_in_one_batch_are_numbered_in_the_order_given(store) -> None:
     assert (added.seq, added.model_version, added.point.tolist()) == (2, 3, [0.5, 1.5])
 
 
-def test_a_batch_longer_than_a_chunk_is_taken_whole(store) -> None:
+def test_a_batch_longer_than_a_chunk_is_taken_whole(store):
     names, x = [str(i) for i in range(503)], np.zeros((1, 2), np.float32)
     store.apply_records([StoredDecision(decision(n), x, int(n), False, 1.0) for n in names])
     assert put_labels(store, *(label(n, silent=1) for n in names)) == list(range(1, 504))
@@ -88,7 +88,7 @@ def test_a_batch_longer_than_a_chunk_is_taken_whole(store) -> None:
     assert store.labels.unreported_total() == 503
 
 
-def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store) -> None:
+def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store):
     x = {n: put_decision(store, n, trace(i), 100 + i, n == "c") for i, n in enumerate("abcde")}
     for name in "ecbad":
         put_label(store, name, name != "b")
@@ -106,7 +106,7 @@ def test_labelled_are_the_newest_in_label_order_without_the_quarantined(store) -
 
 
 @pytest.mark.parametrize("limit", [None, 0, 5])
-def test_an_empty_store_has_empty_arrays(store, limit) -> None:
+def test_an_empty_store_has_empty_arrays(store, limit):
     result, decisions = store.labels.with_traces(limit), store.decisions
     assert (result.seq.shape, result.traces.shape) == ((0,), (0, 0, 0))
     assert (store.versions.newest(), store.labels.unreported_total()) == (None, 0)
@@ -116,7 +116,7 @@ def test_an_empty_store_has_empty_arrays(store, limit) -> None:
     assert (tally.outcomes, tally.count(), tally.first) == (Outcomes(), 0, None)
 
 
-def test_traces_of_two_shapes_are_an_error_that_names_both(store) -> None:
+def test_traces_of_two_shapes_are_an_error_that_names_both(store):
     for name, samples in (("a", 10), ("b", 20)):
         put_decision(store, name, trace(0, (1, samples)))
         put_label(store, name)
@@ -127,7 +127,7 @@ def test_traces_of_two_shapes_are_an_error_that_names_both(store) -> None:
 
 def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_quarantined(
     store,
-) -> None:
+):
     for i, quarantined in enumerate([False, True, False, False]):
         created = decision(str(i), reason=Reason.NOVEL if i == 3 else Reason.CERTAIN)
         created = replace(created, lower=0.1 * i, upper=0.2 * i)
@@ -146,7 +146,7 @@ def test_evidence_is_what_each_decision_was_made_by_and_its_label_without_the_qu
 
 def test_unreported_accepts_are_those_without_a_label_oldest_first_whatever_the_clock_said(
     store,
-) -> None:
+):
     names = ["zoe", "amy", "kim", "eve", "bob", "ann"]  # neither sorted, nor by hash
     store.clock = iter([5.0, 5.0, 5.0, 2.0, 2.0, 1.0, *range(8, 20)]).__next__
     for name in names:
@@ -170,7 +170,7 @@ verify verify  True False None
 """  # action, predicted, and the labels of such decisions
 
 
-def test_outcomes_count_what_became_of_what_was_certain(store) -> None:
+def test_outcomes_count_what_became_of_what_was_certain(store):
     for line in CERTAIN.strip().splitlines():
         action, predicted, *labels = line.split()
         for i, text in enumerate(labels):
@@ -184,7 +184,7 @@ def test_outcomes_count_what_became_of_what_was_certain(store) -> None:
     assert outcomes == replace(accepts, rejected=2, audited_rejects=4, audited_rejects_good=3)
 
 
-def test_events_are_numbered_from_one_and_keep_any_text(store) -> None:
+def test_events_are_numbered_from_one_and_keep_any_text(store):
     store.database.clock = iter([1.5, 1.5, 2.5, 2.5, 3.5, 3.5]).__next__  # the ledger asks, too
     for kind in ("started", "safe_mode", Reason.MODEL_ERROR):
         store.events.put(kind, f"was {kind}: ± \0 \ud800")  # which databases refuse
@@ -196,7 +196,7 @@ def test_events_are_numbered_from_one_and_keep_any_text(store) -> None:
     assert (store.events.newest(0), store.events.newest(9)) == ([], every)
 
 
-def test_the_newest_accepted_version_returns_bit_for_bit(store) -> None:
+def test_the_newest_accepted_version_returns_bit_for_bit(store):
     state = {
         "encoder.stem.weight": np.asfortranarray(trace(3, (4, 1, 5))),
         "ids": np.array(["a", "bc"]),
@@ -216,19 +216,19 @@ def test_the_newest_accepted_version_returns_bit_for_bit(store) -> None:
 @pytest.mark.parametrize(
     ("state", "named"), [({"w": np.array([{}], dtype=object)}, "'w'"), (None, "version 1")]
 )
-def test_an_accepted_version_needs_a_state_of_plain_arrays(store, state, named) -> None:
+def test_an_accepted_version_needs_a_state_of_plain_arrays(store, state, named):
     with pytest.raises(StoreError, match=named):
         store.versions.put(report(1), 0, state)
 
 
-def test_settings_are_replaced_as_a_whole(store) -> None:
+def test_settings_are_replaced_as_a_whole(store):
     assert store.settings.read() == {}
     store.settings.save({"recipe": "a = 1\n", "spec": "é"})
     store.settings.save({"recipe": "a = 2"})
     assert store.settings.read() == {"recipe": "a = 2"}
 
 
-def test_two_cells_in_one_database_do_not_see_each_other(place) -> None:
+def test_two_cells_in_one_database_do_not_see_each_other(place):
     url, cell_id = place
     with SqlStore(url, cell_id) as ours, SqlStore(url, cell_id + "-other") as other:
         for store, seed in ((ours, 1), (other, 2)):
@@ -254,8 +254,8 @@ def test_two_cells_in_one_database_do_not_see_each_other(place) -> None:
 
 def test_numbers_stay_unique_with_two_stores_on_one_cell_and_each_sees_what_the_other_committed(
     place,
-) -> None:
-    def put(store: SqlStore, prefix: str) -> list[int]:
+):
+    def put(store: SqlStore, prefix: str):
         seqs = []
         for name in (f"{prefix}{i}" for i in range(15)):
             put_decision(store, name)
@@ -282,7 +282,7 @@ PRODUCT = "SCAN (label|trace|decision|model_version|correction)"
 @pytest.mark.parametrize(("product", "never"), [(None, "SCAN|TEMP B-TREE"), ("gear", PRODUCT)])
 def test_questions_go_down_an_index_also_of_a_product_and_where_there_are_corrections(
     product, never, tmp_path
-) -> None:
+):
     with SqlStore(str(tmp_path / "a.db"), product=product) as store:
         for name in "ab":
             put_decision(store, name)
@@ -307,10 +307,10 @@ def test_questions_go_down_an_index_also_of_a_product_and_where_there_are_correc
     assert len(sent) >= 14
 
 
-def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path) -> None:
+def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path):
     asked = set()
 
-    def ask(connection, *_) -> None:
+    def ask(connection, *_):
         for name in ("journal_mode", "synchronous"):
             asked.add(connection.execute(f"PRAGMA {name}").fetchone()[0])
 
@@ -337,9 +337,7 @@ def test_sqlite_syncs_every_commit_in_wal_mode(tmp_path) -> None:
         ("not a database\n" * 100, "name a new file"),
     ],
 )
-def test_what_is_no_store_of_this_dengine_is_refused_and_left_alone(
-    statement, message, tmp_path
-) -> None:
+def test_what_is_no_store_of_this_dengine_is_refused_and_left_alone(statement, message, tmp_path):
     file = tmp_path / "a.db"
     if statement.startswith("not"):
         file.write_text(statement)
@@ -356,12 +354,12 @@ def test_what_is_no_store_of_this_dengine_is_refused_and_left_alone(
 
 
 @pytest.mark.parametrize("name", ["missing/engine.db", "."])
-def test_a_place_that_cannot_be_written_says_what_to_do(tmp_path, name) -> None:
+def test_a_place_that_cannot_be_written_says_what_to_do(tmp_path, name):
     with pytest.raises(StoreError, match="Create the directory"):
         SqlStore(str(tmp_path / name))
 
 
-def test_a_pickle_in_the_database_is_never_loaded(tmp_path) -> None:
+def test_a_pickle_in_the_database_is_never_loaded(tmp_path):
     file, evil = tmp_path / "a.db", tmp_path / "evil.npz"
     with SqlStore(str(file)) as store:
         store.versions.put(report(1), 0, {"w": np.zeros(1)})

@@ -35,7 +35,7 @@ def held(file: Path) -> Iterator[None]:
 
 
 @pytest.fixture
-def in_use(tmp_path, data) -> Iterator[DataEngine]:
+def in_use(tmp_path, data):
     """An engine whose newest labels are in its journal alone."""
     with DataEngine("pca", retrain_every=1000, store=str(tmp_path / "engine.db")) as engine:
         learn(engine, data, range(IN_STORE))
@@ -52,7 +52,7 @@ def labels_of(file: Path, cell: str = "cell") -> list[int]:
 
 def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_verifies(
     tmp_path, in_use, data
-) -> None:
+):
     copy, n = tmp_path / "elsewhere" / "copy.db", IN_STORE + IN_JOURNAL
     copy.parent.mkdir()
     result = document("backup", tmp_path / "engine.db", "--out", copy)
@@ -68,12 +68,10 @@ def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_ve
         assert engine.status().labels == n
 
 
-def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(
-    tmp_path, data
-) -> None:
+def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(tmp_path, data):
     acknowledged, ended = list[str](), threading.Event()
 
-    def work() -> None:
+    def work():
         with DataEngine("pca", retrain_every=10**6, store=tmp_path / "engine.db") as engine:
             while not ended.is_set():
                 i = len(acknowledged)
@@ -100,9 +98,7 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
         assert len(before) >= 80
 
 
-def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(
-    tmp_path, in_use
-) -> None:
+def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(tmp_path, in_use):
     file, once, twice = (tmp_path / name for name in ("engine.db", "first.db", "second.db"))
     first = backup_store(file, once)
     # What the journal holds is in the first copy by now.
@@ -116,7 +112,7 @@ def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(
 
 def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_none(
     tmp_path, in_use
-) -> None:
+):
     store, copy, n = tmp_path / "engine.db", tmp_path / "plain.db", 2 * IN_JOURNAL
     for suffix in ("", "-wal"):
         shutil.copyfile(f"{store}{suffix}", f"{copy}{suffix}")
@@ -129,7 +125,7 @@ def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_n
 
 def test_a_cell_moves_to_another_machine_by_backup_and_restore_unless_its_history_was_changed(
     tmp_path, in_use, data, caplog
-) -> None:
+):
     copy, there = tmp_path / "copy.db", tmp_path / "elsewhere" / "engine.db"
     there.parent.mkdir()
     line_of("backup", tmp_path / "engine.db", "--out", copy)
@@ -162,9 +158,7 @@ other.db    copy.db          found another file
 """
 
 
-def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
-    tmp_path, monkeypatch
-) -> None:
+def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("engine.db", "other.db"):
         DataEngine("pca", store=name).close()
@@ -179,9 +173,7 @@ def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of a file there")
-def test_a_backup_that_has_no_room_names_the_copy_and_leaves_nothing_behind(
-    tmp_path, in_use
-) -> None:
+def test_a_backup_that_has_no_room_names_the_copy_and_leaves_nothing_behind(tmp_path, in_use):
     program = """
 import resource, signal, sys
 from dengine.cli import main
@@ -197,7 +189,7 @@ main()
     assert list(tmp_path.glob("*copy*")) == []
 
 
-def test_every_cell_of_a_file_is_in_its_backup(tmp_path, data) -> None:
+def test_every_cell_of_a_file_is_in_its_backup(tmp_path, data):
     file, parts = tmp_path / "line.db", {"A": range(10), "B": range(10, 30)}
     with ExitStack() as cells:
         engines = {}

@@ -19,7 +19,7 @@ from tests.support.command_line import dengine, document, line_of
 
 
 @pytest.fixture(scope="module")
-def used(make_data, tmp_path_factory) -> Path:
+def used(make_data, tmp_path_factory):
     """A store with 60 labels and two versions."""
     path = tmp_path_factory.mktemp("used") / "engine.db"
     import_labelled(path, replace(make_data(60), rate_hz=500.0), "pca", 0)
@@ -30,7 +30,7 @@ def used(make_data, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def store(used, tmp_path) -> Path:
+def store(used, tmp_path):
     """A copy, its journal's head beside it."""
     return Path(shutil.copytree(used.parent, tmp_path / "cell")) / used.name
 
@@ -42,7 +42,7 @@ def labels(store: Path) -> dict[int, tuple[str, int]]:
     return {item.label_seq: (item.decision.id, int(item.success)) for item in past}
 
 
-def test_a_label_is_corrected_and_the_line_says_what_it_was(store) -> None:
+def test_a_label_is_corrected_and_the_line_says_what_it_was(store):
     first, before = labels(store)[1]
     was, now, counts = ("success", "bad", "failure") if before else ("failure", "good", "success")
     line = line_of("correct", store, first, now, "--author", "kim")
@@ -58,7 +58,7 @@ def test_a_label_is_corrected_and_the_line_says_what_it_was(store) -> None:
         assert engine.store.events.newest(1)[0].kind == "retrain"
 
 
-def test_a_part_is_found_and_reported_by_its_number(store, make_data) -> None:
+def test_a_part_is_found_and_reported_by_its_number(store, make_data):
     x = make_data(1).X[0]
     with DataEngine.open(store) as engine:
         engine.decide(np.roll(x, 7), "P-7")
@@ -84,7 +84,7 @@ def test_a_part_is_found_and_reported_by_its_number(store, make_data) -> None:
         assert "'P-9', which is unknown" in dengine(verb, store, *words).stderr
 
 
-def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store) -> None:
+def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store):
     before = labels(store)
     one, two = before.pop(1)[0], before.pop(2)[0]
     failed = dengine("forget", store, one, "nobody")
@@ -99,7 +99,7 @@ def test_several_are_forgotten_at_once_or_none_by_whoever_is_logged_in(store) ->
     assert event.data["reason"] == "wrong part"
 
 
-def test_an_earlier_version_answers_again(store) -> None:
+def test_an_earlier_version_answers_again(store):
     line = line_of("rollback", store, 1, "--author", "kim")
     assert line == "Version 1 answers again, as version 3 after 2, and is pinned. Event 1, by kim."
     assert document("status", store)["pinned"] == 1
@@ -119,7 +119,7 @@ POLICIES = f"""
 """
 
 
-def test_a_policy_is_changed_in_what_is_given_and_stays(store, tmp_path, monkeypatch) -> None:
+def test_a_policy_is_changed_in_what_is_given_and_stays(store, tmp_path, monkeypatch):
     line_of(*f"policy {store} --alpha 0.2 --lower-bound 0.8 --stops all --audit-rate 0.1".split())
     with DataEngine.open(store) as engine:
         assert engine.policy == Policy(0.2, 0.8, audit_rate=0.1, stops="all")
@@ -134,7 +134,7 @@ def test_a_policy_is_changed_in_what_is_given_and_stays(store, tmp_path, monkeyp
     assert document("status", store)["shadow"] is False
 
 
-def test_a_retrain_that_is_dropped_ends_with_1_and_says_why(make_data, tmp_path) -> None:
+def test_a_retrain_that_is_dropped_ends_with_1_and_says_why(make_data, tmp_path):
     import_labelled(tmp_path / "a.db", make_data(40, failures=0.0), "rocket", 0)
     failed = dengine("retrain", tmp_path / "a.db")
     assert failed.exit_code == 1

@@ -4,7 +4,6 @@ everything.
 
 import re
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from tests.support.driving import RECIPE, drive, easy_parts
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Path:
+def store(tmp_path_factory):
     """700 parts; from the 301st to the 400th the sensor is hit by a wave, which puts the engine
     into safe mode.
     """
@@ -37,7 +36,7 @@ def store(tmp_path_factory) -> Path:
 
 def test_a_history_fits_120_columns_and_shows_no_bound_as_a_threshold_that_it_misses(
     store, decisions
-) -> None:
+):
     shown = succeed("history", store, "--last", 700, "--events").splitlines()
     assert max(map(len, shown)) <= TABLE_WIDTH == 120
     assert sum("  * retrain to version" in line for line in shown) >= 5
@@ -56,7 +55,7 @@ def test_a_history_fits_120_columns_and_shows_no_bound_as_a_threshold_that_it_mi
     assert outward(0.07, 0.29, 2) == (0.07, 0.29)  # 100 times these is not a whole number
 
 
-def test_a_historys_filters_are_those_of_the_document(store) -> None:
+def test_a_historys_filters_are_those_of_the_document(store):
     words = "--last 1000 --since 1h --action accept --reason certain --label bad --model accept"
     names = ("action", "reason", "label", "predicted")
     found = document("history", store, *words.split())["decisions"]
@@ -67,7 +66,7 @@ def test_a_historys_filters_are_those_of_the_document(store) -> None:
         assert succeed("history", store, *words.split()) == "No decision of that kind.\n"
 
 
-def test_a_wrong_word_is_a_wrong_call(store) -> None:
+def test_a_wrong_word_is_a_wrong_call(store):
     for line in WRONG.strip().splitlines():
         call, expected = re.split("  +", line)
         code, verb, *words = call.split()
@@ -75,7 +74,7 @@ def test_a_wrong_word_is_a_wrong_call(store) -> None:
         assert (result.exit_code, expected in result.stderr) == (int(code), True), line
 
 
-def test_an_explanations_document_is_its_record(store, decisions, tmp_path) -> None:
+def test_an_explanations_document_is_its_record(store, decisions, tmp_path):
     certain = next(item["id"] for item in decisions[::-1] if item["reason"] == "certain")
     out = tmp_path / "picture.png"
     result = document("explain", store, certain, "--neighbours", 4, "--out", out)
@@ -88,7 +87,7 @@ def test_an_explanations_document_is_its_record(store, decisions, tmp_path) -> N
     assert last | {"label": decisions[-1]["label"]} == decisions[-1]
 
 
-def test_status_counts_the_newest_apart_from_all(store, decisions) -> None:
+def test_status_counts_the_newest_apart_from_all(store, decisions):
     result = document("status", store, "--last", 200)
     for name, some in (("newest", decisions[-200:]), ("ever", decisions)):
         span, actions = result[name], Counter(item["action"] for item in some)
@@ -109,7 +108,7 @@ def test_status_counts_the_newest_apart_from_all(store, decisions) -> None:
 
 def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reasons(
     tmp_path,
-) -> None:
+):
     file = tmp_path / "new.db"
     DataEngine("pca", store=file).close()
     assert "none is known" in succeed("status", file)
@@ -122,7 +121,7 @@ def test_a_store_without_decisions_is_shown_and_dropped_retrains_have_their_reas
     assert (ever["dropped"], ever["unlabelled"]) == ({dropped.reason: 1}, 1)
 
 
-def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
+def test_what_is_known_of_bad_accepts_depends_on_who_tells():
     for line in KNOWN.strip().splitlines():
         stops, *counts = line[:16].split()
         n_known, verdict = line[30:].split()
@@ -133,9 +132,7 @@ def test_what_is_known_of_bad_accepts_depends_on_who_tells() -> None:
     assert bad_accepts(Outcomes(50, 3), policy).upper == bad_accepts(Outcomes(), policy).upper == 1
 
 
-def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(
-    stream, tmp_path
-) -> None:
+def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_true(stream, tmp_path):
     store = tmp_path / "engine.db"
     with DataEngine(recipe=RECIPE, store=store) as engine:
         drive(engine, stream, 0, 30)
@@ -191,6 +188,6 @@ WRONG = """
 
 
 @pytest.fixture(scope="module")
-def decisions(store) -> list[dict]:
+def decisions(store):
     """All decisions of the store, oldest first."""
     return document("history", store, "--last", 1000)["decisions"]

@@ -18,7 +18,7 @@ IN_STORE, IN_JOURNAL = 6, 10  # parts
 
 
 @pytest.fixture(scope="module")
-def left(data, tmp_path_factory) -> Path:
+def left(data, tmp_path_factory):
     """What a killed process leaves whose newest labels are in its journal alone.
 
     Beside it is `engine.db.cell.journal.head.old`, the head before the newest labels.
@@ -39,7 +39,7 @@ def left(data, tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def store(left, tmp_path) -> Path:
+def store(left, tmp_path):
     """A copy of what a killed process left."""
     return Path(shutil.copytree(left, tmp_path / "cell")) / "engine.db"
 
@@ -86,9 +86,7 @@ def damaged(kind: str, content: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("kind", DAMAGES)
-def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it(
-    store, kind
-) -> None:
+def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it(store, kind):
     loss, file = DAMAGES[kind], Path(f"{store}.cell.journal")
     if kind == "deleted":
         file.unlink()
@@ -114,7 +112,7 @@ def test_records_that_a_journal_lost_are_an_alarm_until_somebody_acknowledges_it
 @pytest.mark.parametrize(
     "kind", ["nothing", "an older head", "no head", "a damaged head", "a half"]
 )
-def test_what_a_killed_process_left_is_no_alarm(store, kind) -> None:
+def test_what_a_killed_process_left_is_no_alarm(store, kind):
     file, head = Path(f"{store}.cell.journal"), Path(f"{store}.cell.journal.head")
     if kind == "an older head":
         shutil.copy(f"{head}.old", head)

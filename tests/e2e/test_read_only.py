@@ -9,7 +9,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +66,7 @@ def python(*words: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def stores(tmp_path_factory, make_data) -> dict[str, Path]:
+def stores(tmp_path_factory, make_data):
     """The folder of a store in each state."""
     data, place = make_data(60, samples=80), tmp_path_factory.mktemp("made")
     with DataEngine("pca", retrain_every=30, store=str(place / "engine.db")) as engine:
@@ -82,7 +81,7 @@ def stores(tmp_path_factory, make_data) -> dict[str, Path]:
 
 
 @pytest.fixture
-def locked(stores, tmp_path) -> Iterator[list[Path]]:
+def locked(stores, tmp_path):
     """A copy of a store for each of the `CASES`, which cannot be written."""
     copies = []
     for left, kind in CASES:
@@ -109,9 +108,7 @@ def content(store: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in files}
 
 
-def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(
-    stores, tmp_path
-) -> None:
+def test_a_journal_that_may_not_be_read_makes_no_backup_and_verify_says_so(stores, tmp_path):
     store, journal = tmp_path / "engine.db", tmp_path / "engine.db.cell.journal"
     shutil.copy(stores["closed"] / "engine.db", store)
     journal.write_bytes(b"another user's")
@@ -137,7 +134,7 @@ policy STORE --alpha 0.2             writable
 """
 
 
-def test_what_only_reads_reads_it_and_leaves_it_as_it_is(locked, tmp_path) -> None:
+def test_what_only_reads_reads_it_and_leaves_it_as_it_is(locked, tmp_path):
     before, commands = [content(store) for store in locked], []
     verbs = [re.split("  +", line) for line in VERBS.strip().splitlines()]
     for i, store in enumerate(locked):
@@ -155,6 +152,6 @@ def test_what_only_reads_reads_it_and_leaves_it_as_it_is(locked, tmp_path) -> No
             assert content(store) == files
 
 
-def test_a_write_to_it_is_refused_or_kept_and_never_lost(locked) -> None:
+def test_a_write_to_it_is_refused_or_kept_and_never_lost(locked):
     for line in python("-c", WRITE, *map(str, locked)).splitlines():
         assert line == "1" or "writable" in line

@@ -5,7 +5,6 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -25,7 +24,7 @@ PCA = replace(CONV, reducer="pca", params={})
 
 
 @pytest.fixture(scope="module")
-def running() -> Iterator[list[RetrainingProcess]]:
+def running():
     """The process that runs, which serves tests until one of them ends it; its start takes seconds."""
     processes: list[RetrainingProcess] = []
     yield processes
@@ -34,7 +33,7 @@ def running() -> Iterator[list[RetrainingProcess]]:
 
 
 @pytest.fixture
-def process(running) -> RetrainingProcess:
+def process(running):
     if not running:
         running.append(RetrainingProcess())
         running[0].submit(os.getpid).result(300)
@@ -49,7 +48,7 @@ def settle(engine: DataEngine) -> None:
 
 def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_arrive_writable(
     process,
-) -> None:
+):
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], torch.empty(0), torch.nn.Linear(3, 4).weight, x.numpy()[:, ::2]
     for received, was in zip(process.submit(copy.copy, sent).result(300), sent, strict=True):
@@ -64,7 +63,7 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
     assert process.submit(divmod, 17, 5).result(300) == (3, 2)
 
 
-def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(process, data, caplog) -> None:
+def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(process, data, caplog):
     decided = []
     with ThreadPoolExecutor(1) as thread, caplog.at_level(logging.INFO, "dengine"):
         for executor in (process, thread):
@@ -80,7 +79,7 @@ def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(process, data, cap
 @pytest.mark.merge
 def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while_it_imports(
     process, data, monkeypatch
-) -> None:
+):
     pids = [process.submit(os.getpid).result(300)]
     engine = DataEngine(recipe=PCA, executor=process)
     os.kill(pids[0], signal.SIGKILL)
@@ -112,7 +111,7 @@ def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while
     assert len({*pids}) == 3
 
 
-def test_it_ends_with_whoever_made_it_also_at_work(process, running) -> None:
+def test_it_ends_with_whoever_made_it_also_at_work(process, running):
     running.clear()
     with process:
         pid = process.submit(os.getpid).result(300)

@@ -30,7 +30,7 @@ def good(data: Dataset, n: int = 1) -> np.ndarray:
 
 
 @pytest.fixture
-def trained(data) -> DataEngine:
+def trained(data):
     engine = make()
     play(engine, data, 0, 90, confirm=True)
     return engine
@@ -42,7 +42,7 @@ def state(engine: DataEngine) -> tuple[int, ...]:
     return n_stored, len(engine.model.index), engine.state.new_labels, engine.version
 
 
-def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data) -> None:
+def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data):
     asked: list[str] = []
 
     class Listening(ReplayCell):
@@ -57,7 +57,7 @@ def test_each_action_asks_its_own_question_of_the_cell_exactly_once(data) -> Non
 
 
 @pytest.mark.parametrize("lacks", ["reject", "insert verify proceed reject"])
-def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part(lacks) -> None:
+def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part(lacks):
     methods = {"insert", "verify", "proceed", "reject"} - {*lacks.split()}
     half = type("Half", (), dict.fromkeys(methods, pytest.fail))()
     message = f"Expected a cell with the methods .*got Half without {' and '.join(lacks.split())};"
@@ -65,7 +65,7 @@ def test_a_cell_without_one_of_its_four_methods_is_refused_before_the_first_part
         make().run(half, 1)
 
 
-def test_a_trace_that_comes_again_has_no_vote_on_itself(trained, data) -> None:
+def test_a_trace_that_comes_again_has_no_vote_on_itself(trained, data):
     decision = trained.decide(good(data))
     trained.report(decision.id, success=False)
     assert decision.action is Action.ACCEPT
@@ -76,7 +76,7 @@ def test_a_trace_that_comes_again_has_no_vote_on_itself(trained, data) -> None:
         assert votes.n_failure == decision.n_failure + n_failure
 
 
-def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data) -> None:
+def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data):
     engine, n = make(replace(RECIPE, retrain_every=20)), 0
     for x, y in zip(data.X[:90], data.y[:90] == 1, strict=True):
         decision = engine.decide(x)
@@ -102,7 +102,7 @@ def test_a_report_is_counted_at_once_and_retrains_every_so_many_labels(data) -> 
         "constant 0",
     ],
 )
-def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(line, data) -> None:
+def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(line, data):
     reason, sample = line.split()
     limit = None if reason == "too_large" else 150.0
     engine = make(trace=TraceSpec(samples=100, limit=limit))
@@ -125,7 +125,7 @@ def test_a_bad_trace_is_verified_with_its_reason_kept_and_never_trained_on(line,
 )
 def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
     data, at, later, monkeypatch
-) -> None:
+):
     monkeypatch.setattr(Counting, at, Mock(side_effect=RuntimeError))
     engine = make(model=Counting())
     reasons = Counter(c.decision.reason for c in play(engine, data, 0, 130))
@@ -136,7 +136,7 @@ def test_a_model_that_fails_at_a_label_or_a_trace_loses_neither_it_nor_the_cell(
 
 def test_a_dropped_candidate_leaves_the_old_version_answering_and_three_are_an_alarm(
     data, tmp_path
-) -> None:
+):
     with make(store=tmp_path / "e.db") as engine:
         play(engine, data, 0, 60)
         version, before = engine.version, evidence(engine.decide(good(data)))
@@ -158,7 +158,7 @@ def test_a_dropped_candidate_leaves_the_old_version_answering_and_three_are_an_a
 @pytest.mark.parametrize("where", ["insert", "verify", "proceed"])
 def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(
     where, data, tmp_path, monkeypatch
-) -> None:
+):
     real, cycles = getattr(ReplayCell, where), []
 
     def failing(self):
@@ -177,9 +177,7 @@ def test_an_exception_of_the_cell_propagates_after_everything_known_is_written(
 
 
 @pytest.mark.parametrize("interval", ["jeffreys", "wilson"])
-def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(
-    interval, data, tmp_path
-) -> None:
+def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(interval, data, tmp_path):
     url, recipe = tmp_path / "broken.db", RECIPE.with_policy(interval=interval)
     with make(recipe, seed=3) as engine:
         whole = play(engine, data, 0, 150)
@@ -197,7 +195,7 @@ def test_an_engine_that_was_opened_goes_on_as_one_that_never_closed(
 
 
 # That one in a process of its own does so too is in test_retraining_process.py.
-def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(data) -> None:
+def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(data):
     said = []
     with ThreadPoolExecutor(1) as pool:
         for executor in (None, pool):
@@ -212,7 +210,7 @@ def test_a_retrain_beside_the_cell_ends_where_one_in_line_ends(data) -> None:
     assert said[0] == said[1]
 
 
-def test_a_second_thread_in_an_engine_is_refused(data) -> None:
+def test_a_second_thread_in_an_engine_is_refused(data):
     entered, leave = Event(), Event()
 
     class Slow(Counting):
@@ -233,7 +231,7 @@ def test_a_second_thread_in_an_engine_is_refused(data) -> None:
         assert deciding.result().action is Action.VERIFY
 
 
-def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data) -> None:
+def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data):
     with ThreadPoolExecutor(1) as pool, DataEngine("conv", executor=pool) as engine:
         next(engine.run(ReplayCell(data), 1))
         assert "dengine-warm-up" not in {thread.name for thread in living_threads()}

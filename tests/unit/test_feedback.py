@@ -48,7 +48,7 @@ def outcomes(engine: DataEngine, **options) -> Outcomes:
 
 
 @pytest.fixture(scope="module")
-def stream(make_data) -> Dataset:
+def stream(make_data):
     return make_data(500, samples=60, seed=3)
 
 
@@ -80,12 +80,12 @@ def beyond(engine: DataEngine) -> list[int]:
 
 def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_part(
     stream,
-) -> None:
+):
     engine = make(replace(LOCAL, stops="all"))
     cycles = play(engine, stream, 0, 200)
     assert any(c.retrain for c in cycles if c.decision.action is Action.ACCEPT)  # of these alone
 
-    def source(decision: Decision) -> Source | None:
+    def source(decision: Decision):
         engine.flush()
         return engine.find(decision.id).source
 
@@ -103,7 +103,7 @@ def test_where_all_stops_are_known_silence_until_the_next_decision_confirms_a_pa
     assert newest.last_seq == engine.store.labels.outcomes_since(0)[-1].seq
 
 
-def test_silence_says_nothing_by_default(stream) -> None:
+def test_silence_says_nothing_by_default(stream):
     engine = make(LOCAL)
     play(engine, stream, 0, 200)
     assert engine.store.decisions.counts()["sources"]["confirmed"] == 0
@@ -114,7 +114,7 @@ def test_silence_says_nothing_by_default(stream) -> None:
 
 def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
     stream, tmp_path, monkeypatch
-) -> None:
+):
     with make(POOLED, store=tmp_path / "late.db") as engine:
         play(engine, stream, 0, 200)
         id_ = accepted(engine, stream).id
@@ -146,8 +146,8 @@ def test_a_stop_that_comes_however_late_takes_its_confirmation_back_everywhere(
 
 def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_not_know_of_overdue_checks(
     stream, tmp_path, monkeypatch
-) -> None:
-    def earlier(*given, overdue_to, seq) -> NewLabel:
+):
+    def earlier(*given, overdue_to, seq):
         return NewLabel(*given, seq=seq)
 
     store = tmp_path / "e.db"
@@ -167,7 +167,7 @@ def test_a_cell_stays_healthy_on_a_store_of_an_earlier_dengine_whose_labels_do_n
     assert verify_history(str(store)).ok
 
 
-def test_a_callback_that_raises_costs_no_label(stream) -> None:
+def test_a_callback_that_raises_costs_no_label(stream):
     engine = make(POOLED, on_safe_mode=Mock(side_effect=RuntimeError))
     play(engine, stream, 0, 200)
     play(engine, spoiled(stream))
@@ -179,7 +179,7 @@ def test_a_callback_that_raises_costs_no_label(stream) -> None:
 @pytest.mark.parametrize("guarantee", ["local", pytest.param("pooled", marks=pytest.mark.slow)])
 def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_evidence_keeps_the_tolerance(
     stream, make_data, guarantee
-) -> None:
+):
     heard: list[str] = []
     engine = make(replace(LOCAL, guarantee=guarantee, stops="all"), on_safe_mode=heard.append)
     play(engine, stream, 0, 200)
@@ -201,13 +201,13 @@ def test_safe_mode_begins_with_a_recorded_reason_and_a_call_and_ends_when_fresh_
     assert engine.status(watching=True).watch.recovery == ""
 
 
-def test_a_parts_hash_never_changes() -> None:
+def test_a_parts_hash_never_changes():
     fnv = {"": 0xCBF29CE484222325, "a": 0xAF63DC4C8601EC8C, "foobar": 0x85944171F73967E8}
     for text, expected in fnv.items():  # FNV-1a: the vectors of its authors' reference
         assert part_hash(text) % 2**64 == expected
 
 
-def test_an_event_and_the_status_tell_where_nearly_every_trace_is_novel(stream) -> None:
+def test_an_event_and_the_status_tell_where_nearly_every_trace_is_novel(stream):
     engine = make(LOCAL)
     play(engine, stream, 0, 120)
     assert engine.store.events.newest() == []
@@ -219,7 +219,7 @@ def test_an_event_and_the_status_tell_where_nearly_every_trace_is_novel(stream) 
 
 def test_repeats_that_nobody_names_are_noticed_and_named_ones_or_parts_of_their_own_are_not(
     make_data,
-) -> None:
+):
     X, rng = load_dataset("insertion").X[:200, None], np.random.default_rng(0)
     assert repeats_note(X, np.arange(len(X))) == ""
     base, part = make_data(60, samples=60, seed=4, noise=0.1), rng.permutation(300) // 5
@@ -240,7 +240,7 @@ def told(engine: DataEngine) -> dict[str, list]:
 @pytest.mark.parametrize("policy", [replace(LOCAL, audit_rate=0.2), POOLED])
 def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told(
     policy, stream, tmp_path
-) -> None:
+):
     with make(policy, store=tmp_path / "engine.db") as engine:
         play(engine, stream, 0, 300)
         decisions = [engine.decide(x + np.float32(0.001)) for x in stream.X[stream.y == 0]]
@@ -267,7 +267,7 @@ def test_a_report_on_a_rejected_part_is_kept_and_trains_and_the_rule_is_not_told
 
 def test_false_rejects_bound_the_certificate_from_below_and_are_an_alarm_where_they_are_many(
     stream,
-) -> None:
+):
     engine = make(replace(LOCAL, audit_rate=0.3))
     play(engine, stream, 0, 200)
     decisions = [engine.decide(x) for x in stream.X[stream.y == 0]]

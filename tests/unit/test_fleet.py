@@ -4,7 +4,7 @@ is recounted in test_histories.py.
 
 import threading
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -46,10 +46,10 @@ class Fleet:
     tag: str = field(default_factory=lambda: uuid.uuid4().hex)
     opened: list[DataEngine] = field(default_factory=list)
 
-    def store(self, cell: str, product: str | None = "gear") -> SqlStore:
+    def store(self, cell: str, product: str | None = "gear"):
         return SqlStore(self.url, f"{cell}-{self.tag}", product=product and f"{product}-{self.tag}")
 
-    def engine(self, cell: str, product="gear", recipe=RECIPE, store=None, **options) -> DataEngine:
+    def engine(self, cell: str, product="gear", recipe=RECIPE, store=None, **options):
         options = {"clock": ticks(), "replaying": True} | options
         store = store or self.store(cell, product)
         self.opened.append(DataEngine.open_or_create(store, recipe=recipe, **options))
@@ -63,7 +63,7 @@ SERVER = pytest.param("postgres", marks=[*DATABASES[1].marks, pytest.mark.slow])
 
 
 @pytest.fixture(params=["sqlite", SERVER])
-def fleet(request, tmp_path) -> Iterator[Fleet]:
+def fleet(request, tmp_path):
     created = Fleet(url_of(request.param, tmp_path))
     yield created
     for engine in created.opened:
@@ -71,18 +71,18 @@ def fleet(request, tmp_path) -> Iterator[Fleet]:
 
 
 @pytest.fixture
-def pair(fleet) -> list[DataEngine]:
+def pair(fleet):
     """Two cells of one product."""
     return [fleet.engine(name) for name in "ab"]
 
 
 @pytest.fixture(scope="module")
-def parts() -> Dataset:
+def parts():
     return insertion_like(260, noise=0.3)
 
 
 @pytest.fixture(scope="module")
-def probe() -> np.ndarray:
+def probe():
     return insertion_like(40, seed=99, noise=0.3).X[:, None]
 
 
@@ -135,9 +135,7 @@ def numbers(engine: DataEngine) -> list[int]:
     [RECIPE, replace(RECIPE, reducer=PCA(2)), pytest.param(CONV, marks=pytest.mark.slow)],
     ids=["pca", "a reducer without arrays", "conv"],
 )
-def test_one_retrain_serves_all_and_a_new_cell_that_decides_at_once(
-    recipe, fleet, parts, probe
-) -> None:
+def test_one_retrain_serves_all_and_a_new_cell_that_decides_at_once(recipe, fleet, parts, probe):
     cells = [fleet.engine(name, recipe=recipe) for name in "abc"]
     for i in range(75):
         learn(cells[i % 3], parts, [i])
@@ -152,7 +150,7 @@ def test_one_retrain_serves_all_and_a_new_cell_that_decides_at_once(
         assert engine.state.new_labels == 0
 
 
-def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(fleet, parts) -> None:
+def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(fleet, parts):
     first = fleet.engine("a")
     second = fleet.engine("b", recipe=RECIPE.with_settings(retrain_every=1000))
     for start in range(0, 38, 2):
@@ -167,9 +165,7 @@ def test_each_cell_retrains_by_its_own_labels_since_the_newest_version(fleet, pa
     assert (first.state.new_labels, second.state.new_labels) == (0, 0)
 
 
-def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
-    fleet, parts, probe
-) -> None:
+def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(fleet, parts, probe):
     waiting, may_train = RECIPE.with_settings(retrain_every=1000), threading.Event()
     with ThreadPoolExecutor(1) as executor:
         first = fleet.engine("a", recipe=waiting, executor=executor)
@@ -191,11 +187,11 @@ def test_labels_that_come_in_while_an_executor_retrains_are_in_the_new_version(
 @ON_BOTH
 def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answers(
     pair, parts, probe, monkeypatch
-) -> None:
+):
     first, second = pair
     reports, put = [], second.store.versions.put
 
-    def put_late(*version: Any) -> int:
+    def put_late(*version: Any):
         """Store a version after a peer's."""
         if not reports:
             reports.append(first.retrain())
@@ -211,7 +207,7 @@ def test_two_cells_that_retrain_at_once_make_two_versions_and_the_later_one_answ
 
 
 @ON_BOTH
-def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet, parts, probe) -> None:
+def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet, parts, probe):
     first, second = taught(fleet, parts, 60)
     wrong, *gone = [past.decision.id for past in first.history(label="good")][20:24]
     first.correct(wrong, False)
@@ -233,9 +229,7 @@ def test_what_one_cell_puts_right_reaches_its_peers_and_a_reopened_one(fleet, pa
     must_be_as(fleet, second, probe)
 
 
-def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases_it(
-    fleet, parts
-) -> None:
+def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases_it(fleet, parts):
     first, second = taught(fleet, parts, 60)
     with ThreadPoolExecutor(1) as executor:
         third = fleet.engine("c", executor=executor)
@@ -256,7 +250,7 @@ def test_no_cell_replaces_what_a_peer_rolled_back_to_before_one_of_them_releases
 
 
 @ON_BOTH
-def test_nothing_is_mixed_between_products_and_cells_without(fleet, parts, probe) -> None:
+def test_nothing_is_mixed_between_products_and_cells_without(fleet, parts, probe):
     products = {"a": "gear", "b": "gear", "c": "nut", "d": None}
     cells = [fleet.engine(name, product) for name, product in products.items()]
     alone = DataEngine(recipe=RECIPE, store=SqlStore(), clock=ticks(), replaying=True)
@@ -277,7 +271,7 @@ def test_nothing_is_mixed_between_products_and_cells_without(fleet, parts, probe
 
 
 @ON_BOTH
-def test_label_numbers_are_unique_and_increase_over_the_product(fleet, parts) -> None:
+def test_label_numbers_are_unique_and_increase_over_the_product(fleet, parts):
     waiting = RECIPE.with_settings(retrain_every=10_000)
     cells = [fleet.engine(name, recipe=waiting) for name in "abcd"]
     with ThreadPoolExecutor(4) as pool:
@@ -290,12 +284,12 @@ def test_label_numbers_are_unique_and_increase_over_the_product(fleet, parts) ->
 @ON_BOTH
 def test_a_cell_without_news_goes_on_and_says_so_once(
     fleet, pair, parts, probe, caplog, monkeypatch
-) -> None:
+):
     first, second = pair
     versions, asked, lost = second.store.versions, [], []
     newest_number = versions.newest_number
 
-    def shaky() -> int:
+    def shaky():
         asked.append(len(lost))
         if lost:
             raise StoreError("The connection is gone.")
@@ -323,9 +317,7 @@ def test_a_cell_without_news_goes_on_and_says_so_once(
     must_be_as(fleet, second, probe)
 
 
-def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(
-    fleet, parts, caplog
-) -> None:
+def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(fleet, parts, caplog):
     first, second = taught(fleet, parts, 60)
     version = second.version
     first.retrain()
@@ -348,7 +340,7 @@ def test_a_peers_version_that_is_damaged_is_left_out_and_the_next_one_answers(
         ({}, "seed 0"),
     ],
 )
-def test_what_decides_the_embedding_must_agree(settings, named, fleet) -> None:
+def test_what_decides_the_embedding_must_agree(settings, named, fleet):
     fleet.engine("a")
     with pytest.raises(SettingError, match=f"product.*{named}"):
         fleet.engine("b", recipe=replace(RECIPE, **settings), seed=0 if settings else 7)
@@ -356,7 +348,7 @@ def test_what_decides_the_embedding_must_agree(settings, named, fleet) -> None:
         fleet.engine("b", recipe=Recipe("umap"))
 
 
-def test_the_first_trace_of_any_cell_sets_the_trace_spec(fleet, pair, parts) -> None:
+def test_the_first_trace_of_any_cell_sets_the_trace_spec(fleet, pair, parts):
     first, second = pair
     first.decide(parts.X[0])
     with pytest.raises(TraceError, match="100 samples"):
@@ -365,7 +357,7 @@ def test_the_first_trace_of_any_cell_sets_the_trace_spec(fleet, pair, parts) -> 
 
 
 @ON_BOTH
-def test_cells_are_listed_with_their_products_which_they_keep(fleet, parts) -> None:
+def test_cells_are_listed_with_their_products_which_they_keep(fleet, parts):
     cells = [fleet.engine(*names) for names in (("a", "gear"), ("b", "gear"), ("d", None))]
     learn(cells[0], parts, range(30))
     learn(cells[2], parts, [0])
@@ -393,7 +385,7 @@ export URL --cell TWO --out MODEL
 """
 
 
-def test_every_verb_that_names_a_store_names_a_cell(fleet, parts, tmp_path) -> None:
+def test_every_verb_that_names_a_store_names_a_cell(fleet, parts, tmp_path):
     names = {"DATA": tmp_path / "parts.npz", "MODEL": tmp_path / "model.ts", "URL": fleet.url}
     one, two, product = (f"{name}-{fleet.tag}" for name in ("a", "b", "gear"))
     names |= {"ONE": one, "TWO": two, "PRODUCT": product}

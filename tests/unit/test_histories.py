@@ -27,7 +27,7 @@ QUICK = ("local, all stops", "pooled, audits", "two cells, pooled")  # the other
     "name",
     [name if name in QUICK else pytest.param(name, marks=pytest.mark.merge) for name in CASES],
 )
-def test_in_random_histories_every_count_is_the_recount_from_the_store(name) -> None:
+def test_in_random_histories_every_count_is_the_recount_from_the_store(name):
     row = check_history(name, 11)  # it is opened again while checks are overdue
     assert (row["faults"], row["fault"]) == (0, "")
     assert row["comparisons"] > 800
@@ -35,7 +35,7 @@ def test_in_random_histories_every_count_is_the_recount_from_the_store(name) -> 
     assert row["restarts"] > 0
 
 
-def test_the_recount_hashes_as_the_documents_say_and_the_package_does() -> None:
+def test_the_recount_hashes_as_the_documents_say_and_the_package_does():
     rng = np.random.default_rng(0)
     for _ in range(50):
         part = str(rng.integers(10**6))
@@ -170,7 +170,7 @@ pinned_version_replaced              cost          pins
 
 @pytest.mark.merge
 @pytest.mark.parametrize("line", FAULTS.strip().splitlines(), ids=lambda line: line.split()[0])
-def test_a_planted_fault_is_found(line, monkeypatch) -> None:
+def test_a_planted_fault_is_found(line, monkeypatch):
     mutation, name, kind = re.split("  +", line)
     globals()[mutation](monkeypatch)
     row = check_history(name, 3 if mutation == "late_label_ignored" else 1)

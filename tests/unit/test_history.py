@@ -32,7 +32,7 @@ KIND = ("action", "predicted", "reason", "audit")
 
 
 @pytest.fixture
-def store(store) -> SqlStore:
+def store(store):
     """60 decisions of all kinds, three of each moment; half of them labelled; a retrain after each
     tenth.
     """
@@ -58,7 +58,7 @@ def everything(store: SqlStore) -> list[StoredDecision]:
     return list(history(store))
 
 
-def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store, monkeypatch) -> None:
+def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store, monkeypatch):
     whole = everything(store)
     assert [past.decision.id for past in whole] == [f"d{i:03d}" for i in range(N)]
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 7)
@@ -67,7 +67,7 @@ def test_all_of_a_history_comes_once_and_in_order_whatever_the_page(store, monke
         assert list(history(store, last=last)) == whole[-last:]
 
 
-def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch) -> None:
+def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch):
     now = [0.0]
     times, ids = [5.0, 9.0, 2.0, 2.0, 1.0, 7.0], ["d5", "d1", "d4", "d0", "d3", "d2"]
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 2)
@@ -82,7 +82,7 @@ def test_a_clock_that_is_set_back_changes_no_order(place, monkeypatch) -> None:
         assert (newest.count(), newest.last) == (2, 7.0)
 
 
-def test_a_filter_takes_what_it_says_and_the_newest_of_that(store, monkeypatch) -> None:
+def test_a_filter_takes_what_it_says_and_the_newest_of_that(store, monkeypatch):
     monkeypatch.setattr(dengine.history.status, "PAGE_SIZE", 4)
     whole = everything(store)
     middle = whole[N // 2].time
@@ -108,7 +108,7 @@ def test_a_filter_takes_what_it_says_and_the_newest_of_that(store, monkeypatch) 
         assert list(history(store, last=3, **asked)) == expected[-3:]
 
 
-def test_counts_of_a_store_are_those_of_its_history(store) -> None:
+def test_counts_of_a_store_are_those_of_its_history(store):
     whole = everything(store)
     for last in (None, 1, 10, 59, 500):
         some = whole if last is None else whole[-last:]
@@ -146,7 +146,7 @@ def counted(some: list[StoredDecision]) -> Stretch:
     return Stretch(len(some), some[-1].time, *counts)
 
 
-def test_stretches_are_consecutive_and_hold_everything(store) -> None:
+def test_stretches_are_consecutive_and_hold_everything(store):
     whole = everything(store)
     for n in (1, 7, 60, 500):
         length = max(1, -(-N // n))
@@ -155,13 +155,3 @@ def test_stretches_are_consecutive_and_hold_everything(store) -> None:
         shifts = [[item for item in whole if item.time // (10.0 * n) == k] for k in range(N)]
         shifts = [counted(items) for items in shifts if items]
         assert store.decisions.stretches(seconds=10.0 * n) == shifts
-
-
-def test_labels_come_along_their_numbers_with_what_the_rule_was_told(store) -> None:
-    every = store.labels.past(0)
-    assert [label.seq for label in every] == list(range(1, len(every) + 1))
-    assert [label.seq for label in store.labels.past(3, 7)] == [4, 5, 6, 7]
-    answers = [(label.seq, label.novel) for label in every if not label.quarantined]
-    assert answers == [(item.seq, item.novel) for item in store.labels.outcomes_since(0)]
-    times = {past.decision.id: past.time for past in everything(store)}
-    assert all(label.decided == times[label.decision_id] for label in every)

@@ -22,19 +22,9 @@ def kept(store: SqlStore) -> list[int]:
     return [row.report.version for row in store.versions.all() if row.kept]
 
 
-def test_a_new_state_takes_the_room_of_those_that_are_not_kept_any_more(tmp_path) -> None:
-    file = tmp_path / "a.db"
-    state = np.random.default_rng(0).random(2**17)  # 1 MiB
-    with SqlStore(str(file), keep_versions=2) as store:
-        for version in range(1, 10):
-            store.versions.put(report(version), version, {"w": state})
-        assert kept(store) == [1, 8, 9]
-    assert 3 * 2**20 < file.stat().st_size < 3.6 * 2**20
-
-
 def test_every_retrain_is_listed_for_ever_and_what_is_kept_is_loaded_by_its_number(
     store,
-) -> None:
+):
     put(store, 34)
     store.versions.put(report(34, accepted=False), 35, None)
     rows, numbers = store.versions.all(), [1, 10, 20, 30, 31, 32, 33, 34]
@@ -57,7 +47,7 @@ def test_every_retrain_is_listed_for_ever_and_what_is_kept_is_loaded_by_its_numb
 
 def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall_back_on(
     tmp_path,
-) -> None:
+):
     for keep, numbers in ((None, list(range(1, 13))), (8, [1, 5, 6, 7, 8, 9, 10, 11, 12])):
         file = str(tmp_path / f"{keep}.db")
         with SqlStore(file, keep_versions=keep) as store:
@@ -71,7 +61,7 @@ def test_a_store_may_keep_all_or_more_and_never_so_few_that_none_is_left_to_fall
 
 def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_nothing_was(
     data, tmp_path
-) -> None:
+):
     file = tmp_path / "engine.db"
     with DataEngine("pca", store=file, retrain_every=30) as engine:
         learn(engine, data, range(100))
@@ -87,9 +77,7 @@ def test_an_engine_goes_on_with_the_version_before_and_numbers_the_next_as_if_no
         assert engine.version == 4
 
 
-def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(
-    data, tmp_path
-) -> None:
+def test_a_model_that_is_refitted_is_not_refitted_without_a_trace_that_is_damaged(data, tmp_path):
     """Fitted on the others, its references would lie elsewhere: the engine verifies, and learns
     anew.
     """

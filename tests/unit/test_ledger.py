@@ -59,7 +59,7 @@ def write(store: SqlStore) -> SqlStore:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory) -> Path:
+def written(tmp_path_factory):
     file = tmp_path_factory.mktemp("history") / "engine.db"
     write(SqlStore(str(file))).close()
     execute(file, "PRAGMA wal_checkpoint(TRUNCATE)")
@@ -67,7 +67,7 @@ def written(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def file(written, tmp_path) -> Path:
+def file(written, tmp_path):
     return Path(shutil.copy(written, tmp_path / "engine.db"))
 
 
@@ -75,7 +75,7 @@ def faults(file: Path) -> list[tuple[str, str]]:
     return [(fault.table, fault.key) for fault in verify_history(str(file)).faults]
 
 
-def test_what_a_store_wrote_is_whole_in_every_database(place) -> None:
+def test_what_a_store_wrote_is_whole_in_every_database(place):
     odd = replace(decision("Ünïcode ✓", reason=Reason.CONSTANT), lower=-0.0, part="Stück 7\\0")
     with SqlStore(*place) as store:
         write(store)
@@ -93,7 +93,7 @@ CHANGED = """CASE typeof({0}) WHEN 'text' THEN 'x' || {0} WHEN 'blob' THEN CAST(
 WHEN 'real' THEN {0} * 1.0000001 + 1e-9 ELSE {0} + 1 END"""
 
 
-def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path) -> None:
+def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path):
     rng, missed, tried, file = random.Random(0), [], 0, tmp_path / "changed.db"
     with closing(sqlite3.connect(written)) as whole:
         query = "SELECT s.name, c.name FROM sqlite_master s, pragma_table_info(s.name) c"
@@ -139,12 +139,12 @@ def test_a_value_changed_in_any_column_of_any_table_is_found(written, tmp_path) 
         ("UPDATE ledger SET digest = zeroblob(32) WHERE number = 2", ("ledger", "entry 2")),
     ],
 )
-def test_what_is_wrong_is_named(file, statement, named) -> None:
+def test_what_is_wrong_is_named(file, statement, named):
     execute(file, statement)
     assert named in faults(file)
 
 
-def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file) -> None:
+def test_a_changed_row_with_a_sum_that_fits_is_found_in_its_entry(file):
     """Whoever changes a row can work out its sum anew, and the entry tells all the same."""
     with sqlite3.connect(file) as connection:
         connection.row_factory = sqlite3.Row
@@ -168,7 +168,7 @@ def cut_off(file: Path) -> None:
 
 def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere(
     file,
-) -> None:
+):
     kept = verify_history(str(file)).cells[0].digest
     with SqlStore(str(file)) as store:
         store.events.put("note", "later")
@@ -182,7 +182,7 @@ def test_entries_that_were_cut_off_are_found_by_a_digest_that_was_kept_elsewhere
         verify_history(str(file), expect="newest")
 
 
-def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path, monkeypatch) -> None:
+def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path, monkeypatch):
     file, key = tmp_path / "engine.db", str(make_key(tmp_path / "ledger.key"))
     monkeypatch.setenv(KEY_VARIABLE, key)
     write(SqlStore(str(file))).close()
@@ -208,7 +208,7 @@ def test_who_has_no_key_cannot_make_a_keyed_ledger_anew(tmp_path, monkeypatch) -
     assert verify_history(str(file)).ok  # which is why it has to be keyed
 
 
-def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file) -> None:
+def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file):
     with closing(sqlite3.connect(file)) as connection:
         query = "SELECT (rootpage - 1) * page_size FROM sqlite_master, pragma_page_size"
         (begin,) = connection.execute(f"{query} WHERE name = 'event'").fetchone()
@@ -217,7 +217,7 @@ def test_pages_that_sqlite_cannot_read_are_said_and_the_rest_is_checked(file) ->
     assert {("file", ""), ("event", "")} <= {*faults(file)}
 
 
-def test_another_cells_faults_are_its_own(file) -> None:
+def test_another_cells_faults_are_its_own(file):
     with SqlStore(str(file), "other") as store:
         write(store)
     execute(file, "UPDATE event SET text = 'x' WHERE cell_id = 'other'")
@@ -228,7 +228,7 @@ def test_another_cells_faults_are_its_own(file) -> None:
 
 
 @pytest.mark.parametrize("statement", ["", "CREATE TABLE t (id)"])
-def test_what_is_no_store_is_refused_and_nothing_is_made(statement, tmp_path) -> None:
+def test_what_is_no_store_is_refused_and_nothing_is_made(statement, tmp_path):
     if statement:
         execute(tmp_path / "a.db", statement)
     with pytest.raises(StoreError, match="Expected a"):
@@ -236,7 +236,7 @@ def test_what_is_no_store_is_refused_and_nothing_is_made(statement, tmp_path) ->
     assert (tmp_path / "a.db").exists() == bool(statement)
 
 
-def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file) -> None:
+def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file):
     with SqlStore(str(file)) as store:
         whole = store.labels.with_traces()
     changed, kept = "UPDATE trace SET data = zeroblob(800)", ~np.isin(whole.seq, [4, 5])
@@ -256,7 +256,7 @@ def test_a_damaged_trace_is_left_out_of_training_and_an_event_names_it(file) -> 
         assert len(store.labels.with_traces().traces) == 0
 
 
-def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file) -> None:
+def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file):
     result = document("verify", file)
     digest = result["cells"][0]["digest"]
     assert (result["ok"], result["faults"]) == (True, [])
@@ -268,7 +268,7 @@ def test_the_verb_shows_the_digest_and_names_what_is_wrong_with_exit_code_1(file
     assert (done.exit_code, json.loads(done.output)["faults"][0]["key"]) == (1, "d2")
 
 
-def test_a_sum_is_what_it_was() -> None:
+def test_a_sum_is_what_it_was():
     """Stores hold sums that were made years ago: these numbers change never."""
     row = {"cell_id": "cell", "number": 1, "time": 1.5, "kind": "note", "text": "é"}
     row |= {"ok": True, "none": None, "data": b"\0"}

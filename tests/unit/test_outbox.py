@@ -33,7 +33,7 @@ def opened(folder: Path) -> Iterator[JournalledStore]:
 
 
 @pytest.fixture
-def box(tmp_path, monkeypatch) -> Iterator[JournalledStore]:
+def box(tmp_path, monkeypatch):
     """Its records wait in the journal until somebody asks for them in the store."""
     monkeypatch.setattr(draining, "DRAIN_SECONDS", 1e6)
     with opened(tmp_path) as box:
@@ -67,9 +67,7 @@ def events(box: Outbox, kind: str) -> list[str]:
     return [event.text for event in box.store.events.newest() if event.kind == kind]
 
 
-def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(
-    box, tmp_path
-) -> None:
+def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(box, tmp_path):
     items = [record(box, f"part {i}") for i in range(2)]
     for i in (2, 3):
         box.record_decision(stored(f"part {i}"))
@@ -91,7 +89,7 @@ def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(
 
 def test_a_damaged_decision_that_is_not_in_memory_any_more_is_named_in_an_event(
     box, tmp_path, monkeypatch
-) -> None:
+):
     monkeypatch.setattr(lookup, "N_RECENT", 1)
     for name in ("part 1", "part 2"):
         record(box, name)
@@ -114,7 +112,7 @@ def test_a_damaged_decision_that_is_not_in_memory_any_more_is_named_in_an_event(
 
 def test_a_journal_that_was_damaged_while_its_engine_ran_is_no_fault_at_the_next_start(
     box, tmp_path
-) -> None:
+):
     box.record_decision(stored("part 1"))
     box.sync()
     damage(tmp_path, b'part 1", "action')
@@ -125,7 +123,7 @@ def test_a_journal_that_was_damaged_while_its_engine_ran_is_no_fault_at_the_next
         assert again.verify_all_reason == ""
 
 
-def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(box, monkeypatch) -> None:
+def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(box, monkeypatch):
     box.record_decision(stored("a"))
     with monkeypatch.context() as patch:
         patch.setattr(Journal, "append", Mock(side_effect=StoreError("the disk is full")))
@@ -137,7 +135,7 @@ def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(box, monke
 
 
 @pytest.fixture(params=["memory", "file"])
-def either(request, tmp_path) -> Iterator[Outbox]:
+def either(request, tmp_path):
     """An outbox of each kind."""
     url = None if request.param == "memory" else str(tmp_path / "cell.db")
     with closing(open_outbox(SqlStore(url, wait=10.0), window=10)) as box:
@@ -145,7 +143,7 @@ def either(request, tmp_path) -> Iterator[Outbox]:
         yield box
 
 
-def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either) -> None:
+def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either):
     assert either.find_decision("a") is None
     items = [either.record_decision(stored(name)) for name in "abc"]
     assert [item.number for item in items] == [1, 2, 3]
@@ -164,7 +162,7 @@ def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either) -> No
     assert (either.lag, either.fault, either.verify_all_reason) == (0.0, "", "")
 
 
-def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either) -> None:
+def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either):
     item = either.record_decision(stored("a", Action.ACCEPT, Reason.CERTAIN))
     either.record_labels([(item, label("a", True, source=Source.CONFIRMED))])
     either.drain()
@@ -178,7 +176,7 @@ def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either) -> No
     assert [event.kind for event in either.store.events.newest()] == ["late stop"]
 
 
-def test_a_version_is_stored_with_its_arrays_as_they_were(either) -> None:
+def test_a_version_is_stored_with_its_arrays_as_they_were(either):
     weights = np.zeros(3)
     future = either.store_version(report(1), 7, {"w": weights})
     assert either.wait_for_result(future) == 1
@@ -187,7 +185,7 @@ def test_a_version_is_stored_with_its_arrays_as_they_were(either) -> None:
     assert (version.version, version.last_seq, version.state["w"].tolist()) == (1, 7, [0.0] * 3)
 
 
-def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(either, tmp_path) -> None:
+def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(either, tmp_path):
     either.check_usable()
     record(either, "a")
     for _ in range(2):
@@ -202,7 +200,7 @@ def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(either, tmp_
         assert (other.n_decisions, other.number_label()) == (1, 2)
 
 
-def test_labels_of_a_product_are_numbered_by_the_store(tmp_path) -> None:
+def test_labels_of_a_product_are_numbered_by_the_store(tmp_path):
     store = SqlStore(str(tmp_path / "cell.db"), product="gear", wait=10.0)
     with closing(open_outbox(store, window=10)) as box:
         for name, number in (("a", -1), ("b", -2)):
@@ -217,7 +215,7 @@ def test_labels_of_a_product_are_numbered_by_the_store(tmp_path) -> None:
         SqlStore(product="gear")
 
 
-def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path) -> None:
+def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path):
     with opened(tmp_path) as owner:
         owner.record_decision(stored("a"))
         owner.drain()

@@ -29,7 +29,7 @@ def correct(store: SqlStore, success: bool | None, *names: str, author: str = "k
     return store.corrections.apply(change)
 
 
-def test_a_correction_says_who_when_by_which_event_and_after_which_label(store) -> None:
+def test_a_correction_says_who_when_by_which_event_and_after_which_label(store):
     fill(store, 3)
     store.events.put("note", "before")
     assert correct(store, False, "2", "0") == 2
@@ -58,7 +58,7 @@ def test_a_correction_says_who_when_by_which_event_and_after_which_label(store) 
 )
 def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is_kept(
     store, name, text
-) -> None:
+):
     fill(store, 2)
     put_decision(store, "open")
     store.settings.save({"a": "1"})
@@ -70,14 +70,14 @@ def test_what_is_unknown_or_has_no_label_is_refused_and_nothing_of_the_change_is
     assert store.labels.with_traces().labels.tolist() == [1, 0]
 
 
-def test_an_event_a_version_and_settings_are_kept_together(store) -> None:
+def test_an_event_a_version_and_settings_are_kept_together(store):
     version = (report(1), 7, {"w": np.ones(2)})
     store.corrections.apply(Change("rollback", "to 1", version=version, settings={"b": "2"}))
     assert (store.versions.retrains(), store.settings.read()) == ([report(1)], {"b": "2"})
     assert (store.versions.newest().last_seq, len(store.events.newest())) == (7, 1)
 
 
-def test_an_events_data_that_json_has_not_is_refused(store) -> None:
+def test_an_events_data_that_json_has_not_is_refused(store):
     with pytest.raises(StoreError, match="as JSON has it"):
         store.events.put("note", "", {"x": float("nan")})
     assert store.events.newest() == []
@@ -85,7 +85,7 @@ def test_an_events_data_that_json_has_not_is_refused(store) -> None:
 
 def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itself(
     store,
-) -> None:
+):
     kinds = ("accept", "accept"), ("verify", "accept"), ("verify", "reject")
     for i, (action, predicted) in enumerate(kinds * 2):
         made = decision(str(i), Action(action), Reason.CERTAIN, i // 3)
@@ -105,7 +105,7 @@ def test_outcomes_count_a_label_as_it_was_corrected_and_a_forgotten_one_by_itsel
     max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from([True, False, None])), max_size=12))
-def test_any_corrections_leave_what_plain_python_would(store, changes) -> None:
+def test_any_corrections_leave_what_plain_python_would(store, changes):
     counts, before = store.decisions.counts(), len(store.corrections.after())
     begin, now = counts["labels"] + counts["forgotten"], {i: i % 2 == 0 for i in range(6)}
     names = [uuid.uuid4().hex for _ in now]
@@ -124,7 +124,7 @@ def test_any_corrections_leave_what_plain_python_would(store, changes) -> None:
     assert as_reported.labels.tolist() == [1, 0, 1, 0, 1, 0]
 
 
-def test_corrections_survive_closing_and_belong_to_their_cell(place) -> None:
+def test_corrections_survive_closing_and_belong_to_their_cell(place):
     with SqlStore(*place) as store:
         fill(store)
         correct(store, None, "0")

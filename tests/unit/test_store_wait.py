@@ -14,7 +14,7 @@ from dengine.errors import StoreError
 )
 def test_the_argument_comes_before_the_environment_before_the_default(
     text, argument, wait, tmp_path, monkeypatch
-) -> None:
+):
     monkeypatch.setenv("DENGINE_STORE_WAIT", text)
     for _ in range(2):  # it is made, then opened
         with DataEngine.open_or_create(tmp_path / "a.db", wait=argument) as engine:
@@ -22,7 +22,7 @@ def test_the_argument_comes_before_the_environment_before_the_default(
 
 
 @pytest.mark.parametrize("text", ["soon", "0", "nan"])
-def test_an_environment_that_says_no_seconds_is_named(text, tmp_path, monkeypatch) -> None:
+def test_an_environment_that_says_no_seconds_is_named(text, tmp_path, monkeypatch):
     monkeypatch.setenv("DENGINE_STORE_WAIT", text)
     with pytest.raises(StoreError, match="Expected DENGINE_STORE_WAIT above 0 seconds"):
         DataEngine(store=tmp_path / "a.db")
@@ -52,7 +52,7 @@ print("closed")
 
 
 @pytest.mark.merge
-def test_on_a_full_disk_only_report_raises(tmp_path) -> None:
+def test_on_a_full_disk_only_report_raises(tmp_path):
     store = tmp_path / "engine.db"
     done = subprocess.run(
         [sys.executable, "-c", FULL_DISK, store], capture_output=True, text=True, check=False

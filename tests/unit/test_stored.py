@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Recipe, load_dataset, replay
+from dengine import DataEngine, Recipe, load_dataset, replay
 from dengine.errors import DataError
 from tests.support.driving import drive
 
@@ -11,13 +11,13 @@ RECIPE = Recipe("pca", radius=0.5, retrain_every=40)
 
 
 @pytest.fixture(scope="module")
-def stream(make_data) -> Dataset:
+def stream(make_data):
     return make_data(120, samples=60, seed=3)
 
 
 def test_corrected_labels_count_and_forgotten_and_bad_traces_do_not_and_a_part_that_came_twice_is_one(
     stream, tmp_path
-) -> None:
+):
     path = tmp_path / "cell.db"
     with DataEngine(recipe=RECIPE, store=path) as engine:
         traces = [*stream.X[:12], np.full(60, np.nan)]
@@ -36,7 +36,7 @@ def test_corrected_labels_count_and_forgotten_and_bad_traces_do_not_and_a_part_t
 
 def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_recording(
     stream, tmp_path
-) -> None:
+):
     path, spec = tmp_path / "cell.db", stream.spec
     with DataEngine(recipe=RECIPE, store=path, trace=spec) as engine:
         engine.set_shadow(True)
@@ -50,7 +50,7 @@ def test_in_the_shadow_mode_every_part_is_in_it_in_order_and_replays_as_its_reco
     assert np.array_equal(*lower)
 
 
-def test_a_store_without_a_label_is_refused(tmp_path) -> None:
+def test_a_store_without_a_label_is_refused(tmp_path):
     DataEngine(recipe=RECIPE, store=tmp_path / "new.db").close()
     with pytest.raises(DataError, match=r"labelled traces, .* has none; record some first"):
         load_dataset(tmp_path / "new.db")
