@@ -107,6 +107,9 @@ def test_an_earlier_version_answers_again(store):
     assert line_of("release", store) == "No version is pinned; nothing changed."
     failed = dengine("rollback", store, 9)
     assert (failed.exit_code, "load one of these: 1, 2, 3," in failed.stderr) == (1, True)
+    line_of("rollback", store, 1)
+    line_of("retrain", store)
+    assert document("status", store)["pinned"] == 0
 
 
 LIMITS = "0.05:0.1:-5:60:reject"
