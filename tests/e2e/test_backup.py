@@ -2,7 +2,6 @@
 is not taken for one.
 """
 
-import itertools
 import shutil
 import sqlite3
 import subprocess
@@ -11,33 +10,39 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, SqlStore
+from dengine import DataEngine, SqlStore
 from dengine.store import backup_store, verify_history
 from tests.support.command_line import dengine, document, line_of
 from tests.support.driving import learn
+from tests.support.stores import execute
 
 IN_STORE, IN_JOURNAL = 40, 25  # parts
 
 
+@contextmanager
+def held(file: Path) -> Iterator[None]:
+    """Another process holds the database, so that records wait in journals."""
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield
+        other.execute("ROLLBACK")
+
+
 @pytest.fixture
-def in_use(tmp_path: Path, data: Dataset) -> Iterator[DataEngine]:
-    """An engine whose newest labels are in its journal alone: another process holds the
-    database.
-    """
+def in_use(tmp_path, data):
+    """An engine whose newest labels are in its journal alone."""
     with DataEngine("pca", retrain_every=1000, store=str(tmp_path / "engine.db")) as engine:
         learn(engine, data, range(IN_STORE))
         engine.store.flush()
-        with closing(sqlite3.connect(tmp_path / "engine.db", isolation_level=None)) as other:
-            other.execute("BEGIN IMMEDIATE")
+        with held(tmp_path / "engine.db"):
             learn(engine, data, range(IN_STORE, IN_STORE + IN_JOURNAL))
             yield engine
-            other.execute("ROLLBACK")
 
 
 def labels_of(file: Path, cell: str = "cell") -> list[int]:
@@ -46,8 +51,8 @@ def labels_of(file: Path, cell: str = "cell") -> list[int]:
 
 
 def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_verifies(
-    tmp_path: Path, in_use: DataEngine, data: Dataset
-) -> None:
+    tmp_path, in_use, data
+):
     copy, n = tmp_path / "elsewhere" / "copy.db", IN_STORE + IN_JOURNAL
     copy.parent.mkdir()
     result = document("backup", tmp_path / "engine.db", "--out", copy)
@@ -63,19 +68,16 @@ def test_a_backup_of_a_store_in_use_holds_the_labels_of_its_journal_opens_and_ve
         assert engine.status().labels == n
 
 
-def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(
-    tmp_path: Path, data: Dataset
-) -> None:
+def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_on(tmp_path, data):
     acknowledged, ended = list[str](), threading.Event()
 
-    def work() -> None:
+    def work():
         with DataEngine("pca", retrain_every=10**6, store=tmp_path / "engine.db") as engine:
-            for i in itertools.count():
+            while not ended.is_set():
+                i = len(acknowledged)
                 decision = engine.decide(data.X[i % len(data)] + np.float32(1e-6 * i))
                 engine.report(decision.id, True)
                 acknowledged.append(decision.id)
-                if ended.is_set():
-                    return
 
     with ThreadPoolExecutor(1) as pool:
         working = pool.submit(work)
@@ -84,7 +86,6 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
                 while len(acknowledged) < 20 * n and working.running():
                     time.sleep(0.01)
                 before, copy = set(acknowledged), str(tmp_path / f"{n}.db")
-                assert len(before) >= 20 * n
                 backup_store(tmp_path / "engine.db", copy)
                 assert verify_history(copy).ok
                 with SqlStore(copy) as copied:
@@ -94,46 +95,41 @@ def test_what_was_acknowledged_before_a_backup_is_in_it_though_the_engine_goes_o
         finally:
             ended.set()
         working.result()
+        assert len(before) >= 80
 
 
-def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(
-    tmp_path: Path, in_use: DataEngine
-) -> None:
-    names = [tmp_path / name for name in ("engine.db", "first.db", "second.db")]
-    first = backup_store(*names[:2])
+def test_a_label_is_in_the_backup_once_though_store_and_journal_both_hold_it(tmp_path, in_use):
+    file, once, twice = (tmp_path / name for name in ("engine.db", "first.db", "second.db"))
+    first = backup_store(file, once)
     # What the journal holds is in the first copy by now.
-    shutil.copy(f"{names[0]}.cell.journal", f"{names[1]}.cell.journal")
-    second = backup_store(*names[1:])
+    shutil.copy(f"{file}.cell.journal", f"{once}.cell.journal")
+    second = backup_store(once, twice)
     assert (second.decisions, second.labels) == (first.decisions, first.labels)
-    assert labels_of(names[2]) == labels_of(names[1])
-    with SqlStore(str(names[2])) as store:
+    assert labels_of(twice) == labels_of(once)
+    with SqlStore(str(twice)) as store:
         assert "dead letter" not in [event.kind for event in store.events.newest()]
 
 
 def test_verify_says_what_waits_in_a_journal_and_of_a_plain_copy_that_there_is_none(
-    tmp_path: Path, in_use: DataEngine
-) -> None:
-    store, copy = tmp_path / "engine.db", tmp_path / "plain.db"
+    tmp_path, in_use
+):
+    store, copy, n = tmp_path / "engine.db", tmp_path / "plain.db", 2 * IN_JOURNAL
     for suffix in ("", "-wal"):
         shutil.copyfile(f"{store}{suffix}", f"{copy}{suffix}")
-    for file, text, n in (
-        (store, f"The journal of cell cell holds {2 * IN_JOURNAL} records", 2 * IN_JOURNAL),
-        (copy, "The journal of cell cell is not here", None),
-    ):
-        assert text in line_of("verify", file)
-        assert document("verify", file)["cells"][0]["waiting"] == n
+    for file, text, waiting in ((store, f"holds {n} records", n), (copy, "is not here", None)):
+        assert f"The journal of cell cell {text}" in line_of("verify", file)
+        assert document("verify", file)["cells"][0]["waiting"] == waiting
     alone = shutil.copyfile(store, tmp_path / "alone.db")  # without the log, which has its tables
     assert "dengine backup" in dengine("verify", alone).stderr
 
 
-def test_a_cell_moves_to_another_machine_by_backup_and_restore(
-    tmp_path: Path, in_use: DataEngine, data: Dataset, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_cell_moves_to_another_machine_by_backup_and_restore_unless_its_history_was_changed(
+    tmp_path, in_use, data, caplog
+):
     copy, there = tmp_path / "copy.db", tmp_path / "elsewhere" / "engine.db"
     there.parent.mkdir()
     line_of("backup", tmp_path / "engine.db", "--out", copy)
-    restored = document("restore", copy, "--store", there)
-    verified = document("verify", there)
+    restored, verified = document("restore", copy, "--store", there), document("verify", there)
     assert (verified["ok"], verified["cells"]) == (True, [restored["cells"][0] | {"waiting": 0}])
     caplog.clear()
     with DataEngine.open(there) as engine:
@@ -143,52 +139,41 @@ def test_a_cell_moves_to_another_machine_by_backup_and_restore(
     assert caplog.messages == []
     assert document("verify", there)["ok"]
     assert "name another file" in dengine("restore", copy, "--store", there).output
-
-
-def test_a_copy_whose_history_was_changed_is_not_restored(
-    tmp_path: Path, in_use: DataEngine
-) -> None:
-    copy, there = tmp_path / "copy.db", tmp_path / "there.db"
-    backup_store(tmp_path / "engine.db", copy)
-    with closing(sqlite3.connect(copy)) as connection, connection:
-        connection.execute("UPDATE label SET success = 1 - success WHERE seq = 3")
-    result = dengine("restore", copy, "--store", there)
+    execute(copy, "UPDATE label SET success = 1 - success WHERE seq = 3")
+    result = dengine("restore", copy, "--store", tmp_path / "third.db")
     assert (result.exit_code, "found faults" in result.output) == (1, True)
-    assert not there.exists()
+    assert not (tmp_path / "third.db").exists()
 
 
 # Of a journal that cannot be read no backup is made.
-@pytest.mark.parametrize(
-    ("store", "out", "words"),
-    [
-        ("engine.db", "engine.db", "is a database"),
-        ("engine.db", "other.db", "is a database"),
-        ("engine.db", "notes.txt", "exists"),
-        ("engine.db", "missing/copy.db", "choose a folder that exists"),
-        ("nothing.db", "copy.db", "found no file"),
-        ("notes.txt", "copy.db", "something else"),
-        ("other.db", "copy.db", "found another file"),
-    ],
-)
-def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, store: str, out: str, words: str
-) -> None:
+# The store, the copy and the reason. Of a journal that cannot be read no backup is made.
+REFUSED = """
+engine.db   engine.db        is a database
+engine.db   other.db         is a database
+engine.db   notes.txt        exists
+engine.db   missing/copy.db  choose a folder that exists
+nothing.db  copy.db          found no file
+notes.txt   copy.db          something else
+other.db    copy.db          found another file
+"""
+
+
+def test_a_backup_that_cannot_be_made_says_why_and_leaves_nothing_behind(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("engine.db", "other.db"):
         DataEngine("pca", store=name).close()
     for name in ("notes.txt", "other.db.cell.journal"):
         Path(name).write_text("mine\n" * 100, encoding="utf-8")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    result = dengine("backup", store, "--out", out)
-    assert result.exit_code == 1
-    assert words in result.output
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    for line in REFUSED.strip().splitlines():
+        store, out, words = line.split(maxsplit=2)
+        result = dengine("backup", store, "--out", out)
+        assert (result.exit_code, words in result.output) == (1, True), line
+        assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of a file there")
-def test_a_backup_that_has_no_room_names_the_copy_and_leaves_nothing_behind(
-    tmp_path: Path, in_use: DataEngine
-) -> None:
+def test_a_backup_that_has_no_room_names_the_copy_and_leaves_nothing_behind(tmp_path, in_use):
     program = """
 import resource, signal, sys
 from dengine.cli import main
@@ -204,21 +189,18 @@ main()
     assert list(tmp_path.glob("*copy*")) == []
 
 
-def test_every_cell_of_a_file_is_in_its_backup(tmp_path: Path, data: Dataset) -> None:
-    file, copy = str(tmp_path / "line.db"), tmp_path / "copy.db"
-    parts = {"A": range(10), "B": range(10, 30)}
+def test_every_cell_of_a_file_is_in_its_backup(tmp_path, data):
+    file, parts = tmp_path / "line.db", {"A": range(10), "B": range(10, 30)}
     with ExitStack() as cells:
-        engines = [
-            cells.enter_context(DataEngine("pca", retrain_every=1000, store=SqlStore(file, name)))
-            for name in parts
-        ]
-        for engine, rows in zip(engines, parts.values(), strict=True):
+        engines = {}
+        for name, rows in parts.items():
+            engine = DataEngine("pca", retrain_every=1000, store=SqlStore(str(file), name))
+            engines[name] = cells.enter_context(engine)
             learn(engine, data, rows[:1])  # it sets the TraceSpec, which waits for the store
             engine.store.flush()
-        other = cells.enter_context(closing(sqlite3.connect(file, isolation_level=None)))
-        other.execute("BEGIN IMMEDIATE")
-        for engine, rows in zip(engines, parts.values(), strict=True):
-            learn(engine, data, rows[1:])
-        report = backup_store(file, copy)
+        cells.enter_context(held(file))
+        for name, engine in engines.items():
+            learn(engine, data, parts[name][1:])
+        report = backup_store(file, tmp_path / "copy.db")
     assert (report.decisions, report.labels, report.without_journal) == (30, 30, ())
-    assert {name: len(labels_of(copy, name)) for name in parts} == {"A": 10, "B": 20}
+    assert [len(labels_of(tmp_path / "copy.db", name)) for name in parts] == [10, 20]

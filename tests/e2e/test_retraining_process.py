@@ -5,7 +5,6 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import replace
 
@@ -13,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from dengine import DataEngine, Dataset, Policy, Recipe
+from dengine import DataEngine, Policy, Recipe
 from dengine.engine import trainer
 from dengine.serve.retraining import RetrainingProcess
-from tests.support.driving import learn
+from tests.support.driving import evidence, learn
 
 CONV = replace(
     Recipe.load("conv"), retrain_every=30, max_steps=20, policy=Policy(alpha=0.1, lower_bound=0.9)
@@ -25,7 +24,7 @@ PCA = replace(CONV, reducer="pca", params={})
 
 
 @pytest.fixture(scope="module")
-def running() -> Iterator[list[RetrainingProcess]]:
+def running():
     """The process that runs, which serves tests until one of them ends it; its start takes seconds."""
     processes: list[RetrainingProcess] = []
     yield processes
@@ -34,16 +33,11 @@ def running() -> Iterator[list[RetrainingProcess]]:
 
 
 @pytest.fixture
-def process(running: list[RetrainingProcess]) -> RetrainingProcess:
+def process(running):
     if not running:
         running.append(RetrainingProcess())
         running[0].submit(os.getpid).result(300)
     return running[0]
-
-
-def learn_and_settle(engine: DataEngine, data: Dataset) -> None:
-    learn(engine, data, range(40))
-    settle(engine)
 
 
 def settle(engine: DataEngine) -> None:
@@ -53,8 +47,8 @@ def settle(engine: DataEngine) -> None:
 
 
 def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_arrive_writable(
-    process: RetrainingProcess,
-) -> None:
+    process,
+):
     x = torch.arange(60_000.0).reshape(300, 200)
     sent = x, x.t()[3:, 5:], torch.empty(0), torch.nn.Linear(3, 4).weight, x.numpy()[:, ::2]
     for received, was in zip(process.submit(copy.copy, sent).result(300), sent, strict=True):
@@ -69,42 +63,23 @@ def test_a_call_is_answered_there_its_error_raised_and_its_arrays_and_tensors_ar
     assert process.submit(divmod, 17, 5).result(300) == (3, 2)
 
 
-def test_many_calls_at_once_are_all_answered(process: RetrainingProcess) -> None:
-    calls = [process.submit(int, i) for i in range(500)]
-    assert [call.result(60) for call in calls] == list(range(500))
-
-
-def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(
-    process: RetrainingProcess, data: Dataset
-) -> None:
+def test_a_conv_retrain_there_ends_where_one_in_a_thread_ends(process, data, caplog):
     decided = []
-    with ThreadPoolExecutor(1) as thread:
+    with ThreadPoolExecutor(1) as thread, caplog.at_level(logging.INFO, "dengine"):
         for executor in (process, thread):
             engine = DataEngine(recipe=CONV, replaying=True, executor=executor)
-            learn_and_settle(engine, data)
+            learn(engine, data, range(40))
+            settle(engine)
             assert engine.version == 1
-            decided.append(
-                [
-                    (item.embedding, item.lower, item.upper)
-                    for item in map(engine.decide, data.X[40:60])
-                ]
-            )
+            decided.append([evidence(engine.decide(x)) for x in data.X[40:60]])
     assert decided[0] == decided[1]  # bit for bit
-
-
-def test_the_log_tells_when_the_first_retrain_begins(
-    process: RetrainingProcess, data: Dataset, caplog: pytest.LogCaptureFixture
-) -> None:
-    with caplog.at_level(logging.INFO, "dengine"):
-        learn_and_settle(DataEngine(recipe=CONV, executor=process), data)
-    (begun,) = [line for line in caplog.messages if "retrain begins" in line]
-    assert "the first retrain begins, on 30 labels" in begun
+    assert caplog.text.count("the first retrain begins, on 30 labels") == 2
 
 
 @pytest.mark.merge
 def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while_it_imports(
-    process: RetrainingProcess, data: Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    process, data, monkeypatch
+):
     pids = [process.submit(os.getpid).result(300)]
     engine = DataEngine(recipe=PCA, executor=process)
     os.kill(pids[0], signal.SIGKILL)
@@ -136,9 +111,7 @@ def test_a_process_that_died_or_hangs_is_started_again_and_no_change_waits_while
     assert len({*pids}) == 3
 
 
-def test_it_ends_with_whoever_made_it_also_at_work(
-    process: RetrainingProcess, running: list[RetrainingProcess]
-) -> None:
+def test_it_ends_with_whoever_made_it_also_at_work(process, running):
     running.clear()
     with process:
         pid = process.submit(os.getpid).result(300)

@@ -16,7 +16,7 @@ URL = os.environ.get("DENGINE_TEST_POSTGRES", "")
 pytestmark = pytest.mark.skipif(not URL, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
 
 
-def test_cells_that_open_an_empty_database_at_once_all_succeed() -> None:
+def test_cells_that_open_an_empty_database_at_once_all_succeed():
     admin = sa.create_engine(URL, isolation_level="AUTOCOMMIT")
     name = f"fresh_{uuid.uuid4().hex}"
     with admin.connect() as connection:
@@ -32,12 +32,12 @@ def test_cells_that_open_an_empty_database_at_once_all_succeed() -> None:
     assert len(opened) == 4
 
 
-def test_the_short_url_uses_psycopg_3() -> None:
+def test_the_short_url_uses_psycopg_3():
     with SqlStore(URL.replace("postgresql+psycopg", "postgresql"), uuid.uuid4().hex) as store:
         assert store.settings.read() == {}
 
 
-def test_other_programs_tables_may_stand_beside_ours() -> None:
+def test_other_programs_tables_may_stand_beside_ours():
     admin = sa.create_engine(URL)
     with admin.begin() as connection:
         connection.execute(sa.text("CREATE TABLE IF NOT EXISTS someone_elses (id int)"))

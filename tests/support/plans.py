@@ -1,37 +1,34 @@
-"""How SQLite finds what a store asks for: the plan of every query, caught on its way to the
-database.
-"""
+"""How SQLite finds what a store asks for, by the plan of every query on its way to the database."""
 
+import re
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
 
 import sqlalchemy as sa
 
 
 @contextmanager
-def plans(database: Path) -> Iterator[list[tuple[str, list[str]]]]:
-    """Fill a list, once its block has ended, with the SELECTs that were sent in it and the steps of
-    their plans.
+def along_indexes(database: Path, never: str) -> Iterator[list[str]]:
+    """Assert that the plan of no SELECT of the block has a step with one of these words; gives the
+    list that the SELECTs fill.
     """
-    sent: list[tuple[str, Any]] = []
-    results: list[tuple[str, list[str]]] = []
+    sent: list[str] = []
+    parameters: list[object] = []
 
-    def catch(
-        connection: Any, cursor: Any, statement: str, parameters: Any, context: Any, many: bool
-    ) -> None:
+    def catch(connection, cursor, statement, values, *_) -> None:
         if statement.startswith("SELECT"):
-            sent.append((statement, parameters))
+            sent.append(statement)
+            parameters.append(values)
 
     sa.event.listen(sa.Engine, "before_cursor_execute", catch)
     try:
-        yield results
+        yield sent
     finally:
         sa.event.remove(sa.Engine, "before_cursor_execute", catch)
-    plain = sqlite3.connect(database)
-    for statement, parameters in sent:
-        rows = plain.execute(f"EXPLAIN QUERY PLAN {statement}", parameters).fetchall()
-        results.append((statement, [row[-1] for row in rows]))
-    plain.close()
+    with closing(sqlite3.connect(database)) as plain:
+        for query in zip(sent, parameters, strict=True):
+            plan = [row[-1] for row in plain.execute("EXPLAIN QUERY PLAN " + query[0], query[1])]
+            assert plan, query
+            assert not re.search(never, str(plan)), (query, plan)

@@ -43,16 +43,16 @@ def execute(file: Path, *statements: str) -> None:
 
 def put_decision(
     store: SqlStore,
-    decision: Decision,
-    trace: np.ndarray,
+    made: Decision | str,
+    values: np.ndarray | None = None,
     content_hash: int = 1,
     quarantined: bool = False,
-) -> None:
-    """A decision and its trace, (C, T) or (T,)."""
-    values = np.array(trace, dtype=np.float32, ndmin=2)
-    store.apply_records(
-        [StoredDecision(decision, values, content_hash, quarantined, store.clock())]
-    )
+) -> np.ndarray:
+    """A decision, or a plain one of this name, and its trace, (C, T) or (T,); returns the trace."""
+    values = np.array(trace() if values is None else values, dtype=np.float32, ndmin=2)
+    made = decision(made) if isinstance(made, str) else made
+    store.apply_records([StoredDecision(made, values, content_hash, quarantined, store.clock())])
+    return values
 
 
 def labelled(item: StoredDecision, success: bool) -> list[StoredDecision | NewLabel]:
@@ -63,19 +63,17 @@ def labelled(item: StoredDecision, success: bool) -> list[StoredDecision | NewLa
 
 def put_labels(store: SqlStore, *labels: NewLabel) -> list[int]:
     """Labels of decisions that are there; returns their numbers, in the order given."""
-    now, taken = store.clock() if labels else 0.0, []
+    now, taken = store.clock(), []
     for label in labels:
         stored = store.decisions.get(label.decision_id, trace=False)
-        taken.append(
-            replace(label, time=now, content_hash=stored.content_hash, decided=stored.time)
-        )
+        known = {"content_hash": stored.content_hash, "decided": stored.time}
+        taken.append(replace(label, time=now, **known))
     numbers = dict(store.apply_records(taken))
     return [numbers[label.decision_id] for label in labels]
 
 
 def put_label(
-    store: SqlStore, name: str, success: bool, source: Source = Source.VERIFICATION, version: int = 0,
-    point: np.ndarray | None = None, *, silent: int = 0,
+    store: SqlStore, name: str, success=True, source=Source.VERIFICATION, version=0, point=None, silent=0
 ) -> int:  # fmt: skip
     """One label; returns its number."""
     return put_labels(store, NewLabel(name, success, source, version, point, silent))[0]

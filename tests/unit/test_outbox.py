@@ -6,16 +6,17 @@ import errno
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from dengine.errors import NotTakenError, StoreError
 from dengine.records import Action, Reason, Source
-from dengine.store import NewLabel, SqlStore, StoredDecision, draining, lookup
+from dengine.store import SqlStore, StoredDecision, draining, lookup
 from dengine.store.journal import Journal
 from dengine.store.journalled import JournalledStore
 from dengine.store.memory import MemoryStore
@@ -27,15 +28,12 @@ from tests.support.stores import decision, label, report, trace
 
 @contextmanager
 def opened(folder: Path) -> Iterator[JournalledStore]:
-    box = JournalledStore(SqlStore(str(folder / "cell.db"), wait=10.0), window=10)
-    try:
+    with closing(JournalledStore(SqlStore(str(folder / "cell.db"), wait=10.0), window=10)) as box:
         yield box
-    finally:
-        box.close()
 
 
 @pytest.fixture
-def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[JournalledStore]:
+def box(tmp_path, monkeypatch):
     """Its records wait in the journal until somebody asks for them in the store."""
     monkeypatch.setattr(draining, "DRAIN_SECONDS", 1e6)
     with opened(tmp_path) as box:
@@ -45,8 +43,15 @@ def box(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[JournalledS
         yield box
 
 
-def stored(name: str) -> StoredDecision:
-    return StoredDecision(decision(name), trace(), 1, False, time.time())
+def stored(name: str, *kind) -> StoredDecision:
+    return StoredDecision(decision(name, *kind), trace(), 1, False, time.time())
+
+
+def record(box: Outbox, name: str, **given) -> StoredDecision:
+    """A decision and its label."""
+    item = box.record_decision(stored(name))
+    box.record_labels([(item, label(name, **given))])
+    return item
 
 
 def damage(folder: Path, *texts: bytes) -> None:
@@ -62,82 +67,52 @@ def events(box: Outbox, kind: str) -> list[str]:
     return [event.text for event in box.store.events.newest() if event.kind == kind]
 
 
-def test_a_damaged_label_that_waits_alone_is_stored_from_memory(
-    box: Outbox, tmp_path: Path
-) -> None:
-    item = box.record_decision(stored("part 1"))
-    box.flush()
-    box.record_labels([(item, label("part 1"))])
-    box.sync()
-    damage(tmp_path, b"NewLabel")
-    assert box.request_label_drain()
-    box.drain()
-    assert (box.request_label_drain(), box.fault, box.is_drained) == (False, "", True)
-    assert box.store.decisions.get("part 1").success is True
-    assert box.store.labels.newest() == 1
-    (text,) = events(box, "journal")
-    assert text.startswith("1 records of ")
-    assert text.endswith("are stored from memory; decisions that are lost: none.")
-
-
-def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(
-    box: Outbox, tmp_path: Path
-) -> None:
-    items = [box.record_decision(stored(f"part {i}")) for i in range(4)]
-    box.record_labels([(item, label(item.decision.id)) for item in items[:2]])
+def test_every_damaged_record_is_stored_from_memory_and_those_beside_it_as_ever(box, tmp_path):
+    items = [record(box, f"part {i}") for i in range(2)]
+    for i in (2, 3):
+        box.record_decision(stored(f"part {i}"))
     for text in ("the first", "the last"):
         box.record_event("hello", text)
     box.sync()
     damage(tmp_path, b'part 0", "action', b'part 2", "action', b"NewLabel", b"the last")
+    assert box.request_label_drain()
     box.drain()
+    assert (box.request_label_drain(), box.fault, box.is_drained) == (False, "", True)
     found = [box.store.decisions.get(f"part {i}") for i in range(4)]
     assert [item.success for item in found] == [True, True, None, None]
     np.testing.assert_array_equal(found[0].trace, items[0].trace)
-    assert events(box, "hello") == ["the first", "the last"]
+    assert (box.store.labels.newest(), events(box, "hello")) == (2, ["the first", "the last"])
     (text,) = events(box, "journal")
     assert text.startswith("4 records of ")
+    assert text.endswith("are stored from memory; decisions that are lost: none.")
 
 
 def test_a_damaged_decision_that_is_not_in_memory_any_more_is_named_in_an_event(
-    box: Outbox, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    box, tmp_path, monkeypatch
+):
     monkeypatch.setattr(lookup, "N_RECENT", 1)
     for name in ("part 1", "part 2"):
-        box.record_labels([(box.record_decision(stored(name)), label(name))])
+        record(box, name)
     box.sync()
+    with monkeypatch.context() as patch:
+        failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+        patch.setattr(OwnedFile, "read", failing)  # the disk does not give it back
+        with pytest.raises(StoreError, match=r"Could not use the journal .*Input/output error"):
+            box.find_decision("part 1")
     assert box.find_decision("part 1").decision.id == "part 1"  # in the journal alone
     damage(tmp_path, b'part 1", "action')
     box.drain()
     assert (box.fault, box.request_label_drain()) == ("", False)
     assert box.store.decisions.get("part 1") is box.find_decision("part 1") is None
     assert box.store.decisions.get("part 2").success is True
-    (text,) = events(box, "lost")
+    (text,), (letter,) = events(box, "lost"), events(box, "dead letter")
     assert text.endswith("decisions that are lost: part 1.")
-    (letter,) = events(box, "dead letter")
     assert "a label, success from verification, on 'part 1'" in letter
 
 
-def test_a_journal_that_the_disk_does_not_give_back_is_a_fault_of_the_store(
-    box: Outbox, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lookup, "N_RECENT", 1)
-    for name in ("part 1", "part 2"):
-        box.record_decision(stored(name))
-    box.sync()
-
-    def fail(self: OwnedFile, size: int, offset: int) -> bytes:
-        raise OSError(errno.EIO, "Input/output error")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(OwnedFile, "read", fail)
-        with pytest.raises(StoreError, match=r"Could not use the journal .*Input/output error"):
-            box.find_decision("part 1")
-    assert box.find_decision("part 1").decision.id == "part 1"
-
-
 def test_a_journal_that_was_damaged_while_its_engine_ran_is_no_fault_at_the_next_start(
-    box: Outbox, tmp_path: Path
-) -> None:
+    box, tmp_path
+):
     box.record_decision(stored("part 1"))
     box.sync()
     damage(tmp_path, b'part 1", "action')
@@ -148,67 +123,52 @@ def test_a_journal_that_was_damaged_while_its_engine_ran_is_no_fault_at_the_next
         assert again.verify_all_reason == ""
 
 
-def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(
-    box: Outbox, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*records: object) -> list[int]:
-        raise StoreError("the disk is full")
-
-    monkeypatch.setattr(Journal, "append", fail)
+def test_a_journal_that_cannot_be_written_is_tried_again_and_says_why(box, monkeypatch):
     box.record_decision(stored("a"))
-    with pytest.raises(NotTakenError, match="the disk is full"):
-        box.sync()
+    with monkeypatch.context() as patch:
+        patch.setattr(Journal, "append", Mock(side_effect=StoreError("the disk is full")))
+        with pytest.raises(NotTakenError, match="the disk is full"):
+            box.sync()
     assert box.fault == "the disk is full"
-    monkeypatch.undo()
     box.sync()
     assert box.fault == ""
 
 
 @pytest.fixture(params=["memory", "file"])
-def either(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Outbox]:
+def either(request, tmp_path):
     """An outbox of each kind."""
     url = None if request.param == "memory" else str(tmp_path / "cell.db")
-    box = open_outbox(SqlStore(url, wait=10.0), window=10)
-    assert isinstance(box, MemoryStore if url is None else JournalledStore)
-    yield box
-    box.close()
+    with closing(open_outbox(SqlStore(url, wait=10.0), window=10)) as box:
+        assert isinstance(box, MemoryStore if url is None else JournalledStore)
+        yield box
 
 
-def numbered(box: Outbox, *labels: NewLabel) -> list[NewLabel]:
-    """Labels with the next numbers of a cell."""
-    return [replace(label, seq=box.number_label()) for label in labels]
-
-
-def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either: Outbox) -> None:
+def test_what_is_recorded_is_found_at_once_and_stored_in_its_order(either):
     assert either.find_decision("a") is None
     items = [either.record_decision(stored(name)) for name in "abc"]
     assert [item.number for item in items] == [1, 2, 3]
-    assert either.n_decisions == 3
-    assert either.find_decision("b").decision.id == "b"
-    labels = numbered(either, label("b", False), label("a"))
-    assert [label.seq for label in labels] == [1, 2]
+    assert (either.n_decisions, either.find_decision("b").decision.id) == (3, "b")
+    assert [either.number_label() for _ in range(3)] == [1, 2, 3]
+    labels = replace(label("b", False), seq=2), replace(label("a"), seq=3)  # whatever was before
     either.record_labels(zip((items[1], items[0]), labels, strict=True))
     assert either.find_decision("b", unsynced=True).success is False
     either.record_event("hello", "there")
     either.drain()
     labelled = either.store.labels.with_traces()
-    assert (labelled.seq.tolist(), labelled.labels.tolist()) == ([1, 2], [0, 1])
-    assert either.pop_label_numbers() == []
-    assert events(either, "hello") == ["there"]
-    assert either.find_earlier("c").decision.id == "c"
-    assert either.find_earlier("d") is None
+    assert (labelled.seq.tolist(), labelled.labels.tolist()) == ([2, 3], [0, 1])
+    assert (either.pop_label_numbers(), events(either, "hello")) == ([], ["there"])
+    assert (either.find_earlier("c").decision.id, either.find_earlier("d")) == ("c", None)
     assert (either.is_drained, either.request_label_drain()) == (True, False)
     assert (either.lag, either.fault, either.verify_all_reason) == (0.0, "", "")
 
 
-def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either: Outbox) -> None:
-    accepted = replace(stored("a"), decision=decision("a", Action.ACCEPT, Reason.CERTAIN))
-    item = either.record_decision(accepted)
+def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either):
+    item = either.record_decision(stored("a", Action.ACCEPT, Reason.CERTAIN))
     either.record_labels([(item, label("a", True, source=Source.CONFIRMED))])
     either.drain()
     confirmed = either.find_decision("a")
     either.record_labels([(confirmed, label("a", False, source=Source.STOP))])
-    either.record_labels([(either.record_decision(stored("b")), label("b"))])
+    record(either, "b")
     either.drain()
     assert either.store.decisions.get("b").label_seq == 2
     assert either.store.decisions.get("a").success is False
@@ -216,7 +176,7 @@ def test_a_late_stop_corrects_its_confirmation_and_takes_no_number(either: Outbo
     assert [event.kind for event in either.store.events.newest()] == ["late stop"]
 
 
-def test_a_version_is_stored_with_its_arrays_as_they_were(either: Outbox) -> None:
+def test_a_version_is_stored_with_its_arrays_as_they_were(either):
     weights = np.zeros(3)
     future = either.store_version(report(1), 7, {"w": weights})
     assert either.wait_for_result(future) == 1
@@ -225,12 +185,9 @@ def test_a_version_is_stored_with_its_arrays_as_they_were(either: Outbox) -> Non
     assert (version.version, version.last_seq, version.state["w"].tolist()) == (1, 7, [0.0] * 3)
 
 
-def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(
-    either: Outbox, tmp_path: Path
-) -> None:
+def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(either, tmp_path):
     either.check_usable()
-    item = either.record_decision(stored("a"))
-    either.record_labels([(item, *numbered(either, label("a")))])
+    record(either, "a")
     for _ in range(2):
         either.close()
     with pytest.raises(StoreError, match="after close"):
@@ -239,44 +196,33 @@ def test_a_closed_outbox_takes_nothing_and_what_it_took_can_be_read(
     if isinstance(either, JournalledStore):
         again = SqlStore(str(tmp_path / "cell.db"))
     assert again.decisions.get("a").success is True
-    other = open_outbox(again, window=10)
-    assert (other.n_decisions, other.number_label()) == (1, 2)
-    other.close()
+    with closing(open_outbox(again, window=10)) as other:
+        assert (other.n_decisions, other.number_label()) == (1, 2)
 
 
-def test_a_label_keeps_its_number_whatever_the_one_before_was(either: Outbox) -> None:
-    skipped, kept = numbered(either, label("a"), label("a"))
-    assert (skipped.seq, kept.seq) == (1, 2)
-    either.record_labels([(either.record_decision(stored("a")), kept)])
-    either.record_labels([(either.record_decision(stored("b")), label("b"))])  # as of before
-    either.drain()
-    assert [either.store.decisions.get(name).label_seq for name in "ab"] == [2, 3]
-
-
-def test_labels_of_a_product_are_numbered_by_the_store(tmp_path: Path) -> None:
+def test_labels_of_a_product_are_numbered_by_the_store(tmp_path):
     store = SqlStore(str(tmp_path / "cell.db"), product="gear", wait=10.0)
-    box = open_outbox(store, window=10)
-    labels = numbered(box, label("a"), label("b"))
-    assert [label.seq for label in labels] == [-1, -2]
-    box.record_labels((box.record_decision(stored(one.decision_id)), one) for one in labels)
-    box.drain()
-    assert box.pop_label_numbers() == [("a", 1), ("b", 2)]
-    assert box.pop_label_numbers() == []
-    box.close()
+    with closing(open_outbox(store, window=10)) as box:
+        for name, number in (("a", -1), ("b", -2)):
+            assert box.number_label() == number
+            box.record_labels(
+                [(box.record_decision(stored(name)), replace(label(name), seq=number))]
+            )
+        box.drain()
+        assert box.pop_label_numbers() == [("a", 1), ("b", 2)]
+        assert box.pop_label_numbers() == []
     with pytest.raises(StoreError, match="no product of a store in memory"):
         SqlStore(product="gear")
 
 
-def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path: Path) -> None:
-    file = str(tmp_path / "cell.db")
-    SqlStore(file).close()
+def test_an_outbox_that_only_reads_says_so_and_stores_a_note(tmp_path):
     with opened(tmp_path) as owner:
         owner.record_decision(stored("a"))
         owner.drain()
-        reader = open_outbox(SqlStore(file), window=10, reading=True)
-        with pytest.raises(StoreError, match="opened for reading"):
-            reader.check_usable()
-        assert reader.find_decision("a").decision.id == "a"
-        reader.record_event("export", "a file")
-        reader.close()
+        store = SqlStore(str(tmp_path / "cell.db"))
+        with closing(open_outbox(store, window=10, reading=True)) as reader:
+            with pytest.raises(StoreError, match="opened for reading"):
+                reader.check_usable()
+            assert reader.find_decision("a").decision.id == "a"
+            reader.record_event("export", "a file")
         assert [event.text for event in owner.store.events.newest()] == ["a file"]
