@@ -102,31 +102,13 @@ def claiming(shape: str) -> bytes:
     return buffer.getvalue()
 
 
-def with_field(local: int, central: int, value: int) -> bytes:
-    """An archive whose members' heads say something else at a place: their flags, or how they are
-    packed.
-    """
-    content = npz(X=np.zeros((3, 9)), y=np.ones(3))
-    for magic, place in ((b"PK\x03\x04", local), (b"PK\x01\x02", central)):
-        pattern = re.escape(magic) + b".{%d}" % (place - 4)
-        content = re.sub(
-            b"(%s).." % pattern, rb"\1" + re.escape(struct.pack("<H", value)), content, flags=re.S
-        )
-    return content
-
-
 CLAIMS = f"(10**6,) (1000000000000,) (-1,) (3,-3) 'x' (2.5,) {'9' * 4400} {'(' * 300}"
-ARCHIVES = [
-    *((claiming(shape), "Cannot read") for shape in CLAIMS.split()),
-    *((with_field(8, 10, method), "Cannot read") for method in (1, 12, 65535)),
-    (with_field(6, 8, 1), "is encrypted"),
-]
 
 
-@pytest.mark.parametrize(("content", "text"), ARCHIVES, ids=range(len(ARCHIVES)))
-def test_an_archive_that_cannot_be_what_it_says_is_a_data_error(tmp_path, content, text):
-    (tmp_path / "data.npz").write_bytes(content)
-    with pytest.raises(DataError, match=text):
+@pytest.mark.parametrize("shape", CLAIMS.split(), ids=range(8))
+def test_an_archive_that_cannot_be_what_it_says_is_a_data_error(tmp_path, shape):
+    (tmp_path / "data.npz").write_bytes(claiming(shape))
+    with pytest.raises(DataError, match="Cannot read"):
         load_dataset(tmp_path / "data.npz")
 
 
@@ -137,7 +119,7 @@ def test_where_every_version_is_damaged_the_engine_opens_without_one_and_says_so
     with DataEngine("pca", retrain_every=60, store=path) as engine:
         learn(engine, data, range(len(data)))
     whole = npz(a=np.zeros(1))
-    for state in (b"", b"PK", claiming("(1000000000000,)"), with_field(8, 10, 99), whole[:-9]):
+    for state in (b"", b"PK", claiming("(1000000000000,)"), whole[:-9]):
         with sqlite3.connect(path) as connection:
             connection.execute("UPDATE model_version SET state = ?", (state,))
         with DataEngine.open(path) as engine:

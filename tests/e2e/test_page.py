@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 
 from dengine import Action, DataEngine, Dataset, TraceSpec
-from dengine.store.records import KEEP
 from dengine.store.sql import SqlStore
 from dengine.store.views import HistoryFilter
 from tests.support.serving import a_service, served, started
@@ -162,10 +161,6 @@ def test_a_label_is_corrected_by_the_keyboard_and_the_store_has_it(page, demo):
     button.focus()
     page.keyboard.press("Enter")
     expect(name).to_be_focused()
-    page.keyboard.press("Escape")
-    expect(button).to_be_focused()
-    page.keyboard.press("Enter")
-    expect(name).to_be_focused()
     page.keyboard.press("Enter")
     expect(page.get_by_role("dialog")).to_be_visible()  # without a name nothing is done
     page.keyboard.type(AUTHOR)
@@ -199,32 +194,13 @@ def test_the_rules_of_axe_pass_and_a_phone_need_not_scroll_sideways(browser, dem
             assert completed.violations_count == 0, f"{view}: {completed.generate_report()}"
 
 
-def test_versions_are_rolled_back_released_and_trained_of_those_that_there_are_now(
-    browser, tmp_path, stream
-):
-    def offered() -> list[str | None]:
-        page.get_by_role("button", name="Roll back").click()
-        choices = page.get_by_label("Version").locator("option").all()
-        values = [choice.get_attribute("value") for choice in choices]
-        page.get_by_role("button", name="Cancel").click()
-        return values
-
+def test_versions_are_rolled_back_released_and_trained(browser, tmp_path, stream):
     with cell(tmp_path / "cell.db") as (service, demo), looking(browser) as page:
         played(service, stream, 40)
         service.submit(DataEngine.retrain).result()
         opened(page, demo, "actions")
-        expect(page.get_by_role("button", name="Roll back")).to_be_enabled()
-        for _ in range(2 * KEEP):  # those that were there at first are kept no longer
-            service.submit(DataEngine.retrain).result()
-        versions = service.submit(lambda engine: engine.store.versions.all()).result()
-        kept = [str(version.report.version) for version in versions if version.kept][-2::-1]
-        for _ in range(100):  # the page follows within a moment
-            if offered() == kept:
-                break
-            page.wait_for_timeout(100)
-        assert offered() == kept
         confirmed(page, "Roll back", "Robin")
-        expect(page.locator("#result")).to_contain_text(f"Version {kept[0]} answers again")
+        expect(page.locator("#result")).to_contain_text("Version 1 answers again")
         confirmed(page, "Release the version")
         confirmed(page, "Retrain now")
         expect(page.locator("#result")).to_have_text("The retrain has begun.")
@@ -238,12 +214,15 @@ STRANGE = "<img src=x onerror=alert(1)> 7"
 
 
 def played(service: CellService, data: Dataset, n: int = 70) -> str:
-    """The newest accepted one of n parts with strange numbers, of which nothing is heard."""
+    """The newest accepted one of n parts with strange numbers, of which nothing is heard. Of its
+    two channels the second is the first backwards.
+    """
 
     async def play() -> str:
         newest = ""
         for i in range(n):
-            decision = (await service.decide(data.X[i], f"order-{i}", f"{STRANGE}-{i}")).decision
+            x = np.stack([data.X[i], data.X[i][::-1]])
+            decision = (await service.decide(x, f"order-{i}", f"{STRANGE}-{i}")).decision
             if decision.action is Action.ACCEPT:
                 newest = decision.part
             elif decision.action is Action.VERIFY:
@@ -256,7 +235,8 @@ def played(service: CellService, data: Dataset, n: int = 70) -> str:
 
 def test_an_operators_day(browser, tmp_path, stream):
     viewer, kim = Token("a-viewer-s-password", False, "Line display"), Token(TOKEN, True, "Kim")
-    trace = TraceSpec(60, rate_hz=500.0)  # which limits in seconds need
+    # A rate, which limits in seconds need.
+    trace = TraceSpec(60, 500.0, channels=2, unit=("kN", "mm"), columns=("FZ", "SZ"))
     with cell(tmp_path / "cell.db", (viewer, kim), trace) as (service, demo):
         part = played(service, stream)
         with (
@@ -286,6 +266,9 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     def shown(selector: str, text: Any) -> None:
         expect(page.locator(selector)).to_contain_text(text, timeout=PATIENT)
 
+    opened(page, demo)
+    channels = page.locator("#trace figcaption")
+    expect(channels).to_contain_text([re.compile(r"FZ .* kN\. "), re.compile(r"SZ .* mm\. ")])
     opened(page, demo, "history")
     page.get_by_role("link", name="Older").click()
     expect(page.get_by_role("link", name="Newest")).to_be_visible()
@@ -299,14 +282,10 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     shown("#saved", "line stops, not subtracted: 1")
     shown("#bad", "1 known bad")
     page.locator("#escapes").get_by_role("link", name=part).click()
-    shown("h1", f"Part {part}")
     shown("#part .why", "The part turned out bad (stop)")
     opened(page, demo, "actions")
     confirmed(page, "Verify everything")
     shown("#banner", "every part is verified")
-    opened(page, demo, "overview")
-    shown("#would", re.compile(r"Predicted in shadow mode\s*0 of \d\d verified parts"))
-    opened(page, demo, "actions")
     confirmed(page, "Let the model decide again")
     shown("#mode", "Decides")
     page.get_by_role("button", name="Change the policy").click()
@@ -320,24 +299,6 @@ def a_day(page: Page, demo: DemoCell, part: str, file: Path) -> None:
     rows = csv.DictReader(file.read_text(encoding="utf-8").splitlines())
     (row,) = (row for row in rows if row["part"] == part)
     assert datetime.fromisoformat(row["time"]) < datetime.fromisoformat(row["label_time"])
-
-
-def test_programs_find_the_document(page, demo):
-    opened(page, demo, "history")
-    page.get_by_role("link", name="for programs").click()
-    for text in ("POST /decide", "GET /explanations/{id}", "PolicyRequest"):
-        expect(page.locator("main").get_by_text(text, exact=True).first).to_be_visible()
-
-
-def test_each_channel_is_drawn_in_its_own_unit(browser, tmp_path, stream):
-    spec = TraceSpec(60, channels=2, unit=("kN", "mm"), columns=("FZ", "SZ"))
-    data = Dataset(np.stack([stream.X, stream.X[::-1]], axis=1), stream.y)
-    with cell(tmp_path / "cell.db", trace=spec) as (service, demo), looking(browser) as page:
-        played(service, data, 40)
-        opened(page, demo)
-        captions = page.locator("#trace figcaption")
-        expect(captions.nth(0)).to_contain_text(re.compile(r"FZ over .* kN\. "))
-        expect(captions.nth(1)).to_contain_text(re.compile(r"SZ over .* mm\. "))
 
 
 @pytest.mark.slow

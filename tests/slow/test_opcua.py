@@ -257,7 +257,7 @@ async def test_elsewhere_it_wants_a_token_and_everywhere_a_certificate_with_its_
 async def test_with_a_certificate_only_who_encrypts_and_knows_the_token_gets_in(
     service, tmp_path, monkeypatch
 ):
-    certificate(tmp_path, "urn:dengine:server")
+    certificate(tmp_path, "URI:urn:dengine:server")
     cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
 
     async def connect(user: str, password: str, security: str) -> int:
