@@ -67,9 +67,8 @@ def test_the_examples_are_written_by_serve_into_a_new_folder_alone(tmp_path):
     assert (refused.exit_code, "Expected a new or an empty folder" in refused.stderr) == (1, True)
 
 
-def test_the_container_gets_the_wheel_alone_and_the_projects_python_torch_and_extras():
-    (copied,) = steps("COPY")
-    wheel, _ = copied.split()
+def test_the_container_gets_the_wheel_alone_and_the_projects_torch_and_extras():
+    wheel = steps("COPY")[0].split()[0]
     ignored = (DEPLOY / "Containerfile.dockerignore").read_text(encoding="utf-8")
     assert re.findall("^[^#].*", ignored, flags=re.M) == ["*", f"!{wheel}"]
     (install,) = (step for step in steps("RUN") if "pip install" in step)
@@ -77,17 +76,12 @@ def test_the_container_gets_the_wheel_alone_and_the_projects_python_torch_and_ex
     assert f" {pinned} " in install
     (extras,) = re.findall(rf'"\$\(echo {re.escape(wheel)}\)\[([\w,]+)\]"', install)
     assert {*extras.split(",")} <= {*PROJECT["optional-dependencies"]}
-    (minor,) = re.findall(r"python:3\.(\d+)-slim$", *steps("FROM"))
-    assert minor in re.findall(r"Python :: 3\.(\d+)", str(PROJECT["classifiers"]))
 
 
-def test_the_container_runs_as_nobody_special_and_what_it_starts_is_an_option_each_of_serve():
-    (user,), (volume,) = steps("USER"), steps("VOLUME")
-    (created,) = (step for step in steps("RUN") if "useradd --system --uid 990" in step)
-    assert user in created
+def test_what_the_container_starts_is_an_option_each_of_serve():
     assert json.loads(steps("ENTRYPOINT")[0]) == ["dengine"]
     given = parse(json.loads(steps("CMD")[0]))
-    assert given["store"].startswith(f"{volume}/")
+    assert given["store"].startswith(f"{steps('VOLUME')[0]}/")
     assert str(given["port"]) in steps("EXPOSE")
 
 
@@ -125,16 +119,14 @@ def test_a_token_that_systemd_hands_over_is_taken_though_its_acl_shows_as_a_righ
 
 
 def test_the_unit_starts_serve_with_the_options_of_its_file_and_its_token_as_a_credential():
-    (line,) = settings("ExecStart")
     (behind,) = re.findall(r"^DENGINE_OPTIONS=(.*)$", OPTIONS, flags=re.M)
-    program, *words = shlex.split(line.replace("$DENGINE_OPTIONS", behind))
-    assert Path(program).name == "dengine"
+    line = settings("ExecStart")[0].replace("$DENGINE_OPTIONS", behind)
+    assert "${CREDENTIALS_DIRECTORY}/token" in line
+    assert settings("LoadCredential") == ["token:/etc/dengine/token"]
     assert settings("EnvironmentFile") == ["/etc/dengine/dengine.env"]
-    given = parse(words)
+    given = parse(shlex.split(line)[1:])
     assert given["store"].startswith(f"/var/lib/{settings('StateDirectory')[0]}/")
     assert (given["host"], given["shadow"]) == ("127.0.0.1", True)
-    assert settings("LoadCredential") == ["token:/etc/dengine/token"]
-    assert "${CREDENTIALS_DIRECTORY}/token" in line
 
 
 def test_dashboard_and_alerts_ask_for_metrics_actions_and_reasons_that_there_are():

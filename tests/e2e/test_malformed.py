@@ -145,14 +145,10 @@ trace null
 
 @pytest.mark.usefixtures("no_collection")
 def test_junk_in_a_stores_settings_is_an_error_of_ours_in_every_verb(tmp_path, make_data):
-    path, journal = tmp_path / "engine.db", tmp_path / "journal.csv"
+    path = tmp_path / "engine.db"
     with DataEngine("pca", store=path) as engine:
         learn(engine, make_data(3), range(3))
     kept = path.read_bytes()
-    journal.write_text("1," + ",".join(["0.5"] * 99 + ["1"]) + "\n")
-    verbs = (
-        f"status {path};export {path} --out {tmp_path}/m.ts;import-labels {journal} --store {path}"
-    )
     for key, word in rows(JUNK, 2):
         junk = {"LONG": "a" * 10**5, "NINES": "9" * 5000, "DEEP": "[" * 10**5}.get(word, word)
         path.write_bytes(kept)
@@ -160,7 +156,7 @@ def test_junk_in_a_stores_settings_is_an_error_of_ours_in_every_verb(tmp_path, m
             connection.execute("UPDATE setting SET value = ? WHERE key = ?", (junk, key))
         with pytest.raises(DengineError):
             DataEngine.open(path)
-        for words in verbs.split(";"):
+        for words in (f"status {path}", f"export {path} --out {tmp_path}/m.ts"):
             done = dengine(*words.split())
             assert done.exit_code in (0, 1), (words, junk)
             assert done.exception is None or isinstance(done.exception, SystemExit), (words, junk)

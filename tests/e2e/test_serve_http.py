@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -50,10 +51,10 @@ COUNTED = "action", "n_success", "n_failure", "lower", "upper"
 class Client(httpx.Client):
     """Asks a server as a robot does."""
 
-    def ask(self, path: str, **body: Any) -> Any:
+    def ask(self, path, **body):
         return self.post(path, json=body)
 
-    def decide(self, x: np.ndarray, request: str | None = None, **body: Any) -> Any:
+    def decide(self, x, request=None, **body):
         return self.ask("/decide", trace=x.tolist(), request=request, **body)
 
 
@@ -444,15 +445,10 @@ def test_a_hundred_idle_clients_keep_nobody_out(client, stream):
             assert client.decide(x).status_code == 200
 
 
-@pytest.mark.parametrize(
-    "text",
-    [b"\x16\x03\x01 no HTTP\r\n\r\n", b"GET /healthz HTTP/1.1\r\nx: " + b"y" * 20_000],
-    ids=["no text", "too long a head"],
-)
-def test_what_is_no_http_is_answered_before_its_connection_is_closed(client, text):
+def test_what_is_no_http_is_answered_before_its_connection_is_closed(client):
     answer = b""
     with connected(client) as raw:
-        raw.sendall(text)
+        raw.sendall(b"GET /healthz HTTP/1.1\r\nx: " + b"y" * 20_000)  # too long a head
         while piece := raw.recv(65536):
             answer += piece
     assert answer.startswith(b"HTTP/1.1 400 "), answer
@@ -489,12 +485,9 @@ def test_the_program_serves_until_it_is_told_to_end_and_lets_no_other_have_its_s
 
 
 def refused_in_a_line(text: str, words: str) -> None:
-    root, handlers, level = logging.getLogger(), logging.getLogger().handlers[:], log.level
-    try:
+    # A server leaves its own log, as the process ends with it.
+    with patch.object(logging.getLogger(), "handlers", []), patch.object(log, "level", log.level):
         done = dengine("serve", *words.split())
-    finally:  # a server leaves its own, as the process ends with it
-        root.handlers[:] = handlers
-        log.setLevel(level)
     assert (done.exit_code, done.output.count("\n")) == (1, 1), (done.output, done.exc_info)
     assert text in done.output
 

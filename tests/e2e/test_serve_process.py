@@ -18,13 +18,13 @@ import pytest
 
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
 
-from dengine import Action, DataEngine, Dataset, Recipe
+from dengine import Action, DataEngine, Recipe
 from dengine.serve.auth import Token
 from dengine.serve.http import create_app
 from dengine.serve.service import CellService
 from tests.support.exports import trained
 from tests.support.robots import FakeController, Signals
-from tests.support.serving import REPO, WAIT, Process, served, started
+from tests.support.serving import REPO, WAIT, served, started
 
 SAMPLES = 80
 NAMES = "action", "reason", "lower"
@@ -46,10 +46,7 @@ def until(true: Callable[[], Any], wait: float = WAIT) -> Any:
 
 def children(pid: int) -> list[int]:
     """Processes below this one."""
-    file = Path(f"/proc/{pid}/task/{pid}/children")
-    if not file.exists():
-        pytest.skip("this system does not say which processes are whose")
-    below = [int(word) for word in file.read_text().split()]
+    below = [*map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
     return [*below, *(deeper for child in below for deeper in children(child))]
 
 
@@ -65,7 +62,7 @@ class Robots:
     labels were acknowledged.
     """
 
-    def __init__(self, process: Process, parts: Dataset, n: int = 3) -> None:
+    def __init__(self, process, parts, n=3):
         self.ask, self.parts = process.ask, parts
         self.answers, self.labels = {}, {}
         self.threads = [threading.Thread(target=self.work, args=(item,)) for item in range(n)]
@@ -73,7 +70,7 @@ class Robots:
             item.start()
         until(lambda: process.ask("/status")["retraining"])
 
-    def work(self, robot: int) -> None:
+    def work(self, robot):
         for cycle in count():
             i = cycle % len(self.parts)
             id_, good = f"{robot}-{cycle}", bool(self.parts.y[i])
@@ -86,7 +83,7 @@ class Robots:
             except (OSError, http.client.HTTPException):  # it ends
                 return
 
-    def join(self) -> None:
+    def join(self):
         for item in self.threads:
             item.join(WAIT)
 

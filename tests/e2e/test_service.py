@@ -18,7 +18,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream, tmp_path):
     bad = stream.X[2].copy()
     bad[7] = float("nan")
 
-    async def cell(service: CellService) -> None:
+    async def cell(service):
         free = threading.Event()
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))
         # As a store that does not answer.
@@ -53,7 +53,7 @@ def test_a_late_answer_is_on_the_disk_when_it_leaves(stream, tmp_path):
 
 
 def test_a_part_that_the_next_decision_confirms_may_be_reported_as_good(stream):
-    async def cell(service: CellService) -> None:
+    async def cell(service):
         ids = []
         for x, good in zip(stream.X[:120], stream.y, strict=False):
             decision = (await service.decide(x)).decision
@@ -70,7 +70,7 @@ def test_a_part_that_the_next_decision_confirms_may_be_reported_as_good(stream):
 
 
 def test_the_engine_does_what_it_has_to_while_nobody_asks(stream):
-    async def cell(service: CellService) -> None:
+    async def cell(service):
         for x, good in zip(stream.X[:40], stream.y, strict=False):
             await service.report((await service.decide(x)).decision.id, bool(good))
         changes = service.changes()

@@ -44,7 +44,7 @@ SPEED = 5.0
 
 
 @pytest.fixture(scope="module")
-def parts(make_data) -> Dataset:
+def parts(make_data):
     return make_data(60, samples=SAMPLES)
 
 
@@ -218,7 +218,7 @@ def reconnected(fake: FakeController, stream: RtdeStream, anew: bool = False) ->
 def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(parts, value, text):
     program = RobotProgram(parts)
 
-    def start_anew() -> None:
+    def start_anew():
         program.restart()
         del program.step
 

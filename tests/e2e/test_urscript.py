@@ -10,7 +10,6 @@ import socket
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -18,7 +17,7 @@ import pytest
 
 pytest.importorskip("uvicorn", reason="XML-RPC needs the extra `serve`")
 
-from dengine import Action, DataEngine, Dataset
+from dengine import Action, DataEngine
 from dengine.serve.http import create_app
 from dengine.store.views import HistoryFilter
 from tests.support.serving import PushedTraces, a_service, busy_engine, served
@@ -65,7 +64,7 @@ def as_python(code: list[str]) -> str:
 class Handle(xmlrpc.client.ServerProxy):
     """What `rpc_factory` gives."""
 
-    def closeXMLRPCClientConnection(self) -> None:  # noqa: N802  # so it is called there
+    def closeXMLRPCClientConnection(self):  # noqa: N802  # so it is called there
         self("close")()
 
 
@@ -89,12 +88,12 @@ class Robot:
     each part is noted.
     """
 
-    def __init__(self, data: Dataset, cell: SimpleNamespace, patience: float = 600.0) -> None:
+    def __init__(self, data, cell, patience=600.0):
         self.data, self.cell, self.patience = data, cell, patience
         self.taken, self.flags = -1, {}
         self.checked, self.said = [], []
 
-    def play(self) -> None:
+    def play(self):
         """Run the program until the shift ends."""
         names = {
             name: getattr(self, name, lambda *args, **named: [0.0] * 6) for name in MANUAL.split()
@@ -113,45 +112,45 @@ class Robot:
         with pytest.raises(EndOfShiftError):
             exec(compile(source, str(SCRIPT), "exec"), names)
 
-    def next_part(self) -> bool:
+    def next_part(self):
         self.taken += 1
         if self.taken == len(self.data):
             raise EndOfShiftError
         return True
 
-    def run(self, call: Callable[[], object]) -> threading.Thread:
+    def run(self, call):
         thread = threading.Thread(target=call, daemon=True)
         thread.start()
         return thread
 
-    def sleep(self, seconds: float) -> None:
+    def sleep(self, seconds):
         time.sleep(min(seconds, 0.002))
 
-    def textmsg(self, *text: str) -> None:
+    def textmsg(self, *text):
         self.said.append("".join(text))
 
-    def write_output_integer_register(self, number: int, value: int) -> None:
+    def write_output_integer_register(self, number, value):
         if value:
             self.cell.recorder.traces.append(self.data.X[self.taken])
 
-    def get_standard_digital_in(self, number: int) -> bool:
+    def get_standard_digital_in(self, number):
         good = bool(self.data.y[self.taken])
         if number == 2:
             self.checked.append(self.taken)
             return good
         return not good  # the line stops for a bad part that was passed on
 
-    def set_flag(self, number: int, value: bool) -> None:
+    def set_flag(self, number, value):
         self.flags[number] = value
 
-    def get_flag(self, number: int) -> bool:
+    def get_flag(self, number):
         return self.flags.get(number, False)
 
-    def socket_open(self, host: str, port: int, name: str) -> bool:
+    def socket_open(self, host, port, name):
         with socket.socket() as look:
             return look.connect_ex((host, port)) == 0
 
-    def rpc_factory(self, kind: str, url: str) -> Handle:
+    def rpc_factory(self, kind, url):
         assert kind == "xmlrpc"
         return Handle(url)
 

@@ -59,16 +59,16 @@ def fault_of(cell: SimpleNamespace, body: bytes) -> xmlrpc.client.Fault:
 
 
 def test_a_cell_over_xml_rpc_learns_and_accepts(cell, stream):
-    robot, traces = cell.robot, stream.X[50:90]
-    answers = [robot.decide(x.tolist(), f"order-{i}", f"P{i}") for i, x in enumerate(traces)]
-    assert cell.service.engine.version >= 1
-    assert ACCEPT in {answer["action"] for answer in answers}
-    for i, answer in enumerate(answers):
+    actions = []
+    for i, x in enumerate(stream.X[50:90]):
+        answer = cell.robot.decide(x.tolist(), f"order-{i}", f"P{i}")
         types = type(answer["action"]), type(answer["lower"])
         assert (answer["id"], *types) == (f"order-{i}", int, float)
+        actions.append(answer["action"])
         match = found(cell, f"order-{i}")
         assert match.decision.part == f"P{i}"
-        assert np.array_equal(match.trace[0], traces[i])
+        assert np.array_equal(match.trace[0], x)
+    assert ACCEPT in actions
 
 
 def test_a_trace_in_pieces_is_the_same_trace(cell, stream):
@@ -86,15 +86,14 @@ def test_a_trace_in_pieces_is_the_same_trace(cell, stream):
 
 def test_pieces_of_no_part_that_was_begun_or_too_many_are_refused(cell):
     robot = cell.robot
-    ids = [robot.begin() for _ in range(9)]  # more than are kept
-    assert [robot.add(ids[-1], [0.0] * 2500) for _ in range(80)][-1] == MAX_SAMPLES
-    for wrong, call, *arguments in (
-        ("Expected begin and add", robot.decide_added, "unheard of"),
-        ("Expected begin before add", robot.add, ids[0], [1.0]),
-        (f"at most {MAX_SAMPLES} samples", robot.add, ids[-1], [0.0]),
-    ):
-        with pytest.raises(xmlrpc.client.Fault, match=wrong):
-            call(*arguments)
+    forgotten, *_, id_ = [robot.begin() for _ in range(9)]  # more than are kept
+    assert [robot.add(id_, [0.0] * 2500) for _ in range(80)][-1] == MAX_SAMPLES
+    with pytest.raises(xmlrpc.client.Fault, match=f"at most {MAX_SAMPLES} samples"):
+        robot.add(id_, [0.0])
+    with pytest.raises(xmlrpc.client.Fault, match="Expected begin before add"):
+        robot.add(forgotten, [1.0])
+    with pytest.raises(xmlrpc.client.Fault, match="Expected begin and add"):
+        robot.decide_added(forgotten)
 
 
 def test_what_a_recorder_cut_is_decided_on(cell, stream):
@@ -111,16 +110,14 @@ def test_what_a_recorder_cut_is_decided_on(cell, stream):
     assert robot.decide_recorded()["id"] == "named"
 
 
-@pytest.mark.parametrize("wrong", ["nothing came", "another part", "never begun"])
-def test_what_was_not_recorded_is_verified_and_no_fault(cell, stream, wrong):
+def test_what_was_not_recorded_is_verified_and_no_fault(cell, stream):
     robot = cell.robot
-    id_ = robot.begin()
-    if wrong == "another part":
-        robot.begin()
-        cell.recorder.traces.append(stream.X[4])
-    answer = robot.decide_recorded("never" if wrong == "never begun" else id_)
-    cell.recorder.traces.clear()
-    assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "not_recorded")
+    id_, other = robot.begin(), robot.begin()
+    # Another part was recorded; one was never begun; nothing came.
+    for asked, traces in ((id_, [stream.X[4]]), ("never", []), (other, [])):
+        cell.recorder.traces[:] = traces
+        answer = robot.decide_recorded(asked)
+        assert (answer["action"], answer["id"], answer["reason"]) == (VERIFY, "", "not_recorded")
     assert robot.report(id_, True) is False  # nothing is known of it, and the robot goes on
 
 
@@ -203,7 +200,7 @@ def test_a_call_that_there_is_not_or_of_other_arguments_is_a_fault(cell, name, a
 
 
 def test_what_fails_in_the_server_is_a_fault_that_says_nothing_of_it(cell, monkeypatch, caplog):
-    def broken(*args: object) -> None:
+    def broken(*args):
         raise KeyError("secret")
 
     monkeypatch.setattr(cell.service, "decide", broken)
