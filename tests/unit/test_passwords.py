@@ -1,12 +1,10 @@
 """A database's password is shown nowhere: not in errors, tables, progress or JSON."""
 
 import json
-import os
 import pickle
 from pathlib import Path
 
 import pytest
-import sqlalchemy as sa
 
 from dengine import errors as all_errors
 from dengine.cli import main
@@ -14,12 +12,10 @@ from dengine.cli.output import progress_bar
 from dengine.errors import DengineError, StoreError, without_password
 from dengine.representation import to_jsonable
 from dengine.store import SqlStore
-from dengine.store.connections import make_engine
 from tests.support.command_line import dengine
 from tests.support.tables import rows
 
 SECRET = "hunter2"
-POSTGRES = os.environ.get("DENGINE_TEST_POSTGRES", "")
 NOBODY = f"postgresql+psycopg://robot:{SECRET}@127.0.0.1:1/cell"
 ERRORS = [
     value
@@ -112,11 +108,3 @@ def test_json_and_progress_mask_it(capsys):
     with progress_bar(f"importing {NOBODY}", 3) as advance:
         advance(3)
     assert SECRET not in "".join(capsys.readouterr())
-
-
-@pytest.mark.skipif(not POSTGRES, reason="DENGINE_TEST_POSTGRES is unset: . .ci/postgres.sh")
-def test_the_environment_gives_the_password(monkeypatch):
-    monkeypatch.setenv("PGPASSWORD", SECRET)
-    url = sa.make_url(POSTGRES)._replace(password=None)
-    with make_engine(url.render_as_string(hide_password=False)).connect() as connection:
-        assert connection.connection.driver_connection.info.password == SECRET

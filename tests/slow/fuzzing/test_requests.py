@@ -81,7 +81,6 @@ ends = any_of(ODD).map(lambda odd: odd.replace("LONG", "9" * 5000)) | st.just(""
 paths = st.tuples(any_of(PATHS), ends).map("".join)
 simple = st.none() | st.booleans() | st.floats() | st.text(max_size=20) | st.binary(max_size=20)
 simple = st.recursive(simple | st.integers(-(2**31), 2**31 - 1), st.lists, max_leaves=50)
-changes = st.dictionaries(any_of("id ids success version alpha guarantee"), nested, max_size=3)
 floats = st.sampled_from([2, 3, 100]).map(lambda n: struct.pack(f"<{SAMPLES}f", *GOOD) * n)
 xml = (
     st.builds(call, any_of(CALLS), st.lists(simple, max_size=4))
@@ -98,11 +97,6 @@ KINDS = {
         any_of(QUERIES),
     ),
     "XML-RPC": xml.map(lambda body: request(body, "/RPC2", XML)),
-    "an action": st.builds(
-        lambda path, body: request(body, path, head="Origin: http://localhost"),
-        any_of("/correct /forget /rollback /policy /retrain"),
-        as_json(changes.map(lambda result: result | {"author": " "})),
-    ),
     "a head": st.builds(
         request,
         st.just(b"{}\r\n"),
