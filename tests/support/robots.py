@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
-from itertools import repeat
+from itertools import cycle, repeat
 from types import SimpleNamespace
 from typing import Any
 
@@ -298,16 +298,14 @@ class FakeController(AbstractContextManager):
 
 
 class Signals:
-    """Plays columns of numbers, again and again, with a rest between."""
+    """Plays columns of numbers, again and again."""
 
     place = None
 
     def __init__(self, **columns: np.ndarray) -> None:
-        names = {name: CHANNELS.get(name, name) for name in columns}
-        length = len(next(iter(columns.values())))
-        self._rows = [{names[n]: float(c[i]) for n, c in columns.items()} for i in range(length)]
-        self._cycle = 0
+        names = [CHANNELS.get(name, name) for name in columns]
+        rows = np.stack(list(columns.values()), axis=1).tolist()
+        self._rows = cycle([dict(zip(names, row, strict=True)) for row in rows])
 
-    def step(self, inputs: dict) -> dict:
-        self._cycle += 1
-        return self._rows[self._cycle % len(self._rows)]
+    def step(self, inputs: Values) -> Values:
+        return next(self._rows)
