@@ -80,9 +80,11 @@ def test_the_engine_does_what_it_has_to_while_nobody_asks(stream):
 
     with (
         ThreadPoolExecutor(1) as pool,
-        closing(CellService(lambda: DataEngine(recipe=RECIPE, executor=pool), None, WAIT)) as made,
+        closing(
+            CellService(lambda: DataEngine(recipe=RECIPE, executor=pool), None, WAIT)
+        ) as service,
     ):
-        asyncio.run(cell(made))
+        asyncio.run(cell(service))
 
 
 def test_a_service_whose_second_connection_fails_closes_its_engine_and_ends_its_thread(tmp_path):

@@ -39,7 +39,7 @@ def cell(tmp_path_factory, stream):
         yield SimpleNamespace(service=service, recorder=recorder, port=port, robot=robot)
 
 
-def found(cell: SimpleNamespace, id_: str):
+def find(cell: SimpleNamespace, id_: str):
     return asyncio.run(cell.service.find(id_))
 
 
@@ -65,7 +65,7 @@ def test_a_cell_over_xml_rpc_learns_and_accepts(cell, stream):
         types = type(answer["action"]), type(answer["lower"])
         assert (answer["id"], *types) == (f"order-{i}", int, float)
         actions.append(answer["action"])
-        match = found(cell, f"order-{i}")
+        match = find(cell, f"order-{i}")
         assert match.decision.part == f"P{i}"
         assert np.array_equal(match.trace[0], x)
     assert ACCEPT in actions
@@ -79,7 +79,7 @@ def test_a_trace_in_pieces_is_the_same_trace(cell, stream):
     answer = robot.decide_added(id_, 7)
     assert answer["id"] == id_
     assert (robot.decide_added(id_, 7), robot.action_added(id_)) == (answer, answer["action"])
-    match = found(cell, id_)
+    match = find(cell, id_)
     assert match.decision.part == "7"
     assert np.array_equal(match.trace[0], x)
 
@@ -104,7 +104,7 @@ def test_what_a_recorder_cut_is_decided_on(cell, stream):
     answer = robot.decide_recorded(id_)
     assert answer["id"] == id_
     assert (robot.decide_recorded(id_), robot.action_recorded(id_)) == (answer, answer["action"])
-    assert np.array_equal(found(cell, id_).trace[0], stream.X[2])
+    assert np.array_equal(find(cell, id_).trace[0], stream.X[2])
     robot.begin("named")
     cell.recorder.traces.append(stream.X[3])
     assert robot.decide_recorded()["id"] == "named"
@@ -135,7 +135,7 @@ def test_a_busy_server_answers_verify_and_keeps_no_report(cell, stream):
         assert cell.recorder.traces == []  # the part is verified by hand
         assert robot.report("order-1", True) is False
     waiting[-1].result(60)
-    assert found(cell, "too much") is None
+    assert find(cell, "too much") is None
 
 
 def test_reports_are_a_bool_and_one_a_decision(cell, stream):

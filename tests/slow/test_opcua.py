@@ -175,15 +175,15 @@ WRONG = [  # an argument, its value and type, and what is said of it
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "kind", "said"), WRONG)
-async def test_a_wrong_argument_is_a_bad_status_and_named(plant, name, value, kind, said):
+@pytest.mark.parametrize(("name", "value", "kind", "text"), WRONG)
+async def test_a_wrong_argument_is_a_bad_status_and_named(plant, name, value, kind, text):
     before = await plant.decisions()
     given = SOUND | {name: ua.Variant(value, ua.VariantType[kind])}
     with pytest.raises(ua.uaerrors.BadInvalidArgument):
         await plant.call("Decide", *given.values())
     refused = await plant.value("LastRefused")
     assert refused.startswith("Expected ")
-    assert said in refused
+    assert text in refused
     assert await plant.decisions() == before
 
 

@@ -140,8 +140,8 @@ def test_a_program_killed_at_any_moment_loses_no_label_that_it_acknowledged_and_
     data, lines = shift(make_data, 100)
     rng, ids = random.Random(4), {}
 
-    def play(cell, said, decided, labels):
-        for verb, k in said:
+    def play(cell, lines, decided, labels):
+        for verb, k in lines:
             if verb == "decide":
                 ids[k], *decided[k], _ = cell.decide(data.X[k], data.part[k])
             elif decided[k][0] != "reject":

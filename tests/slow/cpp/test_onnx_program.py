@@ -35,10 +35,10 @@ def signed(tmp_path_factory):
 def program(programs: Path, *arguments: Any, runtime: str = "") -> Program:
     """One that uses this library, or onnxruntime's as its package for Python brings it."""
     libraries = (Path(find_spec("onnxruntime").origin).parent / "capi").glob("libonnxruntime.so*")
-    named = runtime or str(next(libraries, ""))
-    if not named:
+    library = runtime or str(next(libraries, ""))
+    if not library:
         pytest.skip("this onnxruntime brings no shared library of its own")
-    env = os.environ | {"DENGINE_ONNXRUNTIME": named}
+    env = os.environ | {"DENGINE_ONNXRUNTIME": library}
     return Program(programs, *arguments, name="dengine-onnx", env=env)
 
 

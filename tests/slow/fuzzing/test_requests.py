@@ -126,7 +126,7 @@ def send(port: int, sent: bytes, ended: bool = False) -> bytes:
     return text
 
 
-def decided(service: CellService) -> dict[str, str]:
+def read_decisions(service: CellService) -> dict[str, str]:
     service.submit(DataEngine.flush).result(60)
     store = service.read_store.decisions
     ids = [item.decision.id for item in store.select(HistoryFilter(), 10**6)]
@@ -147,10 +147,10 @@ def cell(tmp_path_factory, make_data):
         closing(CellService(lambda: DataEngine.open(file), file, deadline=60.0)) as service,
         served(create_app(service)) as port,
     ):
-        before, bounds = decided(service), service.engine.model.predict_interval(data.X)
+        before, bounds = read_decisions(service), service.engine.model.predict_interval(data.X)
         yield port, n
         assert b'"ok"' in send(port, request(b"", "/healthz", JSON, "GET"))
-        after = decided(service)
+        after = read_decisions(service)
         np.testing.assert_array_equal(service.engine.model.predict_interval(data.X), bounds)
     assert {id_: after[id_] for id_ in before} == before
     assert len(after) - len(before) <= n["taken"] < n["refused"]
