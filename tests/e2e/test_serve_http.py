@@ -2,6 +2,7 @@
 it remembers.
 """
 
+import asyncio
 import json
 import logging
 import re
@@ -27,7 +28,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.routing import Route
 
 from dengine import DataEngine, TraceSpec
-from dengine.errors import log
+from dengine.errors import BusyError, log
 from dengine.serve.auth import MAX_BODY, RPC, Token
 from dengine.serve.http import VIEWS, create_app
 from dengine.serve.service import CellService
@@ -257,7 +258,7 @@ def test_what_cannot_be_put_right_so_is_refused_and_leaves_no_event():
 
 
 def test_the_page_is_files_that_may_ask_nobody_else(client):
-    for view in ("", "overview", "map", "part?id=nobody", "history", "actions"):
+    for view in ("", "overview", "map", "part?id=nobody", "history", "actions", "docs"):
         answer = client.get(f"/{view}")
         assert answer.status_code == 200
         policy = answer.headers["content-security-policy"]
@@ -373,6 +374,8 @@ def test_a_full_line_says_verify_and_when_to_come_again(stream):
         assert int(answer.headers["retry-after"]) >= 1
         assert service.busy == 1
     assert service.read_store.decisions.counts()["decisions"] == 0
+    with pytest.raises(BusyError, match="closing"):
+        asyncio.run(service.decide(stream.X[0]))
 
 
 def test_a_token_is_asked_for_says_who_asks_and_a_viewers_only_looks():
@@ -524,3 +527,4 @@ def test_what_runs_beside_has_to_start_too_or_one_line_says_why(tmp_path):
         port = str(taken.getsockname()[1])
         words = f"--store {tmp_path}/cell.db --reducer pca --port 0 --opcua {port}"
         refused_in_a_line(port, words)
+    refused_in_a_line("127.0.0.1", f"{words} --robot 127.0.0.1:{port}")

@@ -5,6 +5,7 @@ orders; over real TCP.
 import socket
 import struct
 import threading
+import time
 from dataclasses import asdict
 from itertools import chain
 
@@ -169,6 +170,15 @@ def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_befor
         for _ in range(3):
             np.testing.assert_array_equal(recorder.record(WAIT).trace, expected)
     assert recorder.spec == TraceSpec(60, 500.0, 3, ("N", "N", ""), columns=tuple(channels))
+
+
+def test_who_waits_for_an_insertion_is_woken_when_the_recorder_is_closed():
+    with FakeController() as fake, RtdeRecorder(fake.host, port=fake.port) as recorder:
+        threading.Timer(0.2, recorder.close).start()
+        begin = time.monotonic()
+        with pytest.raises(CellError, match="Expected an insertion"):
+            recorder.record(timeout=WAIT)
+        assert time.monotonic() - begin < WAIT / 2
 
 
 def decisions(cell: Cell, n: int) -> list[dict]:

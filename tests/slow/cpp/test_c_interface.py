@@ -12,7 +12,7 @@ import pytest
 import dengine
 from dengine import export_torchscript, load_exported
 from dengine.errors import OutputError
-from dengine.export import export_sources, import_journal, make_key
+from dengine.export import export_sources, import_journal
 from dengine.records import ACTIONS, Action
 from tests.support.command_line import dengine as command
 from tests.support.exports import trained
@@ -35,7 +35,8 @@ def test_a_controller_in_c_finds_the_package_decides_as_python_does_and_its_labe
     consumer = repo / "tests" / "slow" / "cpp" / "consumer"
     run("cmake", "-S", consumer, "-B", build, f"-DCMAKE_PREFIX_PATH={prefix}")
     run("cmake", "--build", build)
-    store, key = tmp_path / "engine.db", make_key(tmp_path / "cell.key")
+    store, key = tmp_path / "engine.db", tmp_path / "cell.key"
+    assert command("export", "--make-key", key).exit_code == 0
     with trained(make_data(400, SAMPLES), store) as engine:
         file = export_torchscript(engine, tmp_path / "model.ts", key=key)
     X = make_data(120, SAMPLES, seed=9).X
