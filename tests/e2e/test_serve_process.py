@@ -9,7 +9,6 @@ import time
 import xmlrpc.client
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -19,20 +18,20 @@ import pytest
 
 pytest.importorskip("uvicorn", reason='the server is not installed: pip install "dengine[serve]"')
 
-from dengine import Action, DataEngine, Dataset, Recipe
+from dengine import Action, DataEngine, Recipe
 from dengine.serve.auth import Token
 from dengine.serve.http import create_app
 from dengine.serve.service import CellService
 from tests.support.exports import trained
 from tests.support.robots import FakeController, Signals
-from tests.support.serving import REPO, WAIT, Process, served, started
+from tests.support.serving import REPO, WAIT, served, started
 
 SAMPLES = 80
 NAMES = "action", "reason", "lower"
 
 
 @pytest.fixture(scope="module")
-def parts(make_data) -> Dataset:
+def parts(make_data):
     return make_data(200, samples=SAMPLES)
 
 
@@ -47,13 +46,8 @@ def until(true: Callable[[], Any], wait: float = WAIT) -> Any:
 
 def children(pid: int) -> list[int]:
     """Processes below this one."""
-    try:
-        custom = [
-            int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        ]
-    except FileNotFoundError:
-        pytest.skip("this system does not say which processes are whose")
-    return [*custom, *(deeper for word in custom for deeper in children(word))]
+    below = [*map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split())]
+    return [*below, *(deeper for child in below for deeper in children(child))]
 
 
 def is_alive(pid: int) -> bool:
@@ -63,58 +57,48 @@ def is_alive(pid: int) -> bool:
         return False
 
 
-@dataclass
 class Robots:
     """Several that ask and report until the server is gone; what they were answered, and which
     labels were acknowledged.
     """
 
-    ask: Callable[[str, Any], dict[str, Any]]
-    parts: Dataset
-    answers: dict[str, dict[str, Any]] = field(default_factory=dict)
-    labels: dict[str, bool] = field(default_factory=dict)
-
-    def start(self, n: int = 3) -> list[threading.Thread]:
-        threads = [threading.Thread(target=self.work, args=(item,)) for item in range(n)]
-        for item in threads:
+    def __init__(self, process, parts, n=3):
+        self.ask, self.parts = process.ask, parts
+        self.answers, self.labels = {}, {}
+        self.threads = [threading.Thread(target=self.work, args=(item,)) for item in range(n)]
+        for item in self.threads:
             item.start()
-        return threads
+        until(lambda: process.ask("/status")["retraining"])
 
-    def work(self, robot: int) -> None:
-        for cycle in range(10**6):
+    def work(self, robot):
+        for cycle in count():
             i = cycle % len(self.parts)
+            id_, good = f"{robot}-{cycle}", bool(self.parts.y[i])
             try:
-                asked = {"trace": self.parts.X[i].tolist(), "request": f"{robot}-{cycle}"}
-                answer = self.answers[asked["request"]] = self.ask("/decide", asked)
-                if answer["action"] != "reject":
-                    self.ask("/report", {"id": answer["id"], "success": bool(self.parts.y[i])})
-                    self.labels[answer["id"]] = bool(self.parts.y[i])
+                asked = {"trace": self.parts.X[i].tolist(), "request": id_}
+                self.answers[id_] = self.ask("/decide", asked)
+                if self.answers[id_]["action"] != "reject":
+                    self.ask("/report", {"id": id_, "success": good})
+                    self.labels[id_] = good
             except (OSError, http.client.HTTPException):  # it ends
                 return
 
+    def join(self):
+        for item in self.threads:
+            item.join(WAIT)
 
-def recorded(process: Process, x: np.ndarray) -> None:
-    """A robot's force is recorded as it was sent, and decided on; test_ur.py and test_xmlrpc.py try
-    what becomes of it when the controller goes away.
-    """
-    robot = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{process.port}/RPC2")
-    answers = (robot.decide_recorded(robot.begin()) for _ in count())
-    answer = next(answer for answer in answers if answer["id"])  # on a busy machine it may be late
-    assert (answer["action"], answer["reason"]) == (0, "no_model")
-    assert robot.report(answer["id"], True) is True
-    record = process.ask(f"/decisions/{answer['id']}?trace=true")
-    assert record["success"] is True
-    assert np.float32(record["trace"]).ravel().tolist() == x.tolist()
+
+def write_recipe(folder: Path, **settings: Any) -> None:
+    recipe = Recipe("conv", retrain_every=20, **settings)
+    (folder / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
 
 
 # The end by Ctrl-C is the same once more, sent to the whole group.
 @pytest.mark.parametrize("name", [pytest.param("SIGINT", marks=pytest.mark.slow), "SIGTERM"])
 def test_it_records_a_robot_and_a_signal_ends_it_in_the_midst_of_work_and_nothing_is_lost(
-    tmp_path, parts, name: str
-) -> None:
-    # Seconds of the budget: so that a retrain is met.
-    recipe = Recipe("conv", radius=0.05, retrain_every=20, budget=1.5)
-    (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
+    tmp_path, parts, name
+):
+    write_recipe(tmp_path, radius=0.05, budget=1.5)  # so many seconds that a retrain is met
     rest, x = np.zeros(SAMPLES), parts.X[0]
     phase = np.concatenate([rest, np.ones(SAMPLES)])
     force = Signals(FZ_Base=np.concatenate([rest, x]), output_int_register_25=phase)
@@ -123,14 +107,14 @@ def test_it_records_a_robot_and_a_signal_ends_it_in_the_midst_of_work_and_nothin
         FakeController(force) as fake,
         started(tmp_path, *f"{words}{fake.port}".split()) as process,
     ):
-        recorded(process, x)
-        robots = Robots(process.ask, parts)
-        threads = robots.start()
-        until(lambda: process.ask("/status")["retraining"])
+        robot = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{process.port}/RPC2")
+        # On a busy machine it may be late.
+        recorded = until(lambda: robot.decide_recorded(robot.begin())["id"])
+        assert robot.report(recorded, True) is True
+        robots = Robots(process, parts)
         below = until(lambda: children(process.process.pid))
         code = process.end(getattr(signal, name), group=name == "SIGINT")
-        for thread in threads:
-            thread.join(WAIT)
+        robots.join()
     assert code == 0
     assert "Traceback" not in process.output
     lines = process.output.splitlines()
@@ -139,54 +123,44 @@ def test_it_records_a_robot_and_a_signal_ends_it_in_the_midst_of_work_and_nothin
     until(lambda: not any(map(is_alive, below)))
     assert len(robots.labels) >= 20
     with DataEngine.open(tmp_path / "cell.db") as engine:
+        assert engine.find(recorded).success is True
+        assert engine.find(recorded).trace.ravel().tolist() == x.tolist()
         assert {id_: engine.find(id_).success for id_ in robots.labels} == robots.labels
         for id_, answer in robots.answers.items():
             decision = engine.find(id_).decision
             assert [getattr(decision, name) for name in NAMES] == [answer[name] for name in NAMES]
 
 
-@pytest.mark.parametrize("at_work", [False, True], ids=["at its start", "in a retrain"])
-def test_a_server_that_is_killed_leaves_no_retraining_process_behind(
-    tmp_path: Path, parts: Dataset, at_work: bool
-) -> None:
-    recipe = Recipe("conv", retrain_every=20, budget=300.0, max_steps=10**6)
-    (tmp_path / "recipe.toml").write_text(recipe.to_toml(), encoding="utf-8")
-    with started(tmp_path, "--recipe", "recipe.toml", wait=at_work) as process:
-        if at_work:
-            threads = Robots(process.ask, parts).start(1)
-            until(lambda: process.ask("/status")["retraining"])
+def test_a_server_that_is_killed_in_a_retrain_leaves_no_process_behind(tmp_path, parts):
+    write_recipe(tmp_path, budget=300.0, max_steps=10**6)
+    with started(tmp_path, "--recipe", "recipe.toml") as process:
+        robots = Robots(process, parts, 1)
         below = until(lambda: children(process.process.pid))
         process.process.kill()
         until(lambda: not any(map(is_alive, below)), WAIT / 4)
-    for thread in threads if at_work else ():
-        thread.join(WAIT)
+    robots.join()
 
 
-def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(
-    tmp_path: Path, make_data
-) -> None:
+def test_a_controllers_socket_and_a_ros_node_are_answered_as_the_page_says(tmp_path, make_data):
     page = (REPO / "docs/howto/plc_and_robot.md").read_text("utf-8")
     (head,) = re.findall(r"```text\n(POST /decide.+?\n\n)```", page, flags=re.DOTALL)
     (node,) = re.findall(r"```python\n(from http.+?)```", page, flags=re.DOTALL)
-    file, token = tmp_path / "cell.db", "t" * 24
-    data = make_data(200, samples=1000)
+    file, token, data = tmp_path / "cell.db", "t" * 24, make_data(200, samples=1000)
     with trained(data, file) as engine:
         x = next(x for x in data.X if engine.decide(x).action is Action.ACCEPT).astype("<f4")
-    pieces = [f"{line}\r\n".encode() for line in head.replace("TOKEN", token).splitlines()]
-    pieces += [x[i : i + 250].tobytes() for i in range(0, 1000, 250)]
+    head = head.replace("TOKEN", token).replace("\n", "\r\n").encode()
+    scope: dict[str, Any] = {}
+    exec(node, scope)
     with (
         closing(CellService(lambda: DataEngine.open(file), file, WAIT)) as service,
         served(create_app(service, (Token(token),))) as port,
         socket.create_connection(("127.0.0.1", port), WAIT) as robot,
     ):
-        for piece in pieces:
+        for piece in (head, x[:250].tobytes(), x[250:].tobytes()):
             robot.sendall(piece)
         answer = b""
-        while not (action := re.search(rb'"action":"(\w+)"', answer)):
+        while not re.search(rb'"action":"accept"', answer):
             answer += robot.recv(100)
-        assert action[1] == b"accept"
-        scope: dict[str, Any] = {}
-        exec(node, scope)
         url = f"http://127.0.0.1:{port}"
         asked = (url, token), (url, "another"), ("http://127.0.0.1:1", token)
         decided = [scope["decide"](x, "P-1", *item) for item in asked]

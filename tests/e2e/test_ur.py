@@ -7,7 +7,7 @@ import struct
 import threading
 import time
 from dataclasses import asdict
-from pathlib import Path
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -16,7 +16,6 @@ from dengine import DataEngine, Dataset, Policy, ReplayCell, TraceSpec
 from dengine.cells import Cell, RtdeRecorder, UrCell
 from dengine.cells.ur.cell import (
     ANSWER,
-    MAX_NUMBER,
     ORDER,
     PHASE,
     RUNTIME,
@@ -34,8 +33,9 @@ from dengine.cells.ur.protocol import (
 from dengine.cells.ur.stream import RtdeClient, RtdeStream
 from dengine.datasets.triggers import Trigger
 from dengine.errors import CellError, DengineError
-from tests.support.command_line import dengine, document, line_of, succeed
+from tests.support.command_line import dengine, document
 from tests.support.robots import FORCE, FakeController, RobotProgram, Signals, Trouble
+from tests.support.tables import rows
 
 SAMPLES = 80
 WAIT = 60.0  # seconds, for what takes milliseconds here: a machine may be busy
@@ -45,7 +45,7 @@ SPEED = 5.0
 
 
 @pytest.fixture(scope="module")
-def parts(make_data) -> Dataset:
+def parts(make_data):
     return make_data(60, samples=SAMPLES)
 
 
@@ -55,19 +55,15 @@ def cell_of(fake: FakeController, **how) -> UrCell:
     )
 
 
-def nan_places(part: int, trace: np.ndarray) -> set[tuple[int, int]]:
-    return {(part, int(sample)) for sample in np.flatnonzero(np.isnan(trace))}
-
-
-def test_packages_come_whole_from_pieces_of_any_size() -> None:
+def test_packages_come_whole_from_pieces_of_any_size():
     sent = [Package(PackageType.DATA, bytes(range(n))) for n in (0, 1, 40)]
+    stream = b"".join(item.to_bytes() for item in sent)
     for size in (1, 2, 7, 100):
-        stream, packages = b"".join(item.to_bytes() for item in sent), PackageReader()
         pieces = [stream[i : i + size] for i in range(0, len(stream), size)]
-        assert [result for piece in pieces for result in packages.feed(piece)] == sent
+        assert [*chain.from_iterable(map(PackageReader().feed, pieces))] == sent
 
 
-def test_a_data_package_is_bytes_as_the_guide_says() -> None:
+def test_a_data_package_is_bytes_as_the_guide_says():
     # Header: size uint16 and kind uint8; then the recipe's number; big-endian.
     recipe = RtdeRecipe(1, ("timestamp", "output_int_register_24"), ("DOUBLE", "INT32"))
     assert recipe.pack({"output_int_register_24": -1, "timestamp": 2.0}) == struct.pack(
@@ -82,21 +78,15 @@ def test_a_data_package_is_bytes_as_the_guide_says() -> None:
         (PackageType.START, FORCE, "refuses"),
         ("actual_TCP_force", FORCE, "does not know actual_TCP_force"),
         (ORDER, FORCE, f"Expected to write {ORDER}, another client"),
-        ("", "FZ", "does not know FZ"),
         ("", "actual_q[9]", r"Expected a channel among FX_Base, .* got actual_q\[9\]"),
     ],
 )
-def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(
-    refused: PackageType | str, column: str, text: str
-) -> None:
-    with (
-        FakeController(refuses=[refused]) as fake,
-        pytest.raises(DengineError, match=text),
-    ):
+def test_what_a_controller_refuses_or_does_not_have_is_said_at_once(refused, column, text):
+    with FakeController(refuses=[refused]) as fake, pytest.raises(DengineError, match=text):
         RtdeClient(fake.host, fake.port, (column,), (ORDER,))
 
 
-def test_what_does_not_answer_is_said_with_what_to_look_at() -> None:
+def test_what_does_not_answer_is_said():
     with (
         socket.create_server(("127.0.0.1", 0)) as server,
         pytest.raises(CellError, match=r"silent for 0\.1 s"),
@@ -106,36 +96,38 @@ def test_what_does_not_answer_is_said_with_what_to_look_at() -> None:
 
 # Insertions, cut out and accounted for.
 
-TROUBLES = [
-    Trouble(3, 50, "drop", 7),
-    Trouble(4, 20, "hold", 30),
-    Trouble(5, 40, "close"),
-    Trouble(6, 0, "drop", 4),
-    Trouble(7, SAMPLES - 1, "half"),
-    Trouble(8, 60, "garbage"),
-    Trouble(9, 3, "repeat"),
-    Trouble(10, 70, "drop", 40),
-    Trouble(11, 0, "close"),
-    Trouble(12, 30, "reset"),
-]
+TROUBLES = """
+3  50 drop    7
+4  20 hold    30
+5  40 close   1
+6  0  drop    4
+7  79 half    1
+8  60 garbage 1
+9  3  repeat  1
+10 70 drop    40
+11 0  close   1
+12 30 reset   1
+"""  # a part, a sample of it, what happens there, and for how many control cycles
 
 
-def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(
-    parts: Dataset,
-) -> None:
+def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(parts):
+    troubles = [
+        Trouble(int(part), int(sample), kind, int(cycles))
+        for part, sample, kind, cycles in rows(TROUBLES)
+    ]
     with (
-        FakeController(RobotProgram(parts), TROUBLES, speed=SPEED) as fake,
+        FakeController(RobotProgram(parts), troubles, speed=SPEED) as fake,
         cell_of(fake) as cell,
     ):
         for part in range(16):
             trace = cell.insert()
-            lost = {place for place in fake.lost if place[0] == part}
-            if (part, 0) in lost:  # its start was not seen: no sample's place is known
-                lost = {(part, sample) for sample in range(SAMPLES)}
+            lost = {sample for number, sample in fake.lost if number == part}
+            if 0 in lost:  # its start was not seen: no sample's place is known
+                lost = {*range(SAMPLES)}
             if part == 12:  # the controller's clock began anew, which ends the trace that it was in
-                lost = {(part, sample) for sample in range(30, SAMPLES)}
-            assert nan_places(part, trace) == lost
+                lost = {*range(30, SAMPLES)}
             there = ~np.isnan(trace)
+            assert {*np.flatnonzero(~there).tolist()} == lost
             np.testing.assert_array_equal(trace[there], parts.X[part][there])
             assert (cell.last.missing, cell.last.repeated) == (len(lost), part == 9)
             assert cell.last.reconnects == (part in (5, 7, 8, 11))
@@ -148,52 +140,45 @@ def test_traces_are_what_was_sent_and_every_gap_is_reported_and_none_invented(
     assert report.missing >= len(fake.lost)
 
 
-def contact() -> np.ndarray:
-    """(400,) 200 at rest, a push of 100, 100 at rest."""
-    force = np.zeros(400)
-    force[200:300] = np.linspace(6.0, 40.0, 100)
-    return force
+FORCE_OF_CONTACT = np.zeros(400)  # 200 at rest, a push of 100, 100 at rest
+FORCE_OF_CONTACT[200:300] = np.linspace(6.0, 40.0, 100)
 
 
-@pytest.mark.parametrize(
-    ("trigger", "columns"),
-    [
-        (Trigger("contact", 5.0, "FZ_Base", quiet_s=0.1), {}),
-        ("bit=3", {"actual_digital_output_bits": 8 * (contact() > 0)}),
-        ("register=2@output_int_register_30", {"output_int_register_30": 2 * (contact() > 0)}),
-        ("register@output_bit_register_64", {"output_bit_register_64": contact() > 0}),
-        ("motion=0.01", {"actual_TCP_speed[2]": -0.02 * (contact() > 0)}),
-    ],
-    ids=["contact", "digital output", "register", "bit register", "motion"],
-)
+CUTS = """
+bit=3                            actual_digital_output_bits 8
+register@output_bit_register_64  output_bit_register_64     1
+motion=0.01                      actual_TCP_speed[2]        -0.02
+contact                          actual_TCP_speed[2]        0
+"""  # a trigger, a column that it needs, and its value in contact
+
+
+@pytest.mark.parametrize(("trigger", "column", "value"), rows(CUTS))
 def test_a_recorder_cuts_several_channels_by_any_trigger_with_samples_from_before_it(
-    trigger, columns: dict
-) -> None:
-    channels = {"FX_Base": contact() / 2, "FZ_Base": contact(), "actual_q[5]": contact() / 4}
+    trigger, column, value
+):
+    if trigger == "contact":
+        trigger = Trigger("contact", 5.0, "FZ_Base", quiet_s=0.1)
+    force = FORCE_OF_CONTACT
+    channels = {"FX_Base": force / 2, "FZ_Base": force, "actual_q[5]": force / 4}
     expected = np.stack(list(channels.values()))[:, 180:240].astype(np.float32)
+    signals = Signals(**channels, **{column: float(value) * (force > 0)})
     how = {"samples": 60, "before": 20, "channels": tuple(channels)}
     with (
-        FakeController(Signals(**channels, **columns), speed=SPEED) as fake,
+        FakeController(signals, speed=SPEED) as fake,
         RtdeRecorder(fake.host, trigger, port=fake.port, **how) as recorder,
     ):
         for _ in range(3):
             np.testing.assert_array_equal(recorder.record(WAIT).trace, expected)
-    spec = TraceSpec(60, 500.0, 3, ("N", "N", ""), columns=tuple(channels))
-    assert recorder.spec == spec
+    assert recorder.spec == TraceSpec(60, 500.0, 3, ("N", "N", ""), columns=tuple(channels))
 
 
-def test_who_waits_for_an_insertion_is_woken_when_the_recorder_is_closed() -> None:
-    with (
-        FakeController(None) as fake,
-        RtdeRecorder(fake.host, port=fake.port) as recorder,
-    ):
-        closing = threading.Timer(0.2, recorder.close)
-        closing.start()
+def test_who_waits_for_an_insertion_is_woken_when_the_recorder_is_closed():
+    with FakeController() as fake, RtdeRecorder(fake.host, port=fake.port) as recorder:
+        threading.Timer(0.2, recorder.close).start()
         begin = time.monotonic()
         with pytest.raises(CellError, match="Expected an insertion"):
             recorder.record(timeout=WAIT)
         assert time.monotonic() - begin < WAIT / 2
-        closing.join()
 
 
 def decisions(cell: Cell, n: int) -> list[dict]:
@@ -207,9 +192,7 @@ def decisions(cell: Cell, n: int) -> list[dict]:
 
 
 @pytest.mark.parametrize("confirm", [False, True])
-def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(
-    make_data, confirm: bool
-) -> None:
+def test_a_run_on_a_robot_equals_a_replay_of_its_traces_decision_for_decision(make_data, confirm):
     data = make_data(60, samples=SAMPLES, failures=0.4)
     with (
         FakeController(RobotProgram(data, confirm=confirm), speed=SPEED) as fake,
@@ -242,12 +225,10 @@ def reconnected(fake: FakeController, stream: RtdeStream, anew: bool = False) ->
         ("is started anew", "started anew"),
     ],
 )
-def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
-    parts: Dataset, value: str, text: str
-) -> None:
+def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(parts, value, text):
     program = RobotProgram(parts)
 
-    def start_anew() -> None:
+    def start_anew():
         program.restart()
         del program.step
 
@@ -266,7 +247,7 @@ def test_an_order_that_is_not_carried_out_is_an_error_that_says_which_and_why(
         assert reconnected(fake, cell.recorder.stream) is None, "it is written again"
 
 
-def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off() -> None:
+def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_off():
     now, order = [0.0], encode_message(7, Verb.INSERT)
     fake = FakeController(speed=20.0)
     with fake, RtdeStream(fake.host, (), (ORDER,), port=fake.port, clock=lambda: now[0]) as stream:
@@ -279,101 +260,68 @@ def test_an_order_is_told_again_unless_it_is_old_or_the_controller_was_switched_
             assert reconnected(fake, stream, anew) == expected
 
 
-def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its_number(
-    parts: Dataset,
-) -> None:
+def test_a_new_owner_waits_for_an_old_order_and_hands_the_register_over_with_its_number(parts):
     """The first owner goes while its order is carried out; what the next one orders has the next
     number.
     """
-    program = RobotProgram(parts, approach=4000)
+    program, done = RobotProgram(parts, approach=4000), encode_message(1, ResultCode.DONE)
     with FakeController(program, speed=20.0) as fake:
         with cell_of(fake) as first:
             first.order_timeout = 0.05
             with pytest.raises(CellError, match="order 1"):
                 first.insert()
         with cell_of(fake) as second:
-            assert program.outputs[ANSWER] == encode_message(
-                1, ResultCode.DONE
-            )  # `open` waited for it
+            assert program.outputs[ANSWER] == done  # `open` waited for it
             second.reject()
             assert fake.inputs[ORDER] == encode_message(2, Verb.REJECT)
-        program.step = lambda inputs: {
-            **program.outputs,
-            ANSWER: encode_message(1, ResultCode.DONE),
-        }  # it owes an answer to order 2
+        program.step = lambda inputs: {**program.outputs, ANSWER: done}
         with pytest.raises(CellError, match="it owes an answer to order 2"):
             UrCell(fake.host, port=fake.port, start_timeout=0.5)
 
 
-def run_on(fake: FakeController, store: Path, *words: object) -> tuple[object, ...]:
-    robot = f"run --cell ur --host {fake.host}:{fake.port} --samples {SAMPLES} --store {store}"
-    return (*robot.split(), *words)
-
-
-def test_a_robot_is_driven_from_the_shell_and_the_store_has_its_parts(
-    parts: Dataset, tmp_path: Path
-) -> None:
+def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
+    parts, tmp_path
+):
     store, gap = tmp_path / "cell.db", Trouble(3, 9, "drop", 2)
-    with FakeController(RobotProgram(parts), [gap], speed=SPEED) as fake:
-        result = document(*run_on(fake, store, "--reducer", "pca", "--cycles", 12))
-        shown = line_of(*run_on(fake, store, "--cycles", 3))
-    assert (result["total"]["verified"], result["cell"]["incomplete"]) == (12, 1)
-    assert result["cell"]["missing"] >= 2
-    assert "incomplete 0" in shown
+    program = RobotProgram(Dataset(parts.X[:10], parts.y[:10]))  # then its bin is empty
+    with FakeController(program, [gap], speed=SPEED) as fake:
+        run = f"run --cell ur --host {fake.host}:{fake.port} --samples {SAMPLES} --store {store}"
+        done = dengine(*run.split(), "--reducer", "pca", "--cycles", 14)
+        assert done.exit_code == 1
+        shown = " ".join(done.output.split())
+        assert "order 21 (insert), it reported a failure" in shown
+        assert f"Everything up to cycle 10 is in {store}; the same command with --cycles 4" in shown
+        program.played = 0  # somebody has filled it
+        result = document(*run.split(), "--cycles", 4)
+    assert (result["total"]["verified"], result["cell"]["incomplete"]) == (4, 0)
     with DataEngine.open(store) as engine:
         kept = engine.store.labels.with_traces().traces
-        assert engine.store.decisions.counts()["decisions"] == 15
-    # Of a trace with a gap the label is counted, not the trace.
-    expected = {x.tobytes() for x in np.delete(parts.X[:15], 3, axis=0)}
-    assert {trace.tobytes() for trace in kept} == expected
-
-
-def test_a_robot_that_fails_ends_the_run_after_what_was_done_is_shown_and_it_goes_on_there(
-    parts, tmp_path: Path
-) -> None:
-    store = tmp_path / "cell.db"
-    program = RobotProgram(Dataset(parts.X[:10], parts.y[:10]))  # then its bin is empty
-    with FakeController(program, speed=SPEED) as fake:
-        done = dengine(*run_on(fake, store, "--reducer", "pca", "--cycles", 14))
-        shown = " ".join(done.output.split())
-        assert done.exit_code == 1
-        for words in (
-            "1 to 10 100 %",
-            "order 21 (insert), it reported a failure; look at the part, then begin again. 10 of 14",
-            f"Everything up to cycle 10 is in {store}; the same command with --cycles 4 continues",
-        ):
-            assert words in shown
-        program.played = 0  # somebody has filled it
-        succeed(*run_on(fake, store, "--cycles", 4))
-    with DataEngine.open(store) as engine:
         assert engine.store.decisions.counts()["decisions"] == 14
+    # Of a trace with a gap the label is counted, not the trace; it was filled with the same parts.
+    expected = {x.tobytes() for x in np.delete(parts.X[:10], 3, axis=0)}
+    assert {trace.tobytes() for trace in kept} == expected | {parts.X[3].tobytes()}
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ("", "Expected the robot's address for --cell ur"),
-        ("--host 127.0.0.1:x", "Expected a host, or host:port"),
-        ("--host 127.0.0.1:1", "it cannot be reached"),
-        ("--host 127.0.0.1:1 --trigger bits", "Expected a trigger, as bit=0"),
-    ],
-)
-def test_what_is_wrong_with_a_robot_is_one_line(words: str, expected: str) -> None:
-    done = dengine("run", "--cell", "ur", *words.split())
-    assert done.exit_code == 1
-    assert expected in " ".join(done.output.split())
-    assert "Traceback" not in done.output
+WRONG_ROBOTS = """
+--cell ur; Expected the robot's address for --cell ur
+--cell ur --host 127.0.0.1:x; Expected a host, or host:port
+--cell ur --host 127.0.0.1:1; it cannot be reached
+--cell ur --host 127.0.0.1:1 --trigger bits; Expected a trigger, as bit=0
+"""
 
 
-def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo: Path) -> None:
-    assert divmod(encode_message(12, Verb.PROCEED), 10) == (12, Verb.PROCEED)
-    assert encode_message(MAX_NUMBER, ResultCode.FAILED) < 2**31  # as a register holds it
+def test_what_is_wrong_with_a_robot_is_said():
+    for words, expected in rows(WRONG_ROBOTS, at="; "):
+        done = dengine("run", *words.split())
+        assert done.exit_code == 1
+        assert expected in " ".join(done.output.split())
+
+
+def test_the_robots_program_of_the_repository_keeps_to_the_same_handshake(repo):
+    assert encode_message(12, Verb.PROCEED) == 120 + Verb.PROCEED
     text = (repo / "dengine" / "cells" / "ur" / "ur_cell.script").read_text(encoding="utf-8")
-    for name in (ORDER, ANSWER, PHASE):
-        way, _, number = name.partition("_int_register_")
-        verb = "read_input" if way == "input" else "write_output"
-        assert f"{verb}_integer_register({number}" in text
-    for verb in Verb:
-        assert f"VERB_{verb.name} = {verb.value}\n" in text
-    for code in ResultCode:
-        assert f"RESULT_{code.name} = {code.value}\n" in text
+    for verb, name in (("read_input", ORDER), ("write_output", ANSWER), ("write_output", PHASE)):
+        assert f"{verb}_integer_register({name.rpartition('_')[2]}" in text
+    for code in (*Verb, *ResultCode):
+        kind = "VERB" if isinstance(code, Verb) else "RESULT"
+        assert f"{kind}_{code.name} = {code.value}\n" in text

@@ -8,8 +8,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
-from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -97,20 +96,16 @@ def python(*words: object, **options: Any) -> subprocess.Popen[str]:
     return subprocess.Popen(command, text=True, env=environment, **pipes, **options)
 
 
-def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_names_that_differ_in_capitals_alone_have_a_journal_each_where_files_do_not(monkeypatch):
     monkeypatch.setattr(journal, "IGNORES_CASE", True)
     url = make_url("sqlite:///line.db")
-    names = ["a", "A", "%41", "b:B", "B:b", "é", "É"]
-    results = [journal_path(url, name).name for name in names]
-    assert len({item.lower() for item in results}) == len(names)
-    assert results[0] == "line.db.a.journal"
+    results = [journal_path(url, name).name.lower() for name in ("a", "A", "%41", "b:B", "B:b")]
+    assert len(set(results)) == len(results)
     assert not set('<>:"/\\|?*') & set("".join(results))
 
 
 @pytest.mark.slow
-def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
+def test_the_store_and_the_process_that_retrains_keep_their_contract():
     tests = (
         "tests/contract/test_store.py",
         "tests/unit/test_incoming.py",
@@ -122,19 +117,9 @@ def test_the_store_and_the_process_that_retrains_keep_their_contract() -> None:
     assert "passed" in text or "[100%]" in text
 
 
-@dataclass
-class Cell:
-    """What two processes printed, of which the first is killed while it has the cell."""
-
-    folder: Path
-    pid: int
-    labels: list[list[str]]
-    refusal: str
-    lines: list[str]
-
-
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory, make_data) -> Cell:
+def cell(tmp_path_factory, make_data):
+    """What two processes printed, of which the first is killed while it has the cell."""
     folder, data = tmp_path_factory.mktemp("cell"), make_data(60, samples=80)
     np.savez(folder / "parts.npz", X=data.X, y=data.y)
     (folder / "mine").write_bytes(b"my notes")
@@ -150,16 +135,16 @@ def cell(tmp_path_factory: pytest.TempPathFactory, make_data) -> Cell:
             first.wait(WAIT)
             text, _ = second.communicate(" ".join(id_ for id_, _ in labels) + "\n")
     assert second.returncode == 0, text[-3000:]
-    return Cell(folder, first.pid, labels, refusal, text.splitlines())
+    assert f"process {first.pid} on " in refusal
+    return SimpleNamespace(folder=folder, labels=labels, lines=text.splitlines())
 
 
-def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(cell: Cell) -> None:
-    assert f"process {cell.pid} on " in cell.refusal
+def test_a_killed_engine_gives_its_cell_free_and_loses_no_label(cell):
     assert len(cell.labels) == 40
     assert cell.lines[0].split() == [str(label == "1") for _, label in cell.labels]
 
 
-def test_every_module_imports_and_files_of_the_system_are_used_as_elsewhere(cell: Cell) -> None:
+def test_every_module_imports_and_files_of_the_system_are_used_as_elsewhere(cell):
     """A link in a journal's place is refused, a token's bits say nothing of who may read it, and a
     child process does not keep the cell.
     """
@@ -168,7 +153,7 @@ def test_every_module_imports_and_files_of_the_system_are_used_as_elsewhere(cell
     assert (cell.folder / "mine").read_bytes() == b"my notes"
 
 
-def test_the_verbs_do_their_work(cell: Cell) -> None:
+def test_the_verbs_do_their_work(cell):
     results = json.loads(cell.lines[3])
     assert len(results) == 9
     assert [result for result in results if result["exit_code"] != 0] == []

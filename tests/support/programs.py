@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 
 class Program:
@@ -28,17 +27,11 @@ class Program:
 
     def ask(self, line: str) -> str:
         """The answer to a line; "" where the program is gone."""
-        try:
-            self.process.stdin.write(line + "\n")
-        except BrokenPipeError:
-            return ""
-        text = self.process.stdout.readline()
-        return text.rstrip("\n") if text.endswith("\n") else ""
+        self.process.stdin.write(line + "\n")
+        return self.process.stdout.readline().rstrip("\n")
 
     def decide(self, x: np.ndarray, part: str | None = None) -> list[str]:
-        """The words of a decision: its id, action, reason, ...; no more than "" where the program
-        is gone.
-        """
+        """The words of a decision: its id, action, reason, ..."""
         return self.ask(asked(x, part)).split(",")
 
     def end(self) -> tuple[int, str]:
@@ -61,16 +54,11 @@ def must_agree(answers: Iterable[list[str]], decisions: list[Any], accuracy: flo
     """Assert that answers are these decisions, embeddings where they are told, and say how long
     they took.
     """
-    for i, (words, decision) in enumerate(zip(answers, decisions, strict=True)):
-        assert words[1:3] == [str(decision.action), str(decision.reason)], i
-        assert list(map(float, words[3:5])) == pytest.approx(
-            [decision.lower, decision.upper], abs=accuracy
-        ), i
-        assert list(map(int, words[5:7])) == [decision.n_success, decision.n_failure], i
-        z = (
-            np.full(len(words) - 8, np.nan)
-            if decision.embedding is None
-            else np.ravel(decision.embedding)
-        )
-        np.testing.assert_allclose(list(map(float, words[7:-1])), z, rtol=1e-5, atol=accuracy)
+    for words, decision in zip(answers, decisions, strict=True):
+        assert words[1:3] == [decision.action, decision.reason]
+        assert words[5:7] == [str(decision.n_success), str(decision.n_failure)]
+        bounds, z = [decision.lower, decision.upper], decision.embedding
+        z = [np.nan] * (len(words) - 8) if z is None else np.ravel(z)
+        numbers = np.array([*words[3:5], *words[7:-1]], dtype=float)
+        np.testing.assert_allclose(numbers, [*bounds, *z], rtol=1e-5, atol=accuracy)
         assert float(words[-1]) > 0.0

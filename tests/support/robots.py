@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
-from itertools import repeat
+from itertools import cycle, repeat
 from types import SimpleNamespace
 from typing import Any
 
@@ -63,12 +63,9 @@ class RobotProgram:
     """
 
     def __init__(self, data: Dataset, confirm: bool = False, approach: int = 5) -> None:
-        self.data = data
-        self.confirm = confirm
-        self.approach = approach
-        self.played = 0
+        self.data, self.confirm, self.approach = data, confirm, approach
+        self.played, self._order = 0, 0
         self.outputs: Values = {RUNTIME: Runtime.PLAYING}
-        self._order = 0
         self.restart()
 
     def step(self, inputs: Values) -> Values:
@@ -160,7 +157,7 @@ class Client:
             self.socket.shutdown(socket.SHUT_WR)
 
 
-class FakeController(AbstractContextManager["FakeController"]):
+class FakeController(AbstractContextManager):
     """A controller that runs a program, in a thread, until it is closed.
 
     program : has `step`, which returns the outputs for the inputs of a control cycle, and `place`;
@@ -177,33 +174,26 @@ class FakeController(AbstractContextManager["FakeController"]):
         program: Any = None,
         troubles: Iterable[Trouble] = (),
         refuses: Collection[PackageType | str] = (),
-        port: int = 0,
         speed: float = 1.0,
     ) -> None:
         self.program = program or SimpleNamespace(place=None, step=lambda inputs: {})
-        self.inputs: Values = {}
-        self.lost: set[tuple[int, int]] = set()
-        self._refuses = {*refuses}
+        self.inputs, self.lost = {}, set()
+        self._refuses = refuses
         self._troubles = {(trouble.part, trouble.sample): trouble for trouble in troubles}
         self._until = Counter[str]()  # by kind of trouble: the cycle at which it ends
-        self._delayed = b""
-        self._clients: list[Client] = []
-        self._cycle = 0
-        self._begin = 0  # the cycle at which the clock began
+        self._clients, self._delayed = [], b""
+        self._cycle, self._begin = 0, 0  # the latter is the one at which the clock began
         self._period = CYCLE_S / speed
         self._lock = threading.Lock()
-        self._server = socket.create_server((self.host, port))
-        self.port: int = self._server.getsockname()[1]
+        self._server = socket.create_server((self.host, 0))
+        self.port = self._server.getsockname()[1]
         self._is_closing = False
         self._thread = threading.Thread(target=self._run_loop, daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._is_closing = True
         self._thread.join()
-
-    def __exit__(self, *raised: object) -> None:
-        self.close()
 
     def hang_up(self, anew: bool = False) -> None:
         """Close every connection; anew : as switched off and on, the clock and inputs too."""
@@ -308,16 +298,14 @@ class FakeController(AbstractContextManager["FakeController"]):
 
 
 class Signals:
-    """Plays columns of numbers, again and again, with a rest between."""
+    """Plays columns of numbers, again and again."""
 
     place = None
 
     def __init__(self, **columns: np.ndarray) -> None:
-        names = {name: CHANNELS.get(name, name) for name in columns}
-        length = len(next(iter(columns.values())))
-        self._rows = [{names[n]: float(c[i]) for n, c in columns.items()} for i in range(length)]
-        self._cycle = 0
+        names = [CHANNELS.get(name, name) for name in columns]
+        rows = np.stack(list(columns.values()), axis=1).tolist()
+        self._rows = cycle([dict(zip(names, row, strict=True)) for row in rows])
 
-    def step(self, inputs: dict) -> dict:
-        self._cycle += 1
-        return self._rows[self._cycle % len(self._rows)]
+    def step(self, inputs: Values) -> Values:
+        return next(self._rows)

@@ -2,10 +2,10 @@
 typed, and a certificate.
 """
 
-import http.client
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,10 +13,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from urllib.request import ProxyHandler, Request, build_opener
 
 import pytest
 
@@ -81,20 +81,12 @@ class Process:
     output: str = ""
 
     def ask(self, path: str, body: Any = None) -> dict[str, Any]:
-        with closing(
-            http.client.HTTPConnection("127.0.0.1", self.port, timeout=WAIT)
-        ) as connection:
-            data, kind = (
-                (None, {})
-                if body is None
-                else (json.dumps(body), {"content-type": "application/json"})
-            )
-            connection.request("GET" if body is None else "POST", path, data, kind)
-            answer = connection.getresponse()
-            document: dict[str, Any] = json.loads(answer.read())
-        if answer.status != 200:
-            raise OSError(f"{path}: {answer.status} {document}")
-        return document
+        """The answer to a GET, or to a POST of a body; OSError for any status but 200."""
+        data = None if body is None else json.dumps(body).encode()
+        heads = {"content-type": "application/json"}
+        asked = Request(f"http://127.0.0.1:{self.port}{path}", data, heads)
+        with build_opener(ProxyHandler({})).open(asked, timeout=WAIT) as answer:
+            return json.load(answer)
 
     def end(self, number: int = signal.SIGTERM, group: bool = False) -> int:
         """Send a signal, to its whole group as a terminal does where asked, and return its exit
@@ -106,24 +98,22 @@ class Process:
 
 
 @contextmanager
-def started(
-    folder: Path, *words: str, wait: bool = True, python_path: str = str(REPO)
-) -> Iterator[Process]:
+def started(folder: Path, *words: str) -> Iterator[Process]:
     """The example of `dengine serve --help` at a free port, and words, as they are typed in a
-    folder. wait : until it says where it listens.
+    folder; it listens.
     """
     command = [sys.executable, "-m", *example_of("serve"), "--port", "0", *words]
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    environment = os.environ | {"PYTHONPATH": python_path}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    environment = os.environ | {"PYTHONPATH": str(REPO)}
     process = subprocess.Popen(
         command, cwd=folder, env=environment, start_new_session=True, **pipes
     )
     try:
         lines, match = [], None
-        while wait and match is None and (line := process.stdout.readline()):
+        while match is None and (line := process.stdout.readline()):
             lines, match = [*lines, line], re.search(r"is served at \S+:(\d+)", line)
-        assert match is not None or not wait, "".join(lines)
-        yield Process(process, int(match[1]) if match else 0)
+        assert match is not None, "".join(lines)
+        yield Process(process, int(match[1]))
     finally:
         if process.poll() is None:
             process.kill()
@@ -159,26 +149,17 @@ def busy_engine(service: Any) -> Iterator[None]:
         free.set()
 
 
-def certificate(folder: Path, *uris: str) -> None:
-    """Files for TLS by the name of localhost: cert.pem, key.pem, and locked.pem with a password."""
-    x509 = pytest.importorskip(
-        "cryptography.x509", reason="the test's certificate needs cryptography"
-    )
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import rsa
-
-    key, now = rsa.generate_private_key(65537, 2048), datetime.now(UTC)
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "localhost")])
-    created = x509.CertificateBuilder(
-        name, name, key.public_key(), 7, now - timedelta(1), now + timedelta(2)
-    )
-    others = [x509.DNSName("localhost"), *map(x509.UniformResourceIdentifier, uris)]
-    signed = created.add_extension(x509.SubjectAlternativeName(others), critical=False).sign(
-        key, hashes.SHA256()
-    )
-    pem, form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
-    (folder / "cert.pem").write_bytes(signed.public_bytes(pem))
-    (folder / "key.pem").write_bytes(key.private_bytes(pem, form, serialization.NoEncryption()))
-    (folder / "locked.pem").write_bytes(
-        key.private_bytes(pem, form, serialization.BestAvailableEncryption(b"secret"))
-    )
+def certificate(folder: Path, *names: str) -> None:
+    """Files for TLS by the name of localhost, and other names: cert.pem, key.pem, and locked.pem
+    with a password.
+    """
+    if shutil.which("openssl") is None:
+        pytest.skip("the test's certificate needs openssl")
+    names = ",".join(("DNS:localhost", *names))
+    for words in (
+        "req -x509 -newkey rsa:2048 -nodes -days 2 -keyout key.pem -out cert.pem "
+        f"-subj /CN=localhost -addext subjectAltName={names}",
+        "rsa -aes256 -in key.pem -out locked.pem -passout pass:secret",
+    ):
+        command = ["openssl", *words.split()]
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
