@@ -175,10 +175,9 @@ class Dataset:
     def select(self, channels: Names) -> "Dataset":
         """Return a data set of the channels with these names, in this order.
 
-        For one channel, X has the shape (n, T). It is a copy or shares its memory with this X.
-        `channels` and `unit` become those of the selected channels; all other fields stay. Raises
-        DataError for an unknown name, for no name, and if the channels of the data set have no
-        names.
+        Its X is a copy, for one channel of shape (n, T). `channels` and `unit` become those of the
+        selected channels; all other fields stay. Raises DataError for an unknown name, for no name,
+        and if the channels of the data set have no names.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = set() < {*channels} <= {*self.channels}
