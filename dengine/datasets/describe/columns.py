@@ -68,7 +68,7 @@ class Column:
 
     @cached_property
     def fixed(self) -> list[str]:
-        """The word of each recording; empty if the words of any recording differ between rows."""
+        """The word of each recording; empty if one has several words or no rows."""
         is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
         return [str(words[0]) for words in self.words] if is_fixed else []
 
@@ -76,7 +76,8 @@ class Column:
     def numbers(self) -> list[Floats]:
         """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        Recordings with other cells are left out; if they are more than 10 %, the list is empty.
+        A word of `text.missing` is NaN. Recordings with other cells are left out; if they are more
+        than 10 %, the list is empty.
         """
         numbers = list[Floats]()
         for table in self.tables:
@@ -91,7 +92,7 @@ class Column:
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for the column; "" if most state none."""
+        """The unit that most files state for the column; "" if more state none than any one."""
         units = Counter(bare(table.units.get(self.name, "")) for table in self.tables)
         return units.most_common(1)[0][0]
 
@@ -99,9 +100,10 @@ class Column:
     def forms(self) -> list[str]:
         """All forms of dates and times, like `%d.%m.%Y`, that fit the cells of the column.
 
-        The list is empty if a cell is no date or time. The first 20 cells and the last cell of each
-        recording are looked at. If an ISO date fits, with or without a time of day, it is the only
-        form.
+        The list is empty if a cell is empty or no date or time. The first 20 cells and the last
+        cell of each recording are looked at. If an ISO date fits, with or without a time of day, it
+        is the only form. A column of datetimes has only the form `iso`. Raises UnreadableError if
+        cells are lists.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
