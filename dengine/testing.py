@@ -89,7 +89,8 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     embedding spaces of d dimensions: finite float32 of shape (n, K, d), equal for two clones with
     the same training, with K of 2 or more if labels are used. `transform` must return shape (n, d).
     `embed_references(X, fold)` must return, for trace i with fold k, the point `embed(X)[i, k]`.
-    None of them may write to the given traces. `reducer` may be unfitted and stays unchanged.
+    None of them may write to the given traces. Too few axes or spaces may raise IndexError instead.
+    `reducer` may be unfitted and stays unchanged.
     """
     is_estimator = isinstance(reducer, BaseEstimator)
     assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -224,8 +225,9 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
     """Assert that the reducer's `module()` compiles to TorchScript and embeds like `embed`.
 
     `module()` returns a PyTorch module, or None, and then the check passes. The points may differ
-    by 1e-4, absolute plus relative. If the module does not compile or run, TorchScript's own error
-    is raised. A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged.
+    by 1e-4, absolute plus relative. `module()` is switched to evaluation. If it does not compile or
+    run, TorchScript's own error is raised. A clone is trained on test traces, so `reducer` may be
+    unfitted and stays unchanged.
     """
     trained = _train_clone(reducer)
     module = trained.module()

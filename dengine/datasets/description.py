@@ -369,7 +369,8 @@ class Description:
 
         It has the version, the keys that do not have their default values, and the channels, for
         which `?` stands if there are none. A note on a whole section, like `channels`, is not
-        written; a note on a key that is not there stands first in its section.
+        written; a note on a key that is not there, or within a table of one line, stands first in
+        its section. Notes on `[[check]]` stand in each of its tables.
         """
         values = {"version": self.version, **self.to_dict()}
         lines = self._lines("", {k: v for k, v in values.items() if k not in SECTIONS})

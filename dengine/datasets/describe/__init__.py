@@ -65,8 +65,8 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         A folder, a file or a table of recordings.
     stated : mapping, optional
         Keys whose values are known, like `{"label.column": "verdict"}`, or sections with such keys.
-        They are kept, except for the value `?`, and the proposals for the other keys follow from
-        them.
+        They are kept, except for the value `?`, and for keys in `ignored`, which is proposed anew
+        for all files but bags. The proposals for the other keys follow from them.
 
     Returns
     -------

@@ -34,9 +34,9 @@ def propose_bag(p: Proposal) -> None:
     it is stated; so is `windows.trigger` unless it or `windows.listing` is stated, and
     `label.topic` unless anything of the label is stated. The notes on the last two list the topics
     with a field `data`, and their words. The words of a stated topic of labels are sorted into good
-    and bad. Fields that are no channels become `ignored`. Raises DataError if the file is no bag or
-    is damaged before its first message, or if the package that reads bags is missing, or if a
-    setting in `[time]` is wrong; a later damage only ends the reading.
+    and bad. Fields that are no channels become `ignored`. Stated keys stay. Raises DataError if the
+    file is no bag or is damaged before its first message, or if the package that reads bags is
+    missing, or if a setting in `[time]` is wrong; a later damage only ends the reading.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()

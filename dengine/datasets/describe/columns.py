@@ -147,13 +147,21 @@ class Proposal:
     notes: dict[str, str] = field(default_factory=dict)
 
     def put(self, key: str, value: Any, note: str = "") -> None:
-        """Set a key like `time.column`, with a note on it; does nothing if the user stated it."""
+        """Set a key like `time.column`, with a note on it; does nothing if the user stated it.
+
+        A place of the label or the part clears the other places, as `with_values` does. An earlier
+        note stays if there is no new one.
+        """
         if key not in self.stated:
             self.description = self.description.with_values({key: value})
             self.notes |= {key: note} if note else {}
 
     @property
     def unused(self) -> list[Column]:
-        """The columns that have no role yet: no clock, part, label, channel, nor words for rows."""
+        """The columns that have no role yet: no clock, part, label, channel, nor words for rows.
+
+        Nor do signals of a trigger and the column of `order` count. Raises SettingError for a
+        malformed `windows.trigger`.
+        """
         kind_of = column_kind(self.description)
         return [column for name, column in self.columns.items() if not kind_of(name)]

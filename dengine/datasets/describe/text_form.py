@@ -265,8 +265,8 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     and comma read as many numbers, or if more than 5 % of the numbers cannot be read at all; but
     not if no number has a point or comma. The mark of thousands is `?`, with a note, if it is a
     point or comma, fewer than 5 % of the numbers need it, and no number has both a point and a
-    comma: `7,286` among `7.1` and `8.2` may be a damaged number. If no mark of thousands reads as
-    many as one, there is none. Only the stated decimal mark is tried. Stated keys stay.
+    comma: `7,286` among `7.1` and `8.2` may be a damaged number. It is "" if no mark reads more
+    numbers. If the decimal mark is stated, only this one is tried. Stated keys stay.
 
     cells : the different texts in the samples that are numbers with any of these marks.
     """

@@ -113,7 +113,8 @@ def _turned(items: Any) -> Mapping[Any, Any]:
 def as_cells(values: Any) -> Cells:
     """Return values as an array (n,): of numbers if all are int or float, otherwise of objects.
 
-    An array is returned as it is.
+    An array is returned as it is. True and False count as objects; without values the array is of
+    floats.
     """
     if isinstance(values, np.ndarray) or {*map(type, values)} <= {int, float}:
         return np.asarray(values)
