@@ -210,10 +210,11 @@ def import_parts(
 
     Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
     has a label for a decision, also a forgotten one, nothing is changed: the new label is counted
-    as repeated or contradicted. A trace with a fault is stored but never used in training, and its
-    decision gets the fault as its reason. With `stops="some"` each label also stores the number of
-    accepted parts without a report since the label before; the label of a trace with a fault stores
-    0, and the next label counts these parts.
+    as repeated or contradicted. A decision that it has without a label stays as it is, too, and
+    gets only the label. New rows have the time of the import. A trace with a fault is stored but
+    never used in training, and its decision gets the fault as its reason. With `stops="some"` each
+    label also stores the number of accepted parts without a report since the label before; the
+    label of a trace with a fault stores 0, and the next label counts these parts.
 
     Parameters
     ----------

@@ -66,7 +66,8 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     stated : mapping, optional
         Keys whose values are known, like `{"label.column": "verdict"}`, or sections with such keys.
         They are kept, except for the value `?`, and for keys in `ignored`, which is proposed anew
-        for all files but bags. The proposals for the other keys follow from them.
+        for all files but bags; `[rows]` may get further columns and words. The proposals for the
+        other keys follow from them.
 
     Returns
     -------
