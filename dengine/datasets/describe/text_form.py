@@ -133,8 +133,9 @@ def _first_row(rows: Rows, width: int) -> int:
     successive rows, or fewer at the end, that have `width` cells and at least 60 % of the median
     number of numbers (over all rows but the first third), at least one. Rows directly above it
     belong to the samples, too, if they have `width` cells and the first is alike but for a number:
-    `0.0,,` above `0.1,5,` has lost a sample, but `time,force,` is no row of samples. If it has 20
-    numbers or more, each larger than the one before, and the next row has not, it names columns.
+    `0.0,,` above `0.1,5,` (a lost sample), but not `time,force,`. If the first row then has 20
+    numbers or more, each larger than the one before, and the next row has not, it names columns,
+    and the next row is the first.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)

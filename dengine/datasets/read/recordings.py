@@ -256,8 +256,8 @@ def parts_of(
     Each table that `split` yields is one part, or, if `[windows]` is stated, a long recording that
     is cut into parts. `name` is the file's name in errors, and `base` the folder of the listing in
     `[windows]`. Raises UnreadableError or DataError if the file cannot be read, DataError if it
-    cannot be split or cut, then after the parts before, and SettingError if `windows.trigger` is
-    malformed.
+    cannot be split, or one of its recordings cannot be cut (those before it are yielded), and
+    SettingError if `windows.trigger` is malformed.
     """
     table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
     for part in split(table, description):
