@@ -35,7 +35,8 @@ _REPR.maxstring = _REPR.maxother = _REPR.maxlong = MAX_LENGTH
 def without_password(text: str) -> str:
     """Return a text in which *** stands for every password of a database URL.
 
-    Two forms are masked, `scheme://user:***@host` and `password=***`.
+    Two forms are masked, `scheme://user:***@host` and `password=***`, also with the names passwd
+    and sslpassword.
     """
     return PASSWORD.sub(rf"\1={MASK}", URL.sub(rf"\1:{MASK}@", text))
 
@@ -65,8 +66,10 @@ def as_options(text: str) -> str:
     `rate_hz=500` becomes `--rate-hz 500`, and a name alone in parentheses, `(samples)`, becomes
     `(--samples)`. Only the names channel, channels, fit, samples, rate_hz, unit and trigger are
     rewritten, and not after a colon. `TraceSpec(...)` around arguments is dropped, with a
-    `DataEngine(trace=...)` around it. A value in quotes loses them unless a shell needs them. All
-    other text stays, also text in single quotes, which messages use for data.
+    `DataEngine(trace=...)` around it, also within quotes. A value in quotes loses them unless a
+    shell needs them. A value that is neither in quotes nor made of letters, digits, `_` and points,
+    like -1, stays with its name as it was. All other text stays, also text in single quotes, which
+    messages use for data.
     """
 
     def to_option(match: re.Match[str]) -> str:
@@ -88,10 +91,10 @@ def percent(share: float, form: str = ".1f") -> str:
 
 
 def outward(lower: float, upper: float, digits: int) -> tuple[float, float]:
-    """Return an interval with the lower end rounded down and the upper end rounded up.
+    """Return an interval with the lower end rounded down and the upper end rounded up, to `digits`.
 
-    So 0.8999 is shown as 0.89, and does not seem to reach a threshold of 0.9. Differences as small
-    as errors of floats are ignored.
+    So 0.8999 is shown as 0.89 with two digits, and does not seem to reach a threshold of 0.9. Both
+    ends are first rounded to nine further digits, so that errors of floats do not count.
     """
     scale = 10**digits
     return math.floor(round(lower * scale, 9)) / scale, math.ceil(round(upper * scale, 9)) / scale
@@ -180,11 +183,11 @@ def instead(
     Parameters
     ----------
     error : type
-        Class of the new error. An exception of this class passes unchanged.
+        Class of the new error. An exception of this class or a subclass passes unchanged.
     message : str
         Beginning of the new message. The text of the caught exception follows, on one line and cut
-        to 300 characters; if it is empty, the name of its class. Of an OSError only `strerror`
-        follows, which lacks the file's name, so `message` must name the file.
+        to 300 characters; if it is empty, the name of its class. Of an OSError that has a
+        `strerror` only this follows. It lacks the file's name, so `message` must name the file.
     *caught : type
         Exceptions to catch. All others pass unchanged.
     do : str

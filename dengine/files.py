@@ -147,9 +147,10 @@ def read_archive(
     Raises
     ------
     DataError
-        If the file cannot be read, is no archive or is damaged. Also if an array that is to be read
-        holds Python objects, which are never unpacked, or if the arrays that are to be read need
-        too much memory (see `check_size`).
+        If the file cannot be read, is no archive or is damaged; damage within an array that is not
+        read is not noticed. Also if an array that is to be read holds Python objects, which are
+        never unpacked, or if the arrays that are to be read need too much memory (see
+        `check_size`).
     """
     title = name or (f"{len(source)} bytes" if isinstance(source, bytes) else os.fspath(source))
     with (
@@ -171,10 +172,11 @@ def read_archive(
 
 
 def damage_of(head: bytes, magic: bytes, is_whole: bool) -> str:
-    """Return why a file is not of the expected kind; "" if it is.
+    """Return why a file is not of the expected kind: another kind, empty or cut off; "" if it is.
 
     `head` holds its first bytes, and `magic` the bytes with which every file of this kind begins.
-    `is_whole` says whether the caller found the end of the file, too.
+    `is_whole` says whether the caller found the end of the file, too; it counts only if the
+    beginning is right.
     """
     if not head.startswith(magic):
         return "it is none" if head else "it is empty"
@@ -255,8 +257,9 @@ def output_file(
 ) -> Iterator[Path]:
     """Context manager that gives the path of an empty file to write.
 
-    If the block ends well, the file is forced to disk (fsync) and renamed to `path`; if it raises,
-    the file is deleted and `path` stays as it was.
+    If the block ends well, the file is forced to disk (fsync) and renamed to `path`, and its folder
+    is forced to disk if the system can do that; if the block raises, the file is deleted and `path`
+    stays as it was. Whether `path` may be replaced is checked before the block, and not again.
 
     Parameters
     ----------
@@ -322,10 +325,11 @@ def new_folder(path: FilePath) -> Iterator[Path]:
 def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:
     """Add the SHA-256 of files to `manifest.json` in `folder`, and return the path of the manifest.
 
-    `files` are listed by their names. Entries of other files stay, and the manifest is created if
-    there is none. Call it after the files are complete. A `manifest.json` that is no manifest is
-    replaced with `force`; without it OutputError is raised. OutputError is also raised if the
-    manifest cannot be written; an OSError of reading `files` passes unchanged.
+    `files` are listed by their names without folders. Entries of files with other names stay, and
+    the manifest is created if there is none. Call it after the files are complete. A manifest is
+    replaced in any case; a `manifest.json` that is none only with `force`, without it OutputError
+    is raised. OutputError is also raised if the manifest cannot be written, or is a link; an
+    OSError of reading `files` passes unchanged.
     """
     target = folder / MANIFEST
     sums: dict[str, str] = {}

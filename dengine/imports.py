@@ -15,8 +15,8 @@ def import_class(path: str) -> type:
     Raises
     ------
     SettingError
-        If the module cannot be imported, whatever exception it raises, or has no class of that
-        name.
+        If the module cannot be imported, whatever subclass of Exception it raises, or has no class
+        of that name. A SettingError that the module raises passes unchanged.
     """
     module, _, name = path.partition(":")
     with instead(

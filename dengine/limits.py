@@ -109,7 +109,11 @@ class ForceLimits:
 
 
 def _is_channel(value: Any) -> bool:
-    """Return whether a value can name a channel: an index, or a name that fits the text form."""
+    """Return whether a value can name a channel: an index, or a name that fits the text form.
+
+    An index is 0 to 1e9. A name is 1 to 200 printable characters, not digits alone, without a
+    blank, a colon or `=`.
+    """
     if not isinstance(value, str):
         return is_whole(value, 0, MOST)
     return is_name(value) and not value.isdecimal() and {*" :="}.isdisjoint(value)

@@ -173,7 +173,10 @@ class Recipe:
 
     @property
     def user_classes(self) -> list[str]:
-        """The `module:Class` of its reducer and of its decision rule, if a user wrote them."""
+        """The `module:Class` of its reducer and decision rule, without classes of dengine.
+
+        A reducer that is an object is named if `to_toml` writes it as `module:Class`.
+        """
         names = (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
         return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
 
@@ -192,8 +195,8 @@ class Recipe:
         Raises
         ------
         SettingError
-            For anything else, and for a file that cannot be read, has more than 1 MB or is no
-            recipe.
+            For anything else, and for a file that cannot be read, has more than 1 MB, is not UTF-8
+            or is no recipe.
         """
         if isinstance(recipe, Recipe):
             return recipe
@@ -217,10 +220,11 @@ class Recipe:
     def from_toml(cls, text: str, where: str = "recipe") -> Recipe:
         """Parse the text that `to_toml` writes, and return the recipe.
 
-        Settings that are missing get their defaults, and "none" is read as None. The policy's
-        "windows", the name in earlier versions, is read as "force_limits". No class of a reducer is
-        imported, so an unknown reducer is not noticed here. Raises SettingError for text that is
-        not TOML, an unknown key or a value out of range. `where` is the recipe's name in errors.
+        Settings that are missing get their defaults, and "none" is read as None, but not in
+        [policy], which has no None. The policy's "windows", the name in earlier versions, is read
+        as "force_limits". No class of a reducer is imported, so an unknown reducer is not noticed
+        here. Raises SettingError for text that is not TOML, an unknown key or a value out of range.
+        `where` is the recipe's name in errors.
         """
         # tomllib raises ValueError for huge integers, too.
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
@@ -250,7 +254,8 @@ class Recipe:
         `settings` has texts by name. No class of a reducer is imported. The defaults of `radius`
         and `retrain_every` stand in that class, so a store must have both, unless the reducer is a
         name in `RECIPES`: else StoreError is raised, because the store is damaged. Raises
-        SettingError for a text that is no recipe. `where` is the recipe's name in errors.
+        SettingError for a text that is no recipe, and KeyError if the settings have no recipe.
+        `where` is the recipe's name in errors.
         """
         recipe = cls.from_toml(settings["recipe"], where)
         missing = [name for name in ("radius", "retrain_every") if vars(recipe)[name] is None]
@@ -267,9 +272,10 @@ class Recipe:
         If `radius` or `retrain_every` is None, the reducer's class is imported, and its default is
         written. Of a reducer given by name the recipe's `params` are written, and no defaults. A
         reducer object is written as `module:Class` and its parameters that are not None. If a
-        parameter is no text, number or boolean, like the steps of a pipeline, or the class cannot
-        be imported by name, the object is written as "object Class", and the user must hand it in
-        again. Raises SettingError if the class of a named reducer must be imported, and cannot be.
+        parameter is no text, number or boolean, like the steps of a pipeline, or is None although
+        its default is not, or if the class is local or stands in `__main__`, the object is written
+        as "object Class", and the user must hand it in again. Raises SettingError if the class of a
+        named reducer must be imported, and cannot be, or if its default is out of range.
         """
         plain = {f.name: getattr(self, f.name) for f in fields(self)}
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
@@ -280,20 +286,32 @@ class Recipe:
         return "\n".join(_table_text(name, values) for name, values in tables.items())
 
     def with_settings(self, **settings: Any) -> Recipe:
-        """Return a copy with these settings; those that are None stay as they are."""
+        """Return a copy with these settings; arguments that are None change nothing.
+
+        A `radius` or `retrain_every` that is None in this recipe becomes the default of the
+        reducer that it has now, also if `settings` have another reducer. Raises SettingError for a
+        value out of range, and if the class of this reducer must be imported for that, and cannot
+        be; TypeError for an unknown setting.
+        """
         changes = {name: value for name, value in settings.items() if value is not None}
         return replace(self, **changes)
 
     def with_policy(self, **changes: Any) -> Recipe:
-        """Return a copy whose policy has these settings changed, as `Policy.changed` does."""
+        """Return a copy whose policy has these settings changed, as `Policy.changed` does.
+
+        A `radius` or `retrain_every` that is None in this recipe becomes the reducer's default.
+        Raises SettingError for a policy's value out of range, and if the class of the reducer must
+        be imported for its defaults, and cannot be.
+        """
         return replace(self, policy=self.policy.changed(**changes))
 
     def make_reducer(self, seed: int) -> Any:
         """Return the reducer: the object itself if one was given, or a new one, made by name.
 
-        The class of a named reducer is imported. If it has parameters `random_state` and `folds`,
-        they get the seed and the recipe's `folds`; the recipe's `params` take precedence over both.
-        Raises SettingError if there is no such reducer, or if it does not take these `params`.
+        The class of a named reducer is imported. If it has a parameter `random_state` or `folds`,
+        that gets the seed or the recipe's `folds`; the recipe's `params` take precedence. Raises
+        SettingError if there is no such reducer, or if it does not take these `params`; what the
+        constructor of a user's class raises passes unchanged.
         """
         if not isinstance(self.reducer, str):
             return self.reducer

@@ -89,7 +89,8 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     embedding spaces of d dimensions: finite float32 of shape (n, K, d), equal for two clones with
     the same training, with K of 2 or more if labels are used. `transform` must return shape (n, d).
     `embed_references(X, fold)` must return, for trace i with fold k, the point `embed(X)[i, k]`.
-    None of them may write to the given traces. `reducer` may be unfitted and stays unchanged.
+    None of them may write to the given traces. Too few axes or spaces may raise IndexError instead.
+    `reducer` may be unfitted and stays unchanged.
     """
     is_estimator = isinstance(reducer, BaseEstimator)
     assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
@@ -224,8 +225,9 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
     """Assert that the reducer's `module()` compiles to TorchScript and embeds like `embed`.
 
     `module()` returns a PyTorch module, or None, and then the check passes. The points may differ
-    by 1e-4, absolute plus relative. If the module does not compile or run, TorchScript's own error
-    is raised. A clone is trained on test traces, so `reducer` may be unfitted and stays unchanged.
+    by 1e-4, absolute plus relative. `module()` is switched to evaluation. If it does not compile or
+    run, TorchScript's own error is raised. A clone is trained on test traces, so `reducer` may be
+    unfitted and stays unchanged.
     """
     trained = _train_clone(reducer)
     module = trained.module()
@@ -238,10 +240,12 @@ def its_module_compiles_and_embeds_as_it_does(reducer: Any) -> None:
 def a_version_answers_as_it_was_trained(reducer: Any) -> None:
     """Assert what an engine requires of a version: restored or compiled, it embeds as when trained.
 
-    Two models with clones of `reducer` are trained on test traces, the second with opposite labels,
-    like after a retrain of an engine. Their points must be finite; a reducer that is restored from
-    the trained one's state, and the model's compiled module, must give the points of the training.
-    `reducer` may be unfitted and stays unchanged.
+    Two models with clones of `reducer` are trained from scratch on test traces, the second with
+    opposite labels. As in a retrain, the module that decides for the second may be a copy of the
+    one that was compiled for the first, with weights of its own. The reference points must be
+    finite. For eight of the traces, a reducer that is restored from the trained one's state, or
+    without a state the trained one itself, must give the same points again, and so must the model's
+    compiled module. `reducer` may be unfitted and stays unchanged.
     """
     X, y = toy_traces()
     for labels in (y, 1 - y):
@@ -271,8 +275,9 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     """Assert that an engine that is closed and opened again decides the same, bit for bit.
 
     It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
-    Its first retrain must be accepted. Its decisions on 20 further traces are compared, without ids
-    and reasons. `reducer` may be unfitted and stays unchanged.
+    Its first retrain must be accepted. Its decisions on 20 further traces, made before the closing
+    and again after it, must have the same action, bound, counts, embedding and version. `reducer`
+    may be unfitted and stays unchanged.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
@@ -348,7 +353,7 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
 
 
 def _decide_all(engine: DataEngine, X: NDArray[np.float32]) -> list[tuple[Any, ...]]:
-    """Let an engine decide on each trace of X; return what was decided, without ids and reasons.
+    """Let an engine decide on each trace of X; return a part of what was decided.
 
     X has the shape (n, C, T). For each trace there is a tuple of the decision's action, lower,
     upper, n_success, n_failure, embedding and model_version. The engine records the decisions.

@@ -74,10 +74,10 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     Parameters
     ----------
     X : array, shape (n, samples) or (n, channels, samples)
-        Of any real dtype.
+        Of any real dtype. n may be 0, but not the other axes.
     trace_spec : TraceSpec, optional
         What the traces must look like; another length is fitted as `trace_spec.fit` says. None: any
-        shape.
+        shape, also one with more channels than samples.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def as_traces(X: ArrayLike, trace_spec: TraceSpec | None = None) -> TraceArray:
     Raises
     ------
     TraceError
-        For another shape, or values that are no real numbers.
+        For another shape, or values that are no real numbers. NaN and infinities pass.
     """
     x = _as_real(X)
     x = x[:, None, :] if x.ndim == 2 else x
@@ -214,6 +214,7 @@ def clip_extremes(traces: TraceArray) -> TraceArray:
     Parameters
     ----------
     traces : array of float32, shape (n, C, T)
+        Finite.
 
     Returns
     -------

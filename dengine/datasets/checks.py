@@ -21,9 +21,10 @@ def check_description(description: Description) -> None:
     """Raise DataError unless recordings can be read by a description; no file is looked at.
 
     No key may have the value `?`, except in `[ignored]` and `[[check]]`. The number of samples of a
-    trace must be stated. There must be a channel, and all channels must have the same `limit`, the
-    range of the sensor. With `order` "time" there must be a column of times. The settings in
-    `[time]` must pass `check_clock`, and those in `[text]` must pass `check_text`.
+    trace must be 1 or more. There must be a channel, and all channels must have the same `limit`,
+    the range of the sensor. With `order` "time" there must be a column of times. The settings in
+    `[time]` must pass `check_clock`, and those in `[text]` must pass `check_text`. Nothing else is
+    checked: neither a trigger nor an expression, nor whether columns exist.
     """
     if open_keys := description.open_keys:
         raise DataError(f"Expected a description without ?, still open: {listed(open_keys)}.")
@@ -45,7 +46,8 @@ def check_clock(clock: Clock) -> None:
     """Raise DataError unless times can be read with the settings in `[time]`.
 
     A time zone, if stated, must have a known name, and a rate, if stated, must be between 1 Hz and
-    1 MHz. If there are columns of times, there must be as many formats.
+    1 MHz, both included. If there are columns of times, there must be as many formats; what these
+    say is not checked.
     """
     with instead(DataError, "Expected a time zone in time.zone", LookupError, ValueError, OSError):
         ZoneInfo(clock.zone or "UTC")
@@ -64,8 +66,8 @@ def check_text(text: TextForm) -> None:
     """Raise DataError unless text files can be read with the settings in `[text]`.
 
     Python must know the encoding. The delimiter and the decimal mark must be one character each.
-    The decimal mark and the mark of thousands, which may be "", must differ, and be no digit, sign
-    or e. The samples must begin in line 1 or later.
+    The decimal mark and the mark of thousands, which may be "", must differ, and be no digit, sign,
+    e or E. `text.data`, the line of the first samples, must be 1 or more.
     """
     with instead(DataError, "Expected an encoding in text.encoding", LookupError, ValueError):
         "".encode(text.encoding)  # also refuses codecs that are of no text
@@ -113,7 +115,7 @@ def without_repeats(recordings: Sequence[Recording]) -> tuple[list[Recording], l
 def lost_note(recordings: Sequence[Recording]) -> str:
     """Return a sentence on lost samples, which are NaN or infinite; "" if no recording has any.
 
-    It says how many samples are lost, and in which recordings.
+    It says how many samples are lost, in how many recordings, and names up to eight of these.
     """
     n_lost = {item.source: int((~np.isfinite(item.trace)).sum()) for item in recordings}
     lost = [source for source, n in n_lost.items() if n]
@@ -125,7 +127,8 @@ def tolerance_note(data: Dataset, lower_bound: float) -> str:
     """Return a warning if the tolerance of a policy is too wide for these parts; "" if it is not.
 
     The tolerance, 1 - `lower_bound`, is the share of accepted parts that may be bad. It is too wide
-    if the share of bad parts in the data set is not above it: accepting every part would meet it.
+    if the share of bad parts in the data set is at most as large: accepting every part would meet
+    it. The data set must have a trace.
     """
     share = 1 - float(data.y.mean())
     tolerance = 1 - lower_bound

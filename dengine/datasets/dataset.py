@@ -175,9 +175,9 @@ class Dataset:
     def select(self, channels: Names) -> "Dataset":
         """Return a data set of the channels with these names, in this order.
 
-        For one channel, X has the shape (n, T). `channels` and `unit` become those of the selected
-        channels; all other fields stay. Raises DataError for an unknown name, for no name, and if
-        the channels of the data set have no names.
+        Its X is a copy, for one channel of shape (n, T). `channels` and `unit` become those of the
+        selected channels; all other fields stay. Raises DataError for an unknown name, for no name,
+        and if the channels of the data set have no names.
         """
         names = ", ".join(self.channels) or "none, its channels have no names"
         is_known = set() < {*channels} <= {*self.channels}
@@ -194,9 +194,10 @@ class Dataset:
     def cut(self, samples: int) -> "Dataset":
         """Return a data set with only the first `samples` samples of each trace.
 
-        If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result. Raises
-        DataError if `samples` is below 1, if the traces are shorter, or if `fit` is "resample" and
-        they would become shorter: their first samples are not those of the recordings.
+        If `fit` is "pad" and the traces become shorter, it becomes "cut" in the result; all other
+        fields stay, `lengths` too. Raises DataError if `samples` is below 1, if the traces are
+        shorter, or if `fit` is "resample" and they would become shorter: their first samples are
+        not those of the recordings.
         """
         most = self.X.shape[-1]
         least = most if self.fit == "resample" else 1
@@ -242,7 +243,9 @@ def make_dataset(
         If X has no trace, another shape, more channels than samples, or values that are no real
         numbers; if y, part, cause or the names of the channels do not fit X; if a label is neither
         1 nor 0, or a part's number neither a text nor an integer; or if the rate is not between
-        1 Hz and 1 MHz. NaN and infinities pass.
+        1 Hz and 1 MHz, both included. NaN and infinities in X pass.
+    TypeError
+        If `about` has a name that is no other field of `Dataset`.
     """
     try:
         cube = as_traces(X)

@@ -302,10 +302,10 @@ class Description:
     def from_dict(cls, values: Stated, where: str = "description") -> "Description":
         """Return the description that nested dicts state, like those of a TOML file.
 
-        The value of every key may be `?`, but no section; a channel named `?` is left out. Of a
-        channel, a text in place of a dict is its unit. Raises DataError for an unknown key (the
-        message names the most similar key), for a value of the wrong type, and for a description
-        of a newer version.
+        The value of every key but `version` may be `?`, but no section; a channel named `?` is left
+        out. Of a channel, a text in place of a dict is its unit. `notes` are no key. Raises
+        DataError for an unknown key (the message names the most similar key, or else all), for a
+        value of the wrong type, and for a description of a newer version or one that is no integer.
 
         where : what the description is called in errors.
         """
@@ -350,14 +350,15 @@ class Description:
     def save(self, path: FilePath, force: bool = False) -> Path:
         """Write the TOML file, over an existing one only with `force`; return its path.
 
-        Raises OutputError if the file exists, without `force`, or cannot be written.
+        Raises OutputError if the file exists, without `force`, or cannot be written, and for a
+        database, folder, link or device also with `force` (`files.check_output`).
         """
         return write_output(path, self.to_toml().encode(errors="replace"), force)
 
     def to_dict(self) -> dict[str, Any]:
         """Return nested dicts of TOML's types, without the notes and without default values.
 
-        The channels are always there; if there are none, `?` stands for them.
+        The channels are always there, each with its unit; if there are none, `?` stands for them.
         """
         channels = self.channels or {UNKNOWN: Channel()}
         tables = {column: {"unit": c.unit, **_plain(c)} for column, c in channels.items()}
@@ -367,7 +368,9 @@ class Description:
         """Return the text of the TOML file, with `notes` as comments above their keys.
 
         It has the version, the keys that do not have their default values, and the channels, for
-        which `?` stands if there are none.
+        which `?` stands if there are none. A note on a whole section, like `channels`, is not
+        written; a note on a key that is not there, or within a table of one line, stands first in
+        its section. Notes on `[[check]]` stand in each of its tables.
         """
         values = {"version": self.version, **self.to_dict()}
         lines = self._lines("", {k: v for k, v in values.items() if k not in SECTIONS})
@@ -422,8 +425,9 @@ class Description:
 
         Of the keys `column`, `path`, `line`, `topic` and `listing` in `[label]`, stating one clears
         the others, and likewise those in `[part]`; words for good and bad stay. Stating a channel
-        replaces the channel `?`. The notes stay. Raises DataError for an unknown key, for a value
-        of the wrong type, and if what stands before the dot in a key is no section.
+        replaces the channel `?`. A key without a dot may be a whole section, which its value then
+        replaces. The notes stay. Raises DataError for an unknown key, for a value of the wrong
+        type, and if what stands before the dot in a key is no section.
         """
         values = self.to_dict()
         for section, sources in SOURCES.items():
@@ -444,8 +448,8 @@ class Description:
     def with_channels(self, columns: Sequence[str]) -> "Description":
         """Return the description with exactly these columns as channels, in this order.
 
-        Each must be in `[channels]`, whose settings stay, or in `[ignored]`, which gives its unit.
-        Raises DataError for any other column.
+        Each must be in `[channels]`, whose settings stay, or else in `[ignored]`, which gives its
+        unit and keeps the column. Raises DataError for any other column.
         """
         channels = {column: Channel(unit) for column, unit in self.ignored.items()}
         channels |= self.channels
@@ -515,9 +519,10 @@ def _made(kind: Any, value: Any, where: str) -> Any:
 def _as_kind(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file in the type of its key, `kind`; `?` is returned as it is.
 
-    `kind` is a type in `KINDS`: text, whole number, number, boolean. A number or boolean becomes a
-    text if a text is expected. Raises DataError for a value of another type and for a number that
-    is not finite; `where` is the name of the key in the message.
+    `kind` is a type in `KINDS`: text, whole number, number, boolean, or whole number or text. A
+    number or boolean becomes a text if only a text is expected, and a whole number a float if a
+    number is. Raises DataError for a value of another type and for a number that is not finite;
+    `where` is the name of the key in the message.
     """
     if value == UNKNOWN:
         return value

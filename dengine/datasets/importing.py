@@ -75,10 +75,10 @@ def in_form_of(store: "StoreLike", description: Description) -> Description:
 def check_agreement(data: Dataset, trace_spec: TraceSpec) -> None:
     """Raise TraceError if a data set does not agree with `trace_spec`, that of a store.
 
-    If both rates are known, they must be the same within 2 %; if both have channel names, these
-    must be the same in the same order. Traces that were read by a description (`data.lengths` is
-    set) must have the store's number of samples, and the store and the data set must both have the
-    `fit` "resample", or neither.
+    If both rates are known, they must be the same within 2 % of the higher one; if both have
+    channel names, these must be the same in the same order. Traces that were read by a description
+    (`data.lengths` is set) must have the store's number of samples, and the store and the data set
+    must both have the `fit` "resample", or neither. The number of channels is not compared.
     """
     spec = data.spec
     fits = {spec.fit, trace_spec.fit}
@@ -143,7 +143,8 @@ def import_labelled(
     Parameters
     ----------
     store : path, URL or store
-        A new store, which is created, or a used one. A store object stays open.
+        A new store, which is created, or a used one. A store object stays open, and so does the
+        engine that this call makes on it.
     dataset : object
         Anything `load_dataset` takes. Recordings that a description describes are brought to the
         length of the store's traces.
@@ -165,14 +166,16 @@ def import_labelled(
     Raises
     ------
     TraceError
-        If the traces do not agree with those of the store, or a part's number is longer than 200
-        characters.
+        If the traces do not agree with those of the store, or a part's number is empty, longer than
+        200 characters or has characters that do not print. A store that was new exists then.
     DataError
         If the data set cannot be read, see `load_dataset`; then no store is created.
     SettingError
-        If the recipe is wrong, or recipe or seed are not those of a used store.
+        If the recipe is wrong, recipe or seed are not those of a used store, or `windows.trigger`
+        of the description is malformed.
     StoreError
-        If the store cannot be opened or written; chunks before the error stay.
+        If the store cannot be opened or written, or another engine owns its cell; chunks before the
+        error stay.
     """
     description = None
     if own_reader(dataset) is None:
@@ -207,10 +210,11 @@ def import_parts(
 
     Each chunk is one transaction; if storing one raises StoreError, those before stay. If the store
     has a label for a decision, also a forgotten one, nothing is changed: the new label is counted
-    as repeated or contradicted. A trace with a fault is stored but never used in training, and its
-    decision gets the fault as its reason. With `stops="some"` each label also stores the number of
-    accepted parts without a report since the label before; the label of a trace with a fault stores
-    0, and the next label counts these parts.
+    as repeated or contradicted. A decision that it has without a label stays as it is, too, and
+    gets only the label. New rows have the time of the import. A trace with a fault is stored but
+    never used in training, and its decision gets the fault as its reason. With `stops="some"` each
+    label also stores the number of accepted parts without a report since the label before; the
+    label of a trace with a fault stores 0, and the next label counts these parts.
 
     Parameters
     ----------
@@ -230,7 +234,12 @@ def import_parts(
     -------
     ImportReport
         It counts labels, not parts: those that were stored, quarantined with a faulty trace, known
-        already and contradicted. `resumed` is True.
+        already and contradicted. `resumed` is True, whatever the store was.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be read or written.
     """
     gate = TraceGate(trace_spec)
     counts: dict[str, Any] = dict.fromkeys(
@@ -289,8 +298,8 @@ def _as_stored(
 
     Its propensity, the probability of a check, is the policy's audit rate (1 in shadow mode) if the
     model was certain, else 1. If `gate` finds a fault in the trace, this becomes the reason of the
-    decision, and the record is marked as quarantined. `time` is that of the decision, seconds since
-    1970.
+    decision, whose propensity stays, and the record is marked as quarantined. `time` is that of the
+    decision, seconds since 1970.
     """
     fault, content = gate(torch.from_numpy(trace))
     is_certain = decision.predicted is not Action.VERIFY
@@ -305,8 +314,8 @@ def _verifying_decisions(traces: TraceArray, data: Dataset) -> Iterator[Decision
 
     The id of a decision is made of the hash of the trace's content and a counter of equal traces,
     so that the same data set gives the same ids. The parts' numbers are those of `data`. Raises
-    TraceError for a part's number of more than 200 characters, or with characters that do not
-    print.
+    TraceError for a part's number that is empty, has more than 200 characters, or one that does
+    not print; the decisions before it are yielded.
     """
     n_equal = Counter[int]()
     parts = [None] * len(data) if data.part is None else data.part.tolist()

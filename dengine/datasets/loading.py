@@ -40,8 +40,9 @@ def load_dataset(
         DataFrame. No description is needed for a `Dataset`; arrays X (n, T) or (n, C, T) and y
         (n,); an .npz file with X, y, and perhaps scale, rate_hz, unit, cause (why a part failed),
         channels and part; a table that `Dataset.to_frame` made, or its Parquet file; the SQLite
-        file of a store, of which the labelled traces are read. A file or table of these is read by
-        a description all the same if one is given, or saved beside the file.
+        file of a store, of which the labelled traces are read (a damaged one is left out, and the
+        store gets an event on it). A file or table of these is read by a description all the same
+        if one is given, or saved beside the file.
     description : Description, dict or path, optional
         How the recordings are written; not beside a `Dataset` or a pair. None: the description that
         was saved, as `recordings.toml` in the folder or `FILE.toml` beside the file.
@@ -53,7 +54,7 @@ def load_dataset(
         fewer samples, or none, or resamples the traces, this number replaces the one that it
         states. None: as the description states, or as the data set is.
     progress : callable, optional
-        Called with 1 after each file.
+        Called with 1 after each file that is read by a description; once for a bag or a table.
 
     Returns
     -------
@@ -67,12 +68,13 @@ def load_dataset(
     DataError
         If the description is missing or has a key whose value is `?` (the message says what to
         type), if the source or a channel does not exist, if no recording is left, if `samples` is
-        below 1, if traces that were read without a description are shorter than `samples`, or if
-        a file cannot be read.
+        below 1, or if traces that were read without a description are shorter than `samples`, or
+        longer although they were resampled. Also if none of the files can be read, a listing of
+        labels cannot, or the traces and labels do not fit together (`make_dataset`).
     SettingError
         If `windows.trigger` of the description, which cuts long recordings, is malformed.
     StoreError
-        If the store in a SQLite file cannot be opened.
+        If the store in a SQLite file cannot be opened or read, or has traces of several shapes.
     """
     stated = channels.split(",") if isinstance(channels, str) else channels or ()
     names = tuple(map(str.strip, stated))
@@ -120,7 +122,9 @@ def description_of(
     ------
     DataError
         If no description was saved (the message says what to type), none is given for a DataFrame,
-        the source does not exist, or a description cannot be read or proposed.
+        the source does not exist, a stated key is unknown or its value of the wrong type, or a
+        description cannot be read or proposed. Without `propose`, too, a proposal is made for the
+        message, and its errors come first.
     SettingError
         If none was saved, and a stated `windows.trigger` is malformed.
     """
@@ -144,8 +148,8 @@ def description_of(
 def count_files(source: str, description: Description | None) -> int:
     """Return how many files of a source are read, for a progress bar.
 
-    It is 1 without a description. Raises DataError if the source does not exist, or the description
-    fits no file.
+    It is 1 without a description; `source` is not looked at then. Raises DataError if the source
+    does not exist, the description fits no file, or one of its patterns is malformed.
     """
     return 1 if description is None else len(find_files(as_source(source), description))
 
@@ -196,7 +200,8 @@ def own_reader(source: Any) -> Callable[[], Dataset] | None:
 def _is_own_archive(path: Path) -> bool:
     """Return whether a file is an .npz archive with an array X, and numbers y that are all 1 or 0.
 
-    A file of another suffix is not opened. Raises DataError for an .npz file that is damaged.
+    A file of another suffix is not opened. Raises DataError for an .npz file that is damaged or
+    cannot be opened; of its arrays only y is read.
     """
     if path.suffix.lower() != ".npz":
         return False
@@ -221,7 +226,10 @@ def _is_own_table(path: Path) -> bool:
 
 
 def _read_own_table(path: Path) -> Dataset:
-    """Return the data set of a Parquet file that `_is_own_table` accepts."""
+    """Return the data set of a Parquet file that `_is_own_table` accepts.
+
+    Raises DataError if `make_dataset` refuses its arrays; the errors of pandas pass unchanged.
+    """
     import pandas as pd
 
     return _from_own_frame(pd.read_parquet(path), path.stem)
@@ -230,7 +238,9 @@ def _read_own_table(path: Path) -> Dataset:
 def _from_own_frame(frame: Any, name: str = "table") -> Dataset:
     """Return the data set of a DataFrame that `Dataset.to_frame` made; `name` becomes its name.
 
-    Raises DataError if `make_dataset` refuses its arrays.
+    All columns but label, part and cause are samples. Raises DataError if `make_dataset` refuses
+    its arrays, KeyError if it has no longer a column `label`, and ValueError if columns of samples
+    are no numbers or their number is not that of `attrs`.
     """
     about = frame.attrs[OWN]
     words = frame[frame.columns.intersection(["part", "cause"])].astype(str)
@@ -258,7 +268,7 @@ def _from_arrays(arrays: Stated, name: str) -> Dataset:
 
     X and y must be there; rate_hz, unit, channels, limit, fit, cause and part are used if they are
     there, and any other array is ignored. `name` becomes the name of the data set. Raises DataError
-    if `make_dataset` refuses the arrays.
+    if `make_dataset` refuses the arrays, and TypeError or ValueError if `rate_hz` is no number.
     """
     units, channels = (
         tuple(map(str, np.atleast_1d(arrays.get(key, ())).tolist())) for key in ("unit", "channels")

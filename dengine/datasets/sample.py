@@ -18,8 +18,8 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
     """Write n insertions of the bundled set as CSV files, such as `insertion_0001_True.csv`.
 
     Each file has 960 to 1000 rows at 500 Hz, with the time in Timestamp, the force in FZ_Base, the
-    height in TCP_Z, and the label in its name: True is good. File 44, or the last one of fewer, is
-    cut off in its last line. The same call always writes the same files.
+    height in TCP_Z, which is only noise, and the label in its name: True is good. File 44, or the
+    last one of fewer, lacks its last 16 characters. The same call always writes the same files.
 
     Parameters
     ----------
@@ -47,8 +47,9 @@ def write_sample(folder: FilePath, n: int = 200) -> None:
 def record(force: NDArray[np.float32], rng: np.random.Generator) -> pd.DataFrame:
     """Return the first 960 to 1000 samples of an insertion as a table that a cell would record.
 
-    A DataFrame with the columns Timestamp, in seconds from 0 at 500 Hz, FZ_Base, which is `force`,
-    shape (T,), and TCP_Z, the height, which is only noise. `rng` gives the number and the noise.
+    A DataFrame with the columns Timestamp, in seconds from 0 at 500 Hz, FZ_Base, the beginning of
+    `force`, shape (T,) with T of 1000 or more, and TCP_Z, the height, which is only noise. `rng`
+    gives the number and the noise.
     """
     n = int(rng.integers(960, 1001))
     height = rng.normal(0.0, 2e-5, n)  # the noise of a robot that stands still

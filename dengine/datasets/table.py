@@ -93,8 +93,8 @@ class Table:
     def take(self, rows: Any) -> "Table":
         """Return a table of the rows that a slice or an array of positions or booleans selects.
 
-        Their line numbers are selected, too. A column of one cell holds for all rows and stays; so
-        do `damage` and all else.
+        Their line numbers are selected, too. A column of one cell, and a single line number, hold
+        for all rows and stay, even if no row is selected; so do `damage`, `origin` and all else.
         """
         lines = self.lines
         if len(lines) > 1:
@@ -103,10 +103,11 @@ class Table:
         return replace(self, columns=columns, lines=lines)
 
     def words(self, name: str) -> Cells:
-        """Return the cells of a column as texts, shape (rows,), without blanks around them.
+        """Return the cells of a column as texts, without blanks around them.
 
-        Whole numbers have no decimal point: 1.0 is "1". NaN and None are "". Raises UnreadableError
-        if there is no such column, or its cells are lists.
+        The shape is (rows,), or (1,) if one cell holds for all rows. Whole numbers have no decimal
+        point: 1.0 is "1". NaN and None are "". Raises UnreadableError if there is no such column,
+        or its cells are lists.
         """
         import pandas as pd
 
@@ -116,11 +117,12 @@ class Table:
         return np.asarray(texts[codes])
 
     def numbers(self, name: str, form: TextForm) -> Floats:
-        """Return a column as numbers, float64 (rows,); a missing number is NaN.
+        """Return a column as numbers, float64 (rows,) or (1,); a missing number is NaN.
 
         `form` is the section `[text]`, with the decimal mark, the mark of thousands and the words
-        for a missing number. Raises UnreadableError if there is no such column, and for any other
-        cell: one that is no number of this form, is infinite, or is too large for float32.
+        for a missing number; a column of numbers does not need it. Raises UnreadableError if there
+        is no such column, and for any other cell: one that is no number of this form, is infinite,
+        or is too large for float32.
         """
         cells = self.column(name)
         if cells.dtype.kind not in "iuf":
@@ -136,7 +138,8 @@ class Table:
         """Raise UnreadableError for the first row in which `is_bad` is True; if none is, return.
 
         is_bad : bool, shape (rows,). wanted : what was expected, for the message. name : the column
-        whose cell the message shows.
+        whose cell the message shows. The error has the line, if known, and the column, by `origin`
+        that of the file.
         """
         if is_bad.any():
             row = int(is_bad.argmax())
@@ -222,8 +225,10 @@ def pattern_of(decimal: str, thousands: str) -> re.Pattern[str]:
 def _number(cell: Any, form: TextForm, pattern: re.Pattern[str]) -> float:
     """Return the number in a cell; NaN for a word of `form.missing`, infinity for any other text.
 
-    A float is returned as it is; None is read as the word `null`. `form` has the decimal mark and
-    the mark of thousands, and `pattern` is the regular expression of a number with these.
+    A float is returned as it is; None is read as the word `null`. A text that is a number counts as
+    one even if it is in `form.missing`; one too large for float64 is infinity. `form` has the
+    decimal mark and the mark of thousands, and `pattern` is the regular expression of a number with
+    these.
     """
     if isinstance(cell, float):
         return cell

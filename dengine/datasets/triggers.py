@@ -97,9 +97,10 @@ def as_trigger(value: Any) -> Trigger:
 
     "bit=0": digital output 0 is on. "register@NAME": the signal NAME is not zero;
     "register=1@NAME": it is 1. "contact=5": the force FZ_Base is 5 N or more, in either direction.
-    "motion=0.002": the tool moves faster than 2 mm a second. Only bit and contact need a number. A
-    bit is 0 to 31, a force and a speed are above 0. Without @SIGNAL each kind reads a default
-    signal. Raises SettingError for any other value.
+    "motion=0.002": the tool moves faster than 2 mm a second. Only bit and contact need a number;
+    without it, register means any value but zero and motion 0.002. A bit is 0 to 31, a register's
+    number any integer, a force and a speed are above 0. Without @SIGNAL each kind reads a default
+    signal; its `quiet_s` is that of the kind. Raises SettingError for any other value.
     """
     if isinstance(value, Trigger):
         return value
@@ -167,9 +168,10 @@ class StartFinder:
     def feed(self, time: float, active: bool) -> Start | None:
         """Take the next sample; return where an insertion begins if the sample shows it, else None.
 
-        It begins if the trigger is on at this sample (`active`) and was off for `quiet_s`, less
-        half a step, before. A trigger that is on at the first sample gives no start until it was
-        off. `time` is in seconds and increases.
+        It begins if the trigger is on at this sample (`active`), was off at the sample before, and
+        the first sample of this stretch of off is `quiet_s`, less half a step, or more ago. A
+        trigger that is on at the first sample gives no start until it was off. `time` is in seconds
+        and increases.
 
         If the sample before came 1.5 steps (`step`, the seconds between samples) ago or more,
         samples are missing; the insertion may have begun in this gap, and `seen` of the result is
@@ -210,8 +212,9 @@ def place(
     Placed
         The trace (C, samples) of float32, NaN at a place for which no sample came; these places,
         increasing; and how many samples were left out because an earlier one had their place.
-        Samples before the first or after the last place are left out, too. A value that is too
-        large for float32 becomes an infinity.
+        Samples nearest to a place before the first or after the last are left out, too, and not
+        counted. Halfway between two places, the even one gets the sample. A value that is too large
+        for float32 becomes an infinity.
     """
     trace = np.full((values.shape[1], samples), np.nan, dtype=np.float32)
     at = np.rint((np.asarray(times) - start) / step).astype(np.int64)

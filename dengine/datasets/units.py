@@ -53,9 +53,10 @@ def conversion(unit: str, wanted: str) -> float:
 
 
 def unit_in(name: str) -> str:
-    """Return the unit in a column's name, as in `Kraft [N]` or `F_kN`; "" if none.
+    """Return the unit at the end of a column's name, as in `Kraft [N]` or `F_kN`; "" if none.
 
-    Behind `/` or `_` a single letter or digit is none, except N: `Fz_W` is a force in world axes.
+    It must be a unit of this table, in brackets, or behind `in`, `/` or `_`. Behind `/` or `_` a
+    single letter or digit is none, except N: `Fz_W` is a force in world axes.
     """
     match = re.search(r"(?:[\[({<]|\bin |[/_](?![^N]$))\s*([^\[\](){}<>/_ ]+)\s*[\])}>]?$", name)
     return match[1] if match and is_unit(match[1]) else ""

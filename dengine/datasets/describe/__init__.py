@@ -65,8 +65,9 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
         A folder, a file or a table of recordings.
     stated : mapping, optional
         Keys whose values are known, like `{"label.column": "verdict"}`, or sections with such keys.
-        They are kept, except for the value `?`, and the proposals for the other keys follow from
-        them.
+        They are kept, except for the value `?`, and for keys in `ignored`, which is proposed anew
+        for all files but bags; `[rows]` may get further columns and words. The proposals for the
+        other keys follow from them.
 
     Returns
     -------
@@ -78,10 +79,11 @@ def describe(source: Any, stated: Stated | None = None) -> Description:
     Raises
     ------
     DataError
-        If there is no file, or none that holds samples (a table of results does not). Also if a
-        stated value is wrong: an unknown key, a column of times or a channel that does not exist, a
-        source of labels that has no words, a malformed pattern of files, or settings in `[text]`
-        or `[time]` that no file can be read with.
+        If there is no file, or none that can be read and holds samples (a table of results does
+        not), or if the package that reads such files is not installed. Also if a stated value is
+        wrong: an unknown key or a value of the wrong type, a column of times or a channel that does
+        not exist, a source of labels that has no words, a malformed pattern of files, or settings
+        in `[text]` or `[time]` that no file can be read with.
     SettingError
         If a stated `windows.trigger`, which cuts long recordings, is malformed.
     """
@@ -109,9 +111,10 @@ def choose_files(p: Proposal, root: Path) -> bool:
     suffix qualifies, all suffixes do. If several suffixes qualify, or each part has several files
     with the names of signals in them (`signal_endings`), `files` is set to `?` with a note that
     lists the choices, a note on `channels` says so, and the result is False. Otherwise `p.base`
-    becomes the folder, `p.names` these files and `p.others` all other files, and the format is that
-    of the first file's suffix, `text` for an unknown one. Raises DataError if there is no file of
-    recordings.
+    becomes the folder, `p.names` these files and `p.others` the other files that `names_in` finds
+    without patterns. `files` becomes `globs` of the names, and `format` that of the first file's
+    suffix, `text` for an unknown one; stated keys stay. Raises DataError if there is no file of
+    recordings or a stated pattern is malformed.
     """
     stated = p.description.files
     every = names_in(root, ())
@@ -150,7 +153,8 @@ def signal_endings(names: Names) -> Names:
 
     An ending is the last word with its suffix, and what stands before it is the part. There must be
     two parts and two endings or more, and each part must have a file with each ending. If not, or
-    if an ending has a digit or is a word for good or bad like `ok`, the result is empty.
+    if an ending has a digit or ends with a word like `ok` or `pending`, the result is empty. Digits
+    are allowed with 2 to 4 endings and 10 parts or more: numbered pieces of a part's curve.
     """
     words = [re.split(r"[-_ ](?=[^-_ /]+$)", name) for name in names]
     endings = sorted({name[-1] for name in words})
@@ -172,7 +176,8 @@ def names_in(root: Path, patterns: Names) -> Names:
 
     Hidden files, descriptions, and files like README or LICENSE are left out. Without `patterns`,
     files with an unknown suffix are left out too. If `root` is a file, the list has only its name.
-    If nothing is there, the list is empty. Raises DataError for a malformed pattern.
+    If nothing is there, the list is empty. Raises DataError for a malformed pattern, unless `root`
+    is a file.
 
     patterns : patterns of the files, like `*.csv`; empty: all files below the folder.
     """
@@ -193,7 +198,8 @@ def globs(names: Names) -> list[str]:
 def contents_of(p: Proposal) -> dict[str, bytes]:
     """Return the contents of at most 60 of the files `p.names`, evenly spread over all, by name.
 
-    No further file is read once 2 MB were read. Files that cannot be read are left out.
+    No further file is read once 2 MB were read; a file is always read whole. Files that cannot be
+    read are left out.
     """
     contents = dict[str, bytes]()
     for name in p.names[:: math.ceil(len(p.names) / MOST_FILES)]:
@@ -206,12 +212,13 @@ def contents_of(p: Proposal) -> dict[str, bytes]:
 def read_tables(p: Proposal) -> list[Table]:
     """Return the tables of some of the files `p.names`, at most 60, with the same column names.
 
-    Tables with other column names than most files have are left out. For text files the keys of
-    `[text]` are set in `p` first, and files of another form move from `p.names` to `p.others`.
-    Damaged files are left out, also those with a line that has a wrong number of cells; if there is
-    only one file, such a line is left out instead. The list is empty if files that are no text
-    cannot be opened. Raises DataError if all files are damaged, or if no text file can be opened,
-    is a text and has a header that is certain.
+    Tables with other column names than the most frequent ones, of equal ones the first, are left
+    out. For text files the keys of `[text]` are set in `p` first, and files of another form move
+    from `p.names` to `p.others`. Damaged files are left out, also those with a line that has a
+    wrong number of cells; if there is only one file, such a line is left out instead. `p.is_cut` is
+    set if only the beginning of a file is read. The list is empty if files that are no text cannot
+    be opened. Raises DataError if all files are damaged, if the package that reads them is missing,
+    or if no text file can be opened, is a text and has a header that is certain.
     """
     contents = contents_of(p)
     if p.description.format == "text":
@@ -233,9 +240,9 @@ def table_in(p: Proposal, content: bytes, name: str) -> Table:
 
     An .npz file is read as one that holds all parts if the layout `npz` is stated; or, if no layout
     is stated, if it is the only file and an array has lists of several items. Of a text or jsonl
-    file of more than 2 MB only the beginning is read, and `p.is_cut` is set. Raises DataError if
-    the file is damaged, or if a line of a text file has a wrong number of cells; but such lines of
-    the only file are left out.
+    file of more than 2 MB only the whole lines of the first 2 MB are read, and `p.is_cut` is set.
+    Raises DataError if the file is damaged, or if a line of a text file has a wrong number of
+    cells; but such lines of the only file are left out, unless all its lines are wrong.
     """
     kind = p.description.format
     if kind == "npz":
@@ -264,8 +271,8 @@ def propose_tables(p: Proposal, files: Tables) -> None:
     tables of the parts, and `p.names` is emptied unless each file is one part. If the layout or
     `part.column` is `?`, nothing more is proposed: `p.tables` and `p.names` stay, and a note on
     `channels` says why. Raises DataError if there is no table, no part, or only a table of results,
-    or if a stated column, format of times or source of labels is wrong, and SettingError for a
-    malformed `windows.trigger`.
+    if the tables do not split as a stated layout says, or if a stated column, setting in `[time]`
+    or source of labels is wrong, and SettingError for a malformed `windows.trigger`.
     """
     if not files:
         raise DataError(f"Expected a table of samples in {listed(p.names)}, found none.")

@@ -28,14 +28,15 @@ def propose_bag(p: Proposal) -> None:
     """Set in `p` the channels, the clock and the source of labels of a bag, and how it is cut.
 
     It looks at the first 50,000 messages of the first file. The clock is the time in the messages'
-    headers if all topics have it, apart from those with a field `data`, else the time of the log;
-    the rate follows from it (`propose_rate`). `traces.samples` is set to `?` unless it is stated;
-    so is `windows.trigger` unless it or `windows.listing` is stated, and `label.topic` unless
-    anything of the label is stated. The notes on the last two list the topics and their words. The
-    words of a stated topic of labels are sorted into good and bad. Fields that are no channels
-    become `ignored`. Raises DataError if the file is no bag or is damaged before its first message,
-    or if the package that reads bags is missing, or if a setting in `[time]` is wrong; a later
-    damage only ends the reading.
+    headers if the first message of each topic has it, apart from topics with a field `data`, else
+    the time of the log. The rate, `order` and `time.gap` follow from the times of the log in any
+    case (`propose_rate`), those of the first channel's topic. `traces.samples` is set to `?` unless
+    it is stated; so is `windows.trigger` unless it or `windows.listing` is stated, and
+    `label.topic` unless anything of the label is stated. The notes on the last two list the topics
+    with a field `data`, and their words. The words of a stated topic of labels are sorted into good
+    and bad. Fields that are no channels become `ignored`. Stated keys stay. Raises DataError if the
+    file is no bag or is damaged before its first message, or if the package that reads bags is
+    missing, or if a setting in `[time]` is wrong; a later damage only ends the reading.
     """
     times, words = defaultdict[str, list[int]](list), defaultdict[str, list[str]](list)
     units = dict[str, str]()
@@ -75,8 +76,8 @@ def _fields(message: Any, path: str) -> Iterator[tuple[str, str]]:
     """Yield (name, unit) for each number in a message, also in nested fields.
 
     `path` is the topic; the name is the topic and the fields, joined by dots. The unit is N or Nm
-    if the number stands in a field named `force` or `torque`, else "". The header and numbers in
-    arrays are left out.
+    if the number stands directly in a field named `force` or `torque`, else "". True and False are
+    numbers, too. Headers and numbers in arrays are left out.
     """
     for name in getattr(message, "__slots__", ()):
         value = getattr(message, name)

@@ -53,10 +53,11 @@ def propose_clock(p: Proposal) -> None:
     """Find the column of times and its form, and set `time.column` and `time.format` in `p`.
 
     `time.column` is set to `?`, with a note, if several columns may tell the time or a part of it,
-    like a date. It is `?`, too, if no column may, but the columns have no names, or one is named
-    `s`, which may be seconds or the stroke. Otherwise, if no column may tell the time, it stays
-    empty, and a note says that the rate is unknown. A stated column is kept; only its form is
-    found.
+    like a date that is the same in all rows of a recording; such a date is not looked for beside a
+    clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but the columns
+    have no names, or one is named `s`, which may be seconds or the stroke. Otherwise, if no column
+    may, it stays empty, and a note says that the rate is unknown. Stated columns are kept; only
+    their forms are found.
     """
     stated = p.description.time.column
     clocks = [column for column in p.columns.values() if is_clock(column)]
@@ -81,8 +82,9 @@ def is_clock(column: Column) -> bool:
     """Return whether a column may hold the times of the samples.
 
     Dates and times of day may if they change within a recording. So may a column that is named like
-    a clock (`time`, `stamp`, `t`, ...), if it changes within a recording and not all cells are
-    numbers, or if it has numbers that rise and no unit of another quantity, like N.
+    a clock (`time`, `stamp`, `t`, ...), if not all its cells are numbers and they change within a
+    recording, or if all are numbers that rise (`is_rising`) and it has no unit of another quantity,
+    like N.
     """
     is_named = NAME.search(column.name) is not None
     if column.forms or (is_named and column.odd):
@@ -109,13 +111,13 @@ def is_rising(column: Column) -> bool:
 
 
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
-    """Return the unit or the form of a column of times; `?` if several fit or none is certain.
+    """Return the unit or the form of a column of times; `?` if none is certain.
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
     the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
     why it is `?`, or which size proves the unit. If several forms of dates fit, so that day and
-    month can be confused, the form is `?`; but if another column tells the time of day and all
-    recordings have one date, it is the first of these forms.
+    month can be confused, the form is `?`; but if another column tells a part of the time, too, and
+    all recordings have one and the same date, it is the first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -146,10 +148,10 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
     """Return the unit of time that the numbers in a column prove, and a note on it.
 
     A unit is proved if with it the first number is a time in the years 2000 to 2050, counted from
-    1970 or from another day that clocks use, and the numbers come at a rate of 1 Hz to 1 MHz. If
-    none is, and the median step is at most 0.019, the unit is s. Otherwise it is `?`, and the note
-    lists the possible units. It is `?`, too, if the column has no numbers that rise; the note then
-    asks for the form of its cells.
+    1970 or from another day that clocks use, and the median of the steps above 0 gives a rate of
+    1 Hz to 1 MHz; the first in `EPOCHS` counts. If none is, and this step is 0.0002 to 0.019, the
+    unit is s. Otherwise it is `?`, and the note lists the possible units. It is `?`, too, if the
+    column has no numbers that rise; the note then asks for the form of its cells.
     """
     rising = column.steps[column.steps > 0]
     if not len(rising):
@@ -176,12 +178,14 @@ def is_rate(step: float) -> bool:
 def propose_rate(p: Proposal, tables: Tables) -> None:
     """Set `time.rate_hz` in `p`, from the median over the recordings of the mean step of time.
 
-    `tables` has the samples of each recording. The rate is `?`, with a note, if it is not between
-    1 Hz and 1 MHz; then no gaps are looked for. If more than 10 % of the recordings plus one would
-    be faults because of their times, `time.gap` is set to `?`, with a note on the first. If all
-    recordings start after 1999, `order` is set to `time`. Recordings whose times cannot be read are
-    skipped. Raises DataError if a stated format is no form or unit of times, or if a setting in
-    `[time]` is wrong (see `check_clock`).
+    `tables` has the samples of each recording. Steps below 0 are left out of the mean, and the rate
+    is rounded to five digits. It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then no
+    gaps are looked for. If more recordings than 10 % plus one would be faults because of their
+    times (`check_steps`, by the stated rate and gap), `time.gap` is set to `?`, with a note on the
+    first. If all recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is
+    `?`. Recordings whose times cannot be read are skipped. Stated keys stay. Raises DataError if a
+    stated format is no form or unit of times, or if a setting in `[time]` is wrong (see
+    `check_clock`).
     """
     check_clock(p.description.time)
     clocks = list[tuple[Table, Floats, float]]()

@@ -68,7 +68,7 @@ class Column:
 
     @cached_property
     def fixed(self) -> list[str]:
-        """The word of each recording; empty if the words of any recording differ between rows."""
+        """The word of each recording; empty if one has several words or no rows."""
         is_fixed = all(len(words) and (words == words[0]).all() for words in self.words)
         return [str(words[0]) for words in self.words] if is_fixed else []
 
@@ -76,7 +76,8 @@ class Column:
     def numbers(self) -> list[Floats]:
         """The numbers of each recording whose cells are all numbers, as `[text]` writes them.
 
-        Recordings with other cells are left out; if they are more than 10 %, the list is empty.
+        A word of `text.missing` is NaN. Recordings with other cells are left out; if they are more
+        than 10 %, the list is empty.
         """
         numbers = list[Floats]()
         for table in self.tables:
@@ -91,7 +92,7 @@ class Column:
 
     @cached_property
     def unit(self) -> str:
-        """The unit that most files state for the column; "" if most state none."""
+        """The unit that most files state for the column; "" if more state none than any one."""
         units = Counter(bare(table.units.get(self.name, "")) for table in self.tables)
         return units.most_common(1)[0][0]
 
@@ -99,9 +100,10 @@ class Column:
     def forms(self) -> list[str]:
         """All forms of dates and times, like `%d.%m.%Y`, that fit the cells of the column.
 
-        The list is empty if a cell is no date or time. The first 20 cells and the last cell of each
-        recording are looked at. If an ISO date fits, with or without a time of day, it is the only
-        form.
+        The list is empty if a cell is empty or no date or time. The first 20 cells and the last
+        cell of each recording are looked at. If an ISO date fits, with or without a time of day, it
+        is the only form. A column of datetimes has only the form `iso`. Raises UnreadableError if
+        cells are lists.
         """
         if self.tables[0].columns[self.name].dtype.kind == "M":
             return [ISO]
@@ -145,13 +147,21 @@ class Proposal:
     notes: dict[str, str] = field(default_factory=dict)
 
     def put(self, key: str, value: Any, note: str = "") -> None:
-        """Set a key like `time.column`, with a note on it; does nothing if the user stated it."""
+        """Set a key like `time.column`, with a note on it; does nothing if the user stated it.
+
+        A place of the label or the part clears the other places, as `with_values` does. An earlier
+        note stays if there is no new one.
+        """
         if key not in self.stated:
             self.description = self.description.with_values({key: value})
             self.notes |= {key: note} if note else {}
 
     @property
     def unused(self) -> list[Column]:
-        """The columns that have no role yet: no clock, part, label, channel, nor words for rows."""
+        """The columns that have no role yet: no clock, part, label, channel, nor words for rows.
+
+        Nor do signals of a trigger and the column of `order` count. Raises SettingError for a
+        malformed `windows.trigger`.
+        """
         kind_of = column_kind(self.description)
         return [column for name, column in self.columns.items() if not kind_of(name)]

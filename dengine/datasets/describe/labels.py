@@ -96,9 +96,10 @@ def is_plain(source: LabelSource) -> bool:
 def in_paths(paths: Names) -> list[str]:
     """Return the regular expressions that find words like "ok" or "failed" in paths.
 
-    Such a word is the name of a folder, or begins or ends a file name. Each expression has only the
-    words that it finds. The list is empty if a path negates such a word, like "not_passed", or has
-    true or false after a name, like "leak=False": the meaning is open then.
+    Such a word is the name of a folder, or begins or ends a file name; numbers may stand behind it
+    at the end. A word for unchecked is one, too, like "pending". Each expression has only the words
+    that it finds. The list is empty if any path negates such a word, like "not_passed", or has true
+    or false after a name, like "leak=False": the meaning is open then.
     """
     stems = [*map(without_suffix, paths)]
     patterns = []
@@ -140,8 +141,9 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
 def row_of(column: Column) -> Literal["", "same", "last", "first"]:
     """Return which row of a recording has the label, if this column holds it; "" if it cannot.
 
-    "same": each recording has one word in all rows. "last" and "first": this row has the label, and
-    all others have the same word or one that means that the part is not checked, like "pending".
+    "same": each recording has one word in all rows. "last" and "first", tried in this order: this
+    row has the label, and all others have the same word or one that means that the part is not
+    checked, like "pending" or "".
     """
     if column.fixed:
         return "same"
@@ -161,7 +163,8 @@ def is_verdict(column: Column) -> bool:
 def lines_of(p: Proposal) -> list[str]:
     """Return how the lines above the header begin, up to the first `; : = , tab` or two blanks.
 
-    Only the first of `p.tables` is looked at. Each beginning comes once; empty ones are left out.
+    Only the first of `p.tables` is looked at. Comment marks and quotes before it are left out. Each
+    beginning comes once; empty ones are left out.
     """
     lines = [re.split(r"[;:=\t,]|  ", line.lstrip("#%* \t\"'"))[0] for line in p.tables[0].above]
     return [*filter(None, dict.fromkeys(line.strip(" \"'") for line in lines))]
@@ -171,7 +174,8 @@ def part_words(source: PartSource, tables: Tables) -> Words:
     """Return the part number of each recording that has one, by the recording's `Table.source`.
 
     `source` says where the number stands; it is "" if that states nothing. `tables` has the table
-    of each recording. Recordings without a number are left out.
+    of each recording. Recordings whose number is missing, empty or not the same in all rows are
+    left out, and all of them if the path in `source` is no valid expression.
     """
     words = dict[str, str]()
     for table in tables:
@@ -184,10 +188,11 @@ def sources_of(p: Proposal, paths: Names) -> Iterator[LabelSource]:
     """Yield the sources that may hold the labels; if the user stated a source, only that.
 
     They come in this order: pairs of columns of listings among `p.others`, of which one may be the
-    key, since its words differ in more than half of the rows, and the other may hold labels;
-    regular expressions for the paths (if a file or a column is a part); columns without another use
-    that may have the label in all rows, the last or the first; and lines above the header. A file
-    that cannot be read as a listing is skipped.
+    key, since it has more different words than half of its rows, and the other may hold labels;
+    regular expressions for the paths (if a file or a column is a part), of words like "ok" in them
+    and of any words at fixed places; columns without another use that may have the label in all
+    rows, the last or the first; and lines above the header. A file that cannot be read as a listing
+    is skipped. A stated `label.topic` alone is no stated source here.
 
     paths : the path of each recording.
     """
@@ -254,7 +259,8 @@ def count_sources(p: Proposal) -> dict[LabelSource, Words]:
     source with the same words as an earlier one counts only if it is named like a verdict. For
     listings and paths all recordings count, since their names are enough; for columns and lines
     only those whose tables were read. The words are sorted into good, bad and unchecked as
-    `with_meanings` does. Raises DataError if the stated source has no words.
+    `with_meanings` does. Raises DataError if the stated source has no words or cannot be read, and
+    SettingError for a malformed `windows.trigger`.
     """
     looked_at = {table.source for table in p.tables}
     others = [Table(name, {}, [], path=name) for name in p.names if name not in looked_at]
@@ -291,7 +297,8 @@ def propose_label(p: Proposal) -> None:
     none is known, but only one is named like a verdict, that becomes the label, with `?` for words
     whose meaning is open. Otherwise `label.column` is `?`, with a note that lists all sources.
     Further known sources that have a word for each recording of the label become checks, unless
-    checks are stated; notes count the words. Raises DataError if a stated source has no words.
+    checks are stated; notes count the words. Raises DataError if a stated source has no words or
+    cannot be read, and SettingError for a malformed `windows.trigger`.
     """
     counted = count_sources(p)
     sides = {source: sides_of(source, words) for source, words in counted.items()}

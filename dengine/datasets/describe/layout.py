@@ -30,11 +30,12 @@ def layout_of(p: Proposal, files: Tables) -> str:
     `files` has the table of each file that is looked at. These rules come one after another.
     Several JSON or .ts files, of which the first has one row, are `files`. Lists in the first row
     of the first table, or 20 or more columns like `x0`, `x1`, make it `wide`, or `npz` for an .npz
-    file. It is `long` if a column may tell the parts apart (`may_tell_parts`), or if the stated
-    `part.column` has several words; `part.column` is then set in `p` to the only such column with a
-    name like that of a part's number, or to `?` with a note. Several tables are `files`. A single
-    one gives `?`, with a note on what to state, or DataError if it is a table of results: one row
-    for each part, with its label, and no samples.
+    file. It is `long` if a column of the first table may tell the parts apart (`may_tell_parts`),
+    or if the stated `part.column` has several words; unless it is stated, `part.column` is then set
+    in `p` to the only such column with a name like that of a part's number and no word in two
+    files, or to `?` with a note. Several tables are `files`. A single one gives `?`, with a note on
+    what to state, or DataError if it is a table of results: one row for each part, with its label,
+    and no samples. Raises UnreadableError if cells of columns that are looked at are lists.
     """
     kind = p.description.format
     first = files[0]
@@ -119,8 +120,8 @@ def _refuse_results(columns: Iterable[Column]) -> None:
     """Raise DataError for a table of results: a row for each part, with its label, but no samples.
 
     `columns` are those of a single table. One shows this if it has known words for good and for
-    bad, maybe among other words, and a word stands in fewer than 8 successive rows between two
-    others.
+    bad, maybe among other words, and somewhere between two changes one word stands in fewer than 8
+    successive rows.
     """
     for column in columns:
         edges = np.flatnonzero(column.words[0][1:] != column.words[0][:-1])
@@ -137,10 +138,11 @@ def _refuse_results(columns: Iterable[Column]) -> None:
 def parts_of(p: Proposal, files: Tables) -> list[Table]:
     """Return the tables of the first 240 parts without damage, by the layout in `p.description`.
 
-    `files` has the table of each file that is looked at. In the layout `long` a file holds several
-    parts, one below the other; if a file was read only in part, the last of several parts of each
-    file is left out, since it may be cut. In `columns` a column that is named like a clock is no
-    part. Raises DataError if the files do not split as the layout says.
+    `files` has the table of each file that is looked at, at least one. In the layout `long` a file
+    holds several parts, one below the other; if any file was read only in part, the last of several
+    parts of each file is left out, since it may be cut. In `columns` a column that is named like a
+    clock is no part. Nothing is set in `p`. Raises DataError if a file of the layout `long` does
+    not have the columns in `part.column`, or none is stated.
     """
     description, layout = p.description, p.description.layout
     patterns = [ANY] if layout == "columns" else numbered_columns(files[0])

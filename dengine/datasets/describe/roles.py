@@ -40,14 +40,16 @@ FORCES = (
 
 
 def propose_roles(p: Proposal) -> None:
-    """Find what each column is for, and set the keys that say so in `p`; stated keys stay.
+    """Find what each column is for, and set the keys that say so in `p`.
 
     The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
     of the traces, ignored columns and files. A key is `?` if no rule proves a value. If it is open
     which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?` gives no
-    rate either. Raises DataError if a stated column of times or channel does not exist, a stated
-    `time.format` is none, or a stated source of labels has no words, and SettingError for a
+    rate either. Stated keys stay, but a stated `ignored` is replaced (`list_others`), and a stated
+    `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is set.
+    Raises DataError if a stated column of times or channel does not exist, a setting in `[time]` is
+    wrong, or a stated source of labels has no words or cannot be read, and SettingError for a
     malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
@@ -98,7 +100,8 @@ def qualify_rows(p: Proposal) -> None:
     several, its `keep` is `?`, with a note that counts them; if it has one, that becomes its
     `keep`, with a note. If the user stated some words of a column, its other words are added to
     `keep`, or to `drop` if `keep` is stated: as `*` if they are more than 12, and not if `*` is
-    stated. Rows that are then known to be no samples are left out of `p.columns`.
+    stated. Rows that are then known to be no samples are left out of `p.columns`. Raises
+    SettingError for a malformed `windows.trigger`.
     """
     rows = dict(p.description.rows)
     unused = p.unused
@@ -126,8 +129,8 @@ def qualifies(column: Column) -> bool:
     It must have at most 12 different words, they must change within a recording, and each recording
     must have several rows, with a cell in each. A column that is named like a status (`Status`,
     `valid`) may have numbers, and also just one word in all. Any other must have texts, and no name
-    like a clock. A column that is named like a verdict and has a known word for good or bad holds
-    labels instead, and gives False.
+    like a clock. A column that is named like a verdict, may have the label in one row (`row_of`),
+    and has a known word for good or bad holds labels instead, and gives False.
     """
     name = column.name
     words = column.counts
@@ -148,8 +151,10 @@ def propose_part(p: Proposal) -> None:
     """Set `[part]` in `p` to the column or the line above the header that has the part's number.
 
     Its name must be like that of a part's number, and the different words in it must be more than
-    half as many as the recordings. If several qualify, only a note on `part.column` lists them. If
-    none does, nothing is set. A stated `[part]` stays.
+    half as many as `p.tables`. Columns that have a role are left out, and the lines are those of
+    the first table. If several qualify, only a note on `part.column` lists them, also if `[part]`
+    is stated. If none does, nothing is set. A stated `[part]` stays. Raises SettingError for a
+    malformed `windows.trigger`.
     """
     sources = [PartSource((c.name,)) for c in p.unused if PART_NAME.search(c.name)]
     sources += [PartSource(line=line) for line in filter(PART_LINE.search, lines_of(p))]
@@ -210,7 +215,7 @@ def _doubt_on(p: Proposal, name: str) -> str:
 
 
 def _strange_in(column: Column) -> Counter[str]:
-    """Return the texts in more than 1 % of the cells, except for one that means a lost sample."""
+    """Return the texts in more than 1 % of the cells each, except for those in `LOST`."""
     least = STRANGE * column.counts.total()
     odd = column.odd.items()
     return Counter({word: n for word, n in odd if word.lower() not in LOST and n > least})
@@ -221,8 +226,9 @@ def _units(p: Proposal) -> dict[str, str]:
 
     Such a column has no other use in the description so far, and at least three different numbers.
     At most 90 % of its cells are no numbers, or 10 % if a text that does not mean a lost sample is
-    in more than 1 % of them. Times, counters of rows and columns that are constant in each
-    recording are left out.
+    in more than 1 % of them. Times, columns named like counters of rows, and columns that are
+    constant in each recording are left out. The unit is the one that the files state, or else the
+    one in the name. Raises SettingError for a malformed `windows.trigger`.
     """
     units = dict[str, str]()
     for column in p.unused:
@@ -242,9 +248,10 @@ def find_lost(p: Proposal) -> None:
 
     They are those already there, and those of the words nan, null, none, n/a, na, -, --, ---, #n/a
     and "", an empty cell, that a channel has, in any case of letters. If more than 10 % of the
-    cells of a channel are empty, "" is not added for it if there is a clock: these rows belong to
-    another signal. `[rows]` then drops them, unless it has words of this channel already, and a
-    note says so. A stated `text.missing` stays.
+    cells of a channel are empty, "" is not added for it if `time.column` is set, even to `?`: these
+    rows belong to another signal. `[rows]` then drops them, unless it has words of this channel
+    already, and a note says so in any case; dropped rows are left out of `p.columns`. A stated
+    `text.missing` stays, but `[rows]` changes all the same.
     """
     rows = dict(p.description.rows)
     missing = {*p.description.text.missing}
@@ -262,11 +269,11 @@ def find_lost(p: Proposal) -> None:
 
 
 def propose_lengths(p: Proposal) -> None:
-    """Set `traces.samples` in `p` to the median length of the recordings.
+    """Set `traces.samples` in `p` to the median length of the recordings, rounded down.
 
-    Recordings without rows are ignored, and without a channel it is 0. If some have another length,
-    and `traces.lengths` is `strict` without being stated, a note counts them; if they are more than
-    10 %, `traces.lengths` becomes `pad`.
+    The length is that of the first channel. Recordings without rows are ignored, and without a
+    channel it is 0. If some have another length, and `traces.lengths` is `strict` without being
+    stated, a note counts them; if they are more than 10 %, `traces.lengths` becomes `pad`.
     """
     words = [p.columns[name].words for name in p.description.channels if name in p.columns]
     lengths = [n for n in map(len, words[0] if words else ()) if n]
@@ -285,9 +292,10 @@ def propose_lengths(p: Proposal) -> None:
 def list_others(p: Proposal) -> None:
     """Set in `p` the columns without any use as `ignored`, and the files `p.others` as `exclude`.
 
-    `ignored` has the unit of each column. Listings are not excluded, and a note on `exclude` lists
-    the files. If there is none, or if `exclude` is `?` because other files may be recordings, it
-    stays.
+    `ignored` has the unit of each column, the one in its name or else the one that the files state;
+    it replaces also a stated `ignored`. Listings of labels are not excluded, and a note on
+    `exclude` lists the files. If there is none, if `exclude` is stated, or if it is `?` because
+    other files may be recordings, it stays. Raises SettingError for a malformed `windows.trigger`.
     """
     listings = {source.listing for source in p.description.labels}
     others = sorted({*p.others} - listings, key=natural_key)

@@ -57,11 +57,15 @@ def look(content: bytes, stated: Stated) -> Look:
     """Return how a text file is written, and the cells of its samples, from its first 2 MB.
 
     The result has the text form, the number of columns, the line of the header ("" for none) and
-    the cells of each row of samples. If no delimiter separates numbers, there is a single column.
-    `content` has the bytes of the file. Raises DataError if it is empty or no text, or if the line
-    of its header is not certain.
+    the cells of each line from the first row of samples on, also of lines of another form. The
+    delimiter and the first row follow from the first 200 lines; of delimiters with equal scores the
+    one with more cells is taken. If no delimiter separates numbers, there is a single column. The
+    marks in numbers stay those of `TextForm`. `content` has the bytes of the file. Raises DataError
+    if it is empty or no text, or if the line of its header is not certain, and LookupError for a
+    stated encoding that Python does not know.
 
-    stated : keys that the user gave; `text.encoding`, `text.delimiter` and `text.header` are used.
+    stated : keys that the user gave. `text.encoding` and `text.delimiter` are taken; `text.header`
+    only says that a doubt about the header is no error.
     """
     encoding, text = decode(content, str(stated.get("text.encoding", "")))
     lines = re.split("\r\n|\r|\n", text.rstrip("\r\n"))
@@ -102,9 +106,10 @@ def _share_of_numbers(lines: Sequence[str], delimiter: str) -> tuple[float, int]
     """Return a score of how well a delimiter splits lines into numbers, and the cells per line.
 
     The score is the share of lines with the most frequent number of cells, times the share of
-    numbers among their cells that are not empty; it is divided by 1.15 if the delimiter is a blank,
-    since cells may have blanks in them. It is 0 if the lines have fewer than 2 cells. Empty lines
-    and the first third of the lines, which may be text above the samples, are left out.
+    numbers among their cells that are not empty, plus 0.01; it is divided by 1.15 if the delimiter
+    is a blank, since cells may have blanks in them, and rounded to two decimals, so that near
+    scores are equal. It is 0 only if the lines have fewer than 2 cells, or all cells are empty. The
+    first third of the lines, which may be text above the samples, and empty lines are left out.
     """
     rows = [split_line(line, delimiter) for line in lines[len(lines) // 3 :] if line.strip()]
     width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
@@ -125,12 +130,12 @@ def _first_row(rows: Rows, width: int) -> int:
     """Return the index of the first row of samples, from 0; 0 if there is none.
 
     `rows` has the cells of each line, of which `width` is the usual number. It is the first of four
-    successive rows that each have at least 60 % of the usual number of numbers, and at least one.
-    Rows directly above it belong to the samples, too, if they have `width` cells and their first
-    cell has another number at most: `0.0,,` above `0.1,5,` has lost a sample, but `time,force,` is
-    no row of samples.
-    But if it has 20 numbers or more, each larger than the one before, and the next row has not,
-    these are names of columns, and the next row is the first.
+    successive rows, or fewer at the end, that have `width` cells and at least 60 % of the median
+    number of numbers (over all rows but the first third), at least one. Rows directly above it
+    belong to the samples, too, if they have `width` cells and the first is alike but for a number:
+    `0.0,,` above `0.1,5,` (a lost sample), but not `time,force,`. If the first row then has 20
+    numbers or more, each larger than the one before, and the next row has not, it names columns,
+    and the next row is the first.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
@@ -180,7 +185,8 @@ def propose_form(p: Proposal, contents: Mapping[str, bytes]) -> None:
     Those have another delimiter, number of columns or header, and move from `p.names` to
     `p.others`. If two or more of them have at least 8 rows of samples, `exclude` is set to `?`,
     with a note that asks whether they are recordings. A file that is no text, or whose header is
-    not certain, is ignored; if all are such, DataError is raised.
+    not certain, is ignored and stays in `p.names`; if all are such, DataError is raised. Of equally
+    frequent forms the first counts. Stated keys stay.
 
     contents : the contents of the files that are looked at, by name.
     """
@@ -205,9 +211,9 @@ def _propose_keys(p: Proposal, looks: Sequence[Look]) -> None:
     """Set the keys of `[text]` in `p`, as the first of these files is written.
 
     If the header stands at different lines, or the user stated a text for it, `text.header` becomes
-    its text, and `text.units` and `text.data` are counted from it. If a file is read as cp1252,
-    that is the encoding, with a note that it is guessed. `propose_marks` sets the decimal mark and
-    the mark of thousands.
+    its text, and `text.units` and `text.data` are counted from it. If any file is read as cp1252,
+    that is the encoding, with a note that it is guessed. `_column_names` gives the names; a stated
+    header other than 0 needs none. `propose_marks` sets the marks in numbers. Stated keys stay.
 
     looks : how each of the files, which are of one form, is written, and the cells of its samples.
     """
@@ -260,7 +266,8 @@ def propose_marks(p: Proposal, cells: Collection[str]) -> None:
     and comma read as many numbers, or if more than 5 % of the numbers cannot be read at all; but
     not if no number has a point or comma. The mark of thousands is `?`, with a note, if it is a
     point or comma, fewer than 5 % of the numbers need it, and no number has both a point and a
-    comma: `7,286` among `7.1` and `8.2` may be a damaged number. Stated keys stay.
+    comma: `7,286` among `7.1` and `8.2` may be a damaged number. It is "" if no mark reads more
+    numbers. If the decimal mark is stated, only this one is tried. Stated keys stay.
 
     cells : the different texts in the samples that are numbers with any of these marks.
     """

@@ -71,9 +71,10 @@ def read_bag(
 
     Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
     message's header, 0 without one; both are in nanoseconds. Other topics that the description
-    names are columns, too. If a topic is a label, each of its messages stands in the last row
-    before it, other rows have None; of several messages after one row, the first stands there. Any
-    other topic has its newest message in each row, None before the first.
+    names are columns, too. If a topic is a label, each of its messages stands in the last row that
+    is not later, other rows have None; of several messages for one row the first stands there, and
+    those before the first row are left out. Any other topic has its newest message in each row,
+    None before the first.
 
     Parameters
     ----------
@@ -84,14 +85,15 @@ def read_bag(
     description : Description
         Of the bag.
     faults : list
-        Gets a fault for each file that is damaged, or has a message without a field that is read;
-        its messages before that are read.
+        Gets a fault for each file that is damaged or no MCAP file, or has a message without a field
+        that is read; its messages before that are read.
 
     Raises
     ------
     DataError
-        If the channels are of several topics, if their topic has no messages, or if a trigger cuts
-        the bag and there is a fault before its last file.
+        If the channels are of several topics, if no message of their topic can be read (also
+        because the package that reads bags is not installed), or if a trigger cuts the bag and
+        there is a fault before its last file.
     SettingError
         If the trigger is malformed.
     """
@@ -123,10 +125,10 @@ def _rows_of(
     Times are in nanoseconds; the header time is 0 without a header. The values are the fields that
     are the channels. `files` has the path and the name in errors of each file, and `topics` the
     topic of the channels. Messages of topics that are keys of `events` are appended there as (log
-    time, data); others are not read. For a file that is damaged, or has a message that lacks a
-    field, a fault is appended to `faults`, and what came before stays. Raises DataError if no
-    message has the channels, or if a trigger cuts the bag and there is a fault before its last
-    file.
+    time, data); others are not read. For a file that cannot be read or is damaged, or has a message
+    that lacks a field, a fault is appended to `faults`, and what came before stays. Raises
+    DataError if no message has the channels, or if a trigger cuts the bag and `faults` has any
+    before its last file.
     """
     fields = [attrgetter(column.partition(".")[2]) for column in description.channels]
     rows: list[Any] = []
@@ -155,8 +157,8 @@ def _cells_of(messages: list[tuple[int, Any]], logs: Cells, is_verdict: bool) ->
     """Return the column of a topic, which has a message or None for each row of the channels.
 
     In each row stands the newest message so far, None before the first. But if `is_verdict`, the
-    messages are labels, and each stands only in the last row before it; of several messages
-    between two rows the first stands there.
+    messages are labels, and each stands only in the last row that is not later than it; of several
+    for one row the first stands there, and those before all rows are left out.
 
     messages : (time in ns, data) of each message; they are sorted in place. logs : the times of the
     rows in ns, increasing.

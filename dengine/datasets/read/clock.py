@@ -53,8 +53,8 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     table : Table
         The rows of a recording.
     clock : Clock
-        The section `[time]`. The times in its columns are added up; a column of one cell holds for
-        all rows. Without columns there is one time, 0.
+        The section `[time]`, which has passed `check_clock`. The times in its columns are added up;
+        a column of one cell holds for all rows. Without columns there is one time, 0.
     form : TextForm
         The section `[text]`: how numbers are written.
 
@@ -62,12 +62,14 @@ def times_of(table: Table, clock: Clock, form: TextForm) -> Times:
     -------
     seconds : array of float64, shape (rows,)
     start : float
-        In seconds, from the zero of the clock: 1970 (UTC) for dates.
+        In seconds, from the zero of the clock: 1970 (UTC) for dates, midnight for times of day,
+        and the sum over the columns.
 
     Raises
     ------
     UnreadableError
-        If a column is missing, empty or of another length, or a cell is no time of the stated form.
+        If a column is missing, empty or of another length, or a cell is no time of the stated form,
+        or no single time because clocks are changed.
     DataError
         If a format is no unit of time.
     """
@@ -90,9 +92,9 @@ def column_times(table: Table, name: str, unit: str, clock: Clock, form: TextFor
     `unit` is the unit of its cells, or the form of its dates or times of day; a column of datetimes
     needs neither. If times of day fall from one row to the next by more than half a day, midnight
     has passed, unless a column of the clock has the date. If a counter falls by more than half of
-    `clock.wrap`, it began again at 0. `form` says how numbers are written. Raises UnreadableError
-    if the column `name` is missing or empty, or a cell is no such time, and DataError if `unit` is
-    no unit of time.
+    `clock.wrap`, it began again at 0; with a `wrap` of 0 times may fall. `form` says how numbers
+    are written. Raises UnreadableError if the column `name` is missing or empty, or a cell is no
+    such time (a missing number, too), and DataError if `unit` is no unit of time.
     """
     cells = table.column(name)
     if not len(cells):
@@ -120,8 +122,9 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
     The times are in seconds since the first row, and the time of the first row is in seconds since
     1970 (UTC), or since midnight if the cells have no date. `unit` is the form of the cells, "iso"
     or like "%d.%m.%Y"; a comma is read as a point. Dates without a time zone are in `clock.zone`,
-    or UTC if that is empty. Raises UnreadableError if there is no column `name`, or one of its
-    cells does not have the form, or is no single time because clocks are changed.
+    or UTC if that is empty; times in the hour that comes twice need rows from both, in order.
+    Raises UnreadableError if there is no column `name`, or one of its cells does not have the form,
+    or is no single time because clocks are changed.
     """
     import pandas as pd
 
@@ -146,10 +149,11 @@ def _dates(table: Table, name: str, unit: str, clock: Clock) -> Times:
 def check_steps(seconds: Floats, clock: Clock, table: Table) -> None:
     """Raise UnreadableError unless the times rise without a gap, at the stated rate within 3 %.
 
-    `seconds`, shape (rows,), has the times of the rows of `table`. No step from one to the next may
-    be longer than `clock.gap` steps of the stated rate, `clock.rate_hz`, or `clock.gap` mean steps
-    if none is stated. With `clock.gap` 0 steps may have any length, and some may be 0; otherwise
-    equal times are refused. A single time passes.
+    `seconds`, shape (rows,), has the times of the rows of `table`, at least one. No step from one
+    to the next may be longer than `clock.gap` steps of the stated rate, `clock.rate_hz`, or
+    `clock.gap` mean steps if none is stated. With `clock.gap` 0 steps may have any length, and
+    some, but not all, may be 0; otherwise equal times are refused. The number of steps may differ
+    by 3 % from the rate times the whole time; without a rate any will do. A single time passes.
     """
     steps = np.diff(seconds)
     rate = clock.rate_hz

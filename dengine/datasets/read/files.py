@@ -64,7 +64,8 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
 
     They are sorted by file name, run_2 before run_10. Listings, the description file and files that
     match a pattern in `exclude` are left out. If `root` is a file, only that is returned, with its
-    name. Raises DataError if there is no file, or for a malformed pattern.
+    name, whatever the description says. Raises DataError if no file is left, or for a malformed
+    pattern in `files`.
     """
     if root.is_file():
         return [(root, root.name)]
@@ -83,9 +84,9 @@ def find_files(root: Path, description: Description) -> list[tuple[Path, str]]:
 
 
 def read_file(path: Path) -> bytes:
-    """Return the content of a file, unpacked if it is gzipped.
+    """Return the content of a file, unpacked if its name ends in `.gz`.
 
-    Raises UnreadableError if it cannot be read, or changed while it was read.
+    Raises UnreadableError if it cannot be read or unpacked, or changed while it was read.
     """
     with instead(UnreadableError, f"Cannot read {path.name}", *BAD, EOFError, zlib.error):
         before = path.stat()
@@ -103,7 +104,7 @@ def caught(faults: list[Fault], source: str) -> Iterator[None]:
     """Context manager that turns a DataError in its block into a fault, and suppresses it.
 
     The fault is appended to `faults`. It has `source` as the file or part, and the line and column
-    of the error, if it has them.
+    of the error, if it has them. All other exceptions pass.
     """
     try:
         yield

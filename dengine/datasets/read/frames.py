@@ -30,7 +30,8 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
     empty lines between them. Keys of nested objects are joined by dots. A cell may be a list; it is
     None if the object lacks the key. `source` is the file's name in errors; of `form` the encoding
     is used. Raises UnreadableError if the file is not in this encoding, or the text is no JSON, or
-    holds anything but objects, or nothing.
+    holds anything but objects, or nothing, and LookupError for an encoding that Python does not
+    know.
     """
     text = to_utf8(content, form.encoding).decode()
     rows: list[Mapping[str, Any]] = []
@@ -57,6 +58,8 @@ def read_objects(content: bytes, source: str, form: TextForm, has_lines: bool) -
 def flat(prefix: str, value: Mapping[str, Any]) -> dict[str, Any]:
     """Return a nested mapping as one dict: `{"a": {"b": 1}}` becomes `{"a.b": 1}`.
 
+    An empty mapping within it is left out. If two keys become equal, the later one counts.
+
     prefix : text that is put before each key. value : the mapping.
     """
     items: dict[str, Any] = {}
@@ -70,9 +73,10 @@ def columns_of(prefix: str, value: Any) -> Columns:
     """Return a value of JSON or NumPy as columns by name; a scalar becomes a column with one cell.
 
     A list of scalars becomes one column, a mapping has a column for each key, and a list of
-    mappings for each key of the first of them. An array (C, n), or (n, C) with C < n, has a column
-    for each of its C channels. Nested values are treated in the same way. Raises UnreadableError if
-    the items of a list are not all alike.
+    mappings for each key of the first of them. An array or list of lists (C, n) with C <= n, or
+    (n, C) with C < n, has a column for each of its C channels. Nested values are treated in the
+    same way; an empty list is a column without cells, an empty mapping none. Raises UnreadableError
+    if the items of a list whose first item is a list or mapping are not all alike.
 
     prefix : the name of the value; a dot and the key, or the channel from 0, are appended. Without
     a name, "", a column is called by the key alone.
@@ -109,7 +113,8 @@ def _turned(items: Any) -> Mapping[Any, Any]:
 def as_cells(values: Any) -> Cells:
     """Return values as an array (n,): of numbers if all are int or float, otherwise of objects.
 
-    An array is returned as it is.
+    An array is returned as it is. True and False count as objects; without values the array is of
+    floats.
     """
     if isinstance(values, np.ndarray) or {*map(type, values)} <= {int, float}:
         return np.asarray(values)
@@ -121,7 +126,8 @@ def as_cells(values: Any) -> Cells:
 def read_frame(frame: Any, source: str) -> Table:
     """Return the table of a DataFrame, whose index is a column if it has a name.
 
-    `source` is the table's name in errors. Rows are numbered from 1.
+    `source` is the table's name in errors. Rows are numbered from 1. Raises ValueError if the index
+    is named like a column.
     """
     frame = frame.reset_index() if frame.index.name is not None else frame
     columns = {str(name): frame[name].to_numpy() for name in frame.columns}
@@ -147,8 +153,8 @@ def read_npz(content: bytes, source: str, has_all: bool) -> Table:
     (C, n), or (n, C) with C < n, a column for each channel. Of all parts, each array is a column
     whose cell i is its item i, and there are as many rows as the array with most numbers has items.
     `content` has the bytes of the archive, and `source` is its name in errors. Raises DataError if
-    it is damaged, and UnreadableError if it has no array, or the items of an array are not all
-    alike.
+    it is damaged, has Python objects or needs too much memory (`read_archive`), and UnreadableError
+    if it has no array.
     """
     arrays, _ = read_archive(content, name=source)
     if not arrays:
@@ -165,9 +171,10 @@ def read_ts(content: bytes, source: str, form: TextForm) -> Table:
     """Return the table of a `.ts` file of the UCR archive, with a row for each series.
 
     Channels are the columns `0`, `1`, ..., whose cells are lists of texts; the class is the column
-    `class`. `content` has the bytes of the file, `source` is its name in errors, and of `form` the
+    `class`. A series with fewer channels than others has a list of one empty text for each that is
+    missing. `content` has the bytes of the file, `source` is its name in errors, and of `form` the
     encoding is used. Raises UnreadableError if the file is not in this encoding, or has no series
-    below a line `@data`.
+    below a line `@data`, and LookupError for an encoding that Python does not know.
 
     References
     ----------

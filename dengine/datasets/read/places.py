@@ -82,8 +82,8 @@ def part_of(source: PartSource, table: Table) -> str:
     """Return the part number of a recording by `[part]`, `source`; "" if that states nothing.
 
     The words of several columns are joined by blanks. Raises UnreadableError if the stated column,
-    line or match is missing or empty, or if the number changes within the recording, and DataError
-    if the stated path is no regular expression with one group.
+    line or match is missing, or it or any of several columns is empty, or if the number changes
+    within the recording, and DataError if the stated path is no regular expression with one group.
     """
     words = words_of(source, table, source.column)
     if not all(words):
@@ -94,10 +94,12 @@ def part_of(source: PartSource, table: Table) -> str:
 def listing_table(path: Path, form: TextForm) -> Table:
     """Return the table of a listing, which is a Parquet file or a text file.
 
-    The first line of a text has the names of the columns; the delimiter is the one of `, ; tab |`
-    that is most frequent in it. Cells stay texts. Of `form` only the encoding is used. Raises
-    UnreadableError if the file cannot be read or a row has another number of cells, and DataError
-    for a damaged Parquet file.
+    A name that ends in `.parquet` tells the first. The first line of a text has the names of the
+    columns; the delimiter is the first of `, ; tab |` that is most frequent in it. Cells of a text
+    stay texts. Of `form` only the encoding is used. Raises UnreadableError if the file cannot be
+    read, is not in the encoding or has no rows, or a row has another number of cells; DataError for
+    a damaged Parquet file or without pyarrow; and LookupError for an encoding that Python does not
+    know.
     """
     content = read_file(path)
     if path.suffix == ".parquet":
@@ -187,8 +189,9 @@ class LabelReader:
     def meaning(self, word: str, line: int = 0) -> int | None:
         """Return what a word of the source means: 1 good, 0 bad, None not checked.
 
-        A word that is stated as several of these has the first of these meanings. Raises
-        UnreadableError for a word whose meaning is not stated; `line` is its line in the file.
+        A word that is stated as several of these has the first of these meanings: good, then bad.
+        Words are compared exactly. Raises UnreadableError for a word whose meaning is not stated;
+        `line` is its line in the file.
         """
         source = self.source
         meanings: dict[str, int | None] = dict.fromkeys(source.unchecked)
@@ -202,7 +205,10 @@ class LabelReader:
         return meanings[word]
 
     def unused_note(self) -> str:
-        """Return a sentence on the rows of the listing whose recording was not read; "" if none."""
+        """Return a sentence on the keys of the listing in which no recording was found, or "".
+
+        It names up to eight of them, with the number of all.
+        """
         unused = sorted(self.listing.keys() - self.used, key=natural_key)
         n = f"{len(unused)} of {len(self.listing)} rows of {self.source.listing}"
         return f"{n} name no recording that was read: {listed(unused)}." if unused else ""
@@ -222,8 +228,9 @@ def read_labels(base: Path, source: LabelSource, form: TextForm) -> LabelReader:
     """Return the reader of a source of labels, after reading its listing, if it has one.
 
     The listing stands in the folder `base`, and is a text in the encoding of `form` or a Parquet
-    file. Raises DataError if it cannot be read, or if `source.key` and `source.column`, the columns
-    of keys and words in it, are not both stated and there.
+    file. Rows of one key stay together, in their order. Raises DataError if it cannot be read, or
+    if `source.key` and `source.column`, the columns of keys and words in it, are not both stated
+    and there. A path that is no valid expression is not noticed here.
     """
     reader = LabelReader(source)
     if source.listing:

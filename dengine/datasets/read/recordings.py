@@ -54,7 +54,8 @@ def recording_of(
     Raises
     ------
     UnreadableError
-        If the table does not follow the description, or is damaged.
+        If the table does not follow the description, is damaged, or has too few or too many samples
+        (see `fitted`).
     DataError
         If a regular expression or a format of times in the description is invalid.
     """
@@ -93,8 +94,9 @@ def recording_of(
 def kept_rows(table: Table, rows: Mapping[str, RowWords]) -> tuple[Table, Cells]:
     """Return a table of the rows that are samples, and which of these are lost, bool (kept rows,).
 
-    Without `rows` all are kept. Raises UnreadableError for a word whose meaning is not stated, or a
-    column that is missing or of another length.
+    A column takes its words from the rows that the columns before it keep. Without `rows` all are
+    kept. Raises UnreadableError for a word whose meaning is not stated, and for a column that is
+    missing, has lists or is of another length.
 
     rows : for each column, the words that keep a row, drop it, or mark its samples as lost; `*` is
     any other word.
@@ -119,8 +121,9 @@ def samples_of(table: Table, column: str, channel: Channel, form: TextForm) -> F
 
     The cells of `column` are in the unit that the file states for it, or else in the unit in its
     name, or else in the channel's unit. `form` says how numbers are written. A lost sample is NaN.
-    Raises UnreadableError if the unit that the file states is of another quantity, if the column is
-    missing, or if a cell is no number; a unit of another quantity in the name is ignored.
+    Raises UnreadableError if the file and the channel state different units, and these are of
+    different quantities or one is unknown; if the column is missing; or if a cell is no number. A
+    unit of another quantity in the name is ignored.
     """
     values = table.numbers(column, form)
     factor = 1.0
@@ -139,8 +142,9 @@ def label_of(labels: Sequence[LabelReader], table: Table, part: str) -> int | No
     """Return the label of a part, 1 good or 0 bad; None if it was not checked.
 
     `labels` has a reader for the source of labels, and for each source that must agree with it;
-    `table` and `part` are the table and the number of the part. Raises UnreadableError if a source
-    has no label for it, or if the sources do not agree, also if only one of them says that it was
+    `table` and `part` are the table and the number of the part. A reader of a listing adds the key
+    that it found to its `used`. Raises UnreadableError if a source has no label for the part or
+    contradictory rows, or if the sources do not agree, also if only one of them says that it was
     not checked, and DataError if the path of a source is no regular expression with one group.
     """
     label, *others = [reader.label(table, part) for reader in labels]
@@ -165,21 +169,24 @@ def read_recordings(
         A folder, a file or a table.
     description : Description
     progress : callable, optional
-        Called with 1 after each file.
+        Called with 1 after each file, also one that cannot be read; once for a bag or a table.
 
     Returns
     -------
     Dataset
-        Its traces are in the order that `order` of the description states. A recording that does
-        not follow the description or repeats another is one of its `faults`; one whose part was not
-        checked counts in `unlabelled`. `notes` says if samples are lost, rows of a listing name no
-        recording, or there are fewer recordings than when the description was made.
+        Its traces are in the order that `order` of the description states; of equal ones that of
+        the files. A recording that does not follow the description or repeats another is one of its
+        `faults`, and so is a file that cannot be read; of recordings with equal samples and
+        different labels none is kept. One whose part was not checked counts in `unlabelled`.
+        `notes` says if samples are lost, rows of a listing name no recording, or there are fewer
+        recordings than when the description was made.
 
     Raises
     ------
     DataError
-        If the description does not pass `check_description`, no file is found, a listing of labels
-        cannot be read, or no recording is left.
+        If the description does not pass `check_description`, no file is found or a pattern in
+        `files` is malformed, a bag or a listing of labels cannot be read, no recording is left, or
+        `make_dataset` refuses the traces, like those with more channels than samples.
     SettingError
         If `windows.trigger` is malformed.
     """
@@ -226,9 +233,9 @@ def files_of(
 
     The data set has the name of the folder, or of the file without its suffix. All files of a bag
     are read here, into one table; a fault of each damaged one is appended to `faults`. A DataFrame
-    gives one table, called "table", and the current folder. Raises DataError if there is no file or
-    the bag cannot be read (see `read_bag`), and SettingError if `windows.trigger` of a bag is
-    malformed.
+    gives one table, called "table", and the current folder. Raises DataError if there is no file, a
+    pattern in `files` is malformed, or the bag cannot be read (see `read_bag`), and SettingError if
+    `windows.trigger` of a bag is malformed.
     """
     if not isinstance(source, Path):
         return FRAME, Path(), [(read_frame(source, FRAME), FRAME)]
@@ -248,8 +255,9 @@ def parts_of(
 
     Each table that `split` yields is one part, or, if `[windows]` is stated, a long recording that
     is cut into parts. `name` is the file's name in errors, and `base` the folder of the listing in
-    `[windows]`. Raises UnreadableError if the file cannot be read, DataError if it cannot be split
-    or cut, and SettingError if `windows.trigger` is malformed.
+    `[windows]`. Raises UnreadableError or DataError if the file cannot be read, DataError if it
+    cannot be split, or one of its recordings cannot be cut (those before it are yielded), and
+    SettingError if `windows.trigger` is malformed.
     """
     table = file if isinstance(file, Table) else table_of(read_file(file), name, description)
     for part in split(table, description):
@@ -260,13 +268,13 @@ def parts_of(
 
 
 def dataset_of(recordings: Sequence[Recording], description: Description) -> Dataset:
-    """Return the data set of recordings, in the given order.
+    """Return the data set of recordings, at least one, in the given order.
 
     `ordered` is False if the label changes exactly once from one recording to the next. `fit` is
     "strict" if the recordings were resampled at the stated rate of their clock, since live traces
     then come at this rate; otherwise it is `traces.lengths` of the description, "pad" for
-    "pad-all". `part` is None if no recording has a part number. Raises DataError if `make_dataset`
-    refuses the traces.
+    "pad-all". `limit` is that of the first channel. `part` is None if no recording has a part
+    number. Raises DataError if `make_dataset` refuses the traces.
     """
     labels, parts, sources, lengths = (
         np.array([getattr(recording, key) for recording in recordings])
@@ -298,9 +306,11 @@ def fitted(
 
     `seconds`, shape (n,), has the times since the first sample; None without a clock. With
     `resample`, times and a stated rate, the samples are interpolated at that rate from the first
-    time on. A longer recording loses its end; one that ends up to one step early is accepted. With
-    times but without a rate the whole recording is interpolated evenly. Otherwise it is fitted like
-    a live trace (`fit_length`); `pad-all` repeats the last sample, however short the recording is.
+    time on. A longer recording loses its end; one that ends up to one step early is accepted, and
+    its last sample repeated. With times but without a rate the whole recording is interpolated
+    evenly, if it has half to twice T samples. Otherwise it is fitted like a live trace
+    (`can_fit_length`, `fit_length`); `pad-all` takes any length but 0, and repeats the last sample
+    or drops the end.
 
     Raises
     ------

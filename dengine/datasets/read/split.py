@@ -22,9 +22,10 @@ OBJECTS = ("json", "jsonl", "ts")
 def table_of(content: bytes, name: str, description: Description) -> Table:
     """Return the table of a file in the format of the description.
 
-    `content` has the bytes of the file, and `name` is its name in errors. Raises UnreadableError or
-    DataError if the file does not have this format; for a text file also SettingError if
-    `windows.trigger` is malformed.
+    Any other format than `ts`, `json`, `jsonl`, `parquet` and `npz` is read as text. `content` has
+    the bytes of the file, and `name` is its name in errors. Raises UnreadableError or DataError if
+    the file does not have this format, and DataError without pyarrow for a Parquet file; for a text
+    file also SettingError if `windows.trigger` is malformed.
     """
     kind, form = description.format, description.text
     if kind == "ts":
@@ -92,8 +93,10 @@ def split(table: Table, description: Description) -> Iterator[Table]:
     order of these numbers. Otherwise the file is one part.
 
     In numbered columns and in the layout `columns`, empty cells at the end are no samples. A part
-    has `damage` if one of its rows is damaged, or if rows of other parts stand between its own.
-    Raises DataError if `part.column` of the layout `long` is not stated or not in the table.
+    has `damage` if one of its rows is damaged (`long`: or one directly before or behind it), if the
+    items of a list in its row are not alike, or if rows of other parts stand between its own
+    without `time.sort`; in `columns` and for a whole file, if the file has any. Raises DataError if
+    `part.column` of the layout `long` is not stated or not in the table.
     """
     if description.layout == "long":
         yield from _split_rows(table, description)
@@ -108,9 +111,10 @@ def split(table: Table, description: Description) -> Iterator[Table]:
 def _split_rows(table: Table, description: Description) -> Iterator[Table]:
     """Yield the table of each part, whose rows have the same words in `part.column`.
 
-    A part has damage if a row with a wrong number of cells stands within or beside it, or if rows
-    of other parts stand between its own and `time.sort` is not set. Raises DataError if
-    `part.column` is not stated or not in the table.
+    The parts come in the order of their first rows. A row with a wrong number of cells is in no
+    part; a part has damage if such a row stands within or beside it, or if rows of other parts
+    stand between its own and `time.sort` is not set. Raises DataError if `part.column` is not
+    stated or not in the table.
     """
     import pandas as pd
 
@@ -141,8 +145,9 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
 
     A channel like `x*` gets its samples from the columns in which a number stands for the `*`, in
     the order of these numbers, without empty cells at the end. A list in any other cell becomes a
-    column. A part has damage if its row had a wrong number of cells, or if the items of a list in
-    it are not all alike.
+    column, or several; a column without a cell for each row is in every part as a whole, and an
+    empty one in none. A part has damage if its row had a wrong number of cells, or if the items of
+    a list in it are not all alike; then it has only its numbered channels.
     """
     groups = {
         key: [match[0] for match in match_numbered(key, table.columns)]
@@ -160,11 +165,11 @@ def _split_wide(table: Table, description: Description) -> Iterator[Table]:
 
 
 def _row_of(table: Table, i: int) -> Table:
-    """Return row i as the table of a part; a list in a cell becomes a column.
+    """Return row i as the table of a part; a list in a cell becomes a column, or several.
 
     A column that does not have a cell for each row is taken as a whole. The part has damage if the
-    row had a wrong number of cells, or if the items of a list in a cell are not all alike; then it
-    has no columns.
+    row had a wrong number of cells. If the items of a list in a cell are not all alike, that is its
+    only damage, and it has no columns.
     """
     n = len(table.lines)
     line = table.lines[i]
@@ -192,8 +197,8 @@ def _split_columns(table: Table, description: Description) -> Iterator[Table]:
     """Yield for each column that matches the first channel a table, which is a part.
 
     The channel's name may have a `*` for any text. The columns of times and of `[rows]` are in each
-    table, too, and are no parts. Rows below the last cell of the part that is not empty are left
-    out. Damage of the file is damage of each part.
+    table, too, and are no parts; other columns are in none. Rows below the last cell of the part
+    that is not empty are left out. Damage of the file is damage of each part.
     """
     channel = next(iter(description.channels))
     shared = {*description.time.column, *description.rows}
@@ -213,7 +218,7 @@ def _with_samples(
     """Return a table to which columns with the samples of channels are added.
 
     Cells at the end of a channel that are empty or NaN are left out. The unit of a channel becomes
-    that of its first column in the file.
+    that of its first column in the file, "" if that has none. `origin` replaces that of the table.
 
     samples : the cells by channel. origin : by channel the column of the file for each sample.
     """

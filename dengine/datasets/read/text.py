@@ -39,18 +39,22 @@ def read_text(content: bytes, source: str, form: TextForm, kind_of: Kind = lambd
     kind_of : callable
         Returns the kind of a column by its name; by default "word". "number": the column has
         numbers if the file is plain, otherwise texts. "word": it has texts. "": it is not needed,
-        and is empty if the file is plain. A file is plain if pandas can read it without doubt.
+        and is empty if the file is plain. A file is plain if pandas can read it without doubt, and
+        `form.drop` is empty.
 
     Returns
     -------
     Table
-        A line with a wrong number of cells is in its `damage`, and its row has empty cells.
+        A line with a wrong number of cells is in its `damage`, and its row has empty cells. Empty
+        lines and those that `form.drop` names are left out; if all are, it has no rows.
 
     Raises
     ------
     UnreadableError
-        If the file has no rows of samples, has another encoding, or has neither the stated header
-        nor stated names, or if all rows have a wrong number of cells.
+        If the file has no line for samples, has another encoding, lacks a stated text of the
+        header, or has neither header nor stated names, or if all rows have a wrong number of cells.
+    LookupError
+        If Python does not know the encoding.
     """
     content = to_utf8(content, form.encoding)
     header = _header_line(content, form.header)
@@ -100,7 +104,7 @@ def to_utf8(content: bytes, encoding: str) -> bytes:
 def split_line(line: str, delimiter: str) -> list[str]:
     """Return the cells of one line; a blank as delimiter stands for any run of blanks.
 
-    Quotes mean nothing in a line with a cell that is too long for the `csv` module.
+    Quotes mean nothing then, nor in a line with a cell that is too long for the `csv` module.
     """
     with suppress(csv.Error):
         return line.split() if delimiter == BLANK else next(csv.reader([line], delimiter=delimiter))
@@ -120,7 +124,8 @@ def header_names(cells: Sequence[str]) -> list[str]:
 def _header_line(content: bytes, header: int | str) -> int:
     """Return the number of the header's line, from 1; 0 for none.
 
-    Raises UnreadableError if `header` is a text and no line begins with it.
+    The first line that begins with the text counts; a number is returned as it is. Raises
+    UnreadableError if `header` is a text and no line begins with it.
 
     content : the file in UTF-8. header : the number, or the text with which the line begins.
     """
@@ -161,8 +166,8 @@ def _read_plain(
 ) -> dict[str, Cells]:
     """Return the needed columns by name, read by pandas; none if anything in the file is not plain.
 
-    Not plain are a row with a wrong number of cells, an empty line, an empty last cell, and a cell
-    that is not a finite number in a column of numbers.
+    Not plain are a row with a wrong number of cells, an empty line, an empty last cell, a cell with
+    a line break, and one that is not a finite number in a column of numbers, like an empty one.
 
     table : only the names of its columns and the lines of its rows are used. kinds : the kind of
     each column: "number", "word" (its cells are read as texts), or "" if it is not needed.

@@ -25,12 +25,13 @@ def cut(table: Table, description: Description, base: Path) -> Iterator[Table]:
     """Yield the table of each part of a long recording, as `[windows]` says.
 
     A part is a window of rows, which a trigger begins, or whose start and end are in a listing, a
-    file in the folder `base`. It has `damage` if it begins in a gap of the times, or if its window
-    has no samples, overlaps an earlier one, or goes beyond the recording. If the labels are a topic
-    of a bag, that column has at most one cell: the first label between the start of the part and
-    the start of the next. Raises DataError if `time.column` is not stated, if a trigger cuts and
-    the rate is not stated, if no part is found, if the recording has damage, or if times, signals,
-    labels or the listing cannot be read, and SettingError for a malformed trigger.
+    file in the folder `base`; with both stated the trigger counts. It has `damage` if a trigger
+    begins it in a gap of the times, or if a window of the listing has no samples, overlaps an
+    earlier one, or goes beyond the recording. If the labels are a topic of a bag, that column has
+    at most one cell: the first label between the start of the part and the start of the next.
+    Raises DataError if `time.column` is not stated, if a trigger cuts and the rate is not stated,
+    if no part is found, if the recording has damage, or if times, signals, labels or the listing
+    cannot be read, and SettingError for a malformed trigger.
     """
     name = table.source
     if not description.time.column:
@@ -55,10 +56,10 @@ def _triggered(table: Table, times: Floats, description: Description, base: Path
     """Yield the number, the rows and the fault ("" for none) of each part that a trigger begins.
 
     The numbers count from 1. Each part has `traces.samples` rows; those of the last may go beyond
-    the table, which is no fault here. It has a fault if it begins in a gap of the times. A start
-    within the previous part is ignored. `times`, shape (rows,), are in seconds; `base` is not used.
-    Raises DataError if the rate is not stated or a signal cannot be read, and SettingError for a
-    malformed trigger.
+    the table, which is no fault here. It has a fault if it begins in a gap of the times, 1.5 steps
+    of the stated rate or more. A start within the previous part is ignored. `times`, shape (rows,),
+    are in seconds and increase; `base` is not used. Raises DataError if the rate is not stated or a
+    signal cannot be read, and SettingError for a malformed trigger.
     """
     rate = description.time.rate_hz
     if not rate:
@@ -82,11 +83,11 @@ def _listed(table: Table, times: Floats, description: Description, base: Path) -
 
     The listing, a file in the folder `base`, has the key (the part's number), start and end of each
     window. `times`, shape (rows,), are the recording's, in seconds. If they begin at 1e8 s or
-    later, like dates, and all times of the listing are smaller, those count from the recording's
-    first sample. The rows are those from the start to before the end. A window has a fault if it
-    overlaps an earlier one, has no samples, or goes beyond the recording by more than 1.5 steps of
-    the stated rate; one without samples gets the first row. Raises DataError if the listing cannot
-    be read.
+    later, like dates, and all ends in the listing are smaller, its times count from the first of
+    `times`. The rows are those from the start to before the end (less 1e-5 s, for rounding). A
+    window has a fault if it overlaps an earlier one, has no samples, or goes beyond the recording
+    by more than 1.5 steps of the stated rate (without one: at all); one without samples gets the
+    first row. Raises DataError if the listing or its times cannot be read.
     """
     about = description.windows
     form = description.text
