@@ -26,6 +26,7 @@ ANY = "*"  # in place of a word, any that is not named; in a column, any text
 VERSION = 1
 FOLDER_FILE = "recordings.toml"  # in a folder; beside a single file it is FILE.toml
 MOST_BYTES = 1_000_000
+ORDERS = {"name", "path", "time"}  # any other `order` is a column
 Words = tuple[str, ...]
 Stated = Mapping[str, Any]
 
@@ -275,8 +276,9 @@ class Description:
         `columns`: a column for each part. `npz`: arrays with all parts. `mcap`: bags.
     order
         The order in which the parts were made. `name`: by file name, with the numbers in it sorted
-        by value, and dates like 31.12.2025 by year. `time`: by the first time of each recording. Or
-        the name of a column.
+        by value, and dates like 31.12.2025 by year. `path`: folder by folder, apart from the words
+        of `label.path`, and by name within a folder. `time`: by the first time of each recording.
+        Or the name of a column.
     """
 
     version: int = VERSION

@@ -73,7 +73,7 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     known meanings only if its name is one for good, like `success`; for `failed` they stay unknown.
     """
     words = sorted({*words})
-    name = source.column or source.line or source.topic
+    name = source.column or source.line or source.topic or ("([^" in source.path and source.path)
     verdicts: Sequence[Sequence[str]] = (GOOD, BAD)
     if name and {word.lower() for word in words} <= {*YES, *NO, *UNCHECKED}:
         verdicts = (YES, NO) if GOOD_NAME.fullmatch(name) else ((), ())

@@ -22,6 +22,7 @@ from .clock import is_clock, propose_clock, propose_rate
 from .columns import MOST_WORDS, Column, Proposal, columns_of, counts_of
 from .labels import is_verdict, lines_of, part_words, propose_label, with_meanings
 from .layout import PART_NAME
+from .order import propose_order
 
 MOST_FREQUENT = 0.9  # of the rows, if the others are of another signal
 SPARSE = 0.1
@@ -44,8 +45,8 @@ def propose_roles(p: Proposal) -> None:
 
     The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
-    of the traces, ignored columns and files. A key is `?` if no rule proves a value. If it is open
-    which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?` gives no
+    of the traces, order, ignored columns and files. A key is `?` if no rule proves a value. If it
+    is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?` gives no
     rate either. Stated keys stay, but a stated `ignored` is replaced (`list_others`), and a stated
     `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is set.
     Raises DataError if a stated column of times or channel does not exist, a setting in `[time]` is
@@ -69,6 +70,8 @@ def propose_roles(p: Proposal) -> None:
         if clock.column and UNKNOWN not in clock.column + clock.format:
             propose_rate(p, [samples_only(p, table) for table in p.tables])
         propose_lengths(p)
+    if p.description.order == "name" and UNKNOWN not in clock.column:
+        propose_order(p)
     list_others(p)
 
 

@@ -22,6 +22,12 @@ SUFFIX = re.compile(r"\.[A-Za-z]\w{0,7}(\.gz)?$")  # of a file
 MARKS = " \t;,:=\"'"  # around the words of a line
 
 
+def without_label(source: LabelSource, path: str) -> str:
+    """Return a path without the text that `source.path` finds in it; the whole path if none."""
+    match = re.search(source.path, path) if source.path else None
+    return path[: match.start(1)] + path[match.end(1) :] if match else path
+
+
 def without_suffix(path: str) -> str:
     """Return a path without the suffix of its file, and without `.gz` behind it."""
     return SUFFIX.sub("", path)

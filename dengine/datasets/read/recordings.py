@@ -19,14 +19,14 @@ from ...records import FITS, Floats
 from ...traces import can_fit_length, fit_length
 from ..checks import check_description, lost_note, without_repeats
 from ..dataset import Dataset, Fault, make_dataset, unit_text
-from ..description import ANY, Channel, Description, RowWords, TextForm
+from ..description import ANY, ORDERS, Channel, Description, RowWords, TextForm
 from ..table import Cells, Recording, Table, UnreadableError
 from ..units import conversion, unit_in
 from .bags import read_bag
 from .clock import check_steps, times_of
 from .files import caught, find_files, natural_key, read_file
 from .frames import read_frame
-from .places import LabelReader, part_of, read_labels
+from .places import LabelReader, part_of, read_labels, without_label
 from .split import split, table_of
 from .windows import cut
 
@@ -81,8 +81,9 @@ def recording_of(
     part = part_of(description.part, table)
     if description.windows.trigger or description.windows.listing:
         part = part or table.path
-    is_column = description.order not in ("name", "time")
-    rank = table.one_word(description.order, "first") if is_column else ""
+    rank = without_label(description.label, table.path) if description.order == "path" else ""
+    if description.order not in ORDERS:
+        rank = table.one_word(description.order, "first")
     label = label_of(labels, table, part)
     if label is None:
         return None

@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from ...errors import DataError
-from ..description import ANY, Description
+from ..description import ANY, ORDERS, Description
 from ..table import Cells, Table, UnreadableError, as_word
 from ..triggers import as_trigger
 from . import frames
@@ -49,7 +49,7 @@ def column_kind(description: Description) -> Kind:
     """
     clock = zip(description.time.column, description.time.format, strict=False)
     dated = {name for name, form in clock if is_dated(form)}
-    order = {description.order} - {"name", "time"}
+    order = {description.order} - ORDERS
     words = dated.union(description.part.column, description.rows, order)
     words |= {source.column for source in description.labels}
     numbers = {*description.time.column, *signals_of(description)}

@@ -1,0 +1,39 @@
+"""In which order the parts were made, as far as names and columns prove it."""
+
+import re
+
+from ..description import UNKNOWN
+from ..read.files import natural_key
+from ..read.places import without_label, without_suffix
+from .columns import Proposal
+
+# Dates in names. Those in the group `odd` are not sorted by name: they have the day or the month
+# first, the month as a word, or AM and PM.
+DATE = re.compile(
+    r"(?i)(?P<odd>(?<![a-z])(jan|feb|m[aä]r|apr|ma[iy]|jun|jul|aug|sep|o[ck]t|nov|de[cz])(?![a-z])"
+    r"|\d ?[ap]m(?![a-z])|(?<!\d)\d\d?([-_])\d\d?\3(19|20)\d\d(?!\d)"
+    r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d))|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\6[0-3]\d"
+)
+
+
+def propose_order(p: Proposal) -> None:
+    """Set `order` in `p` to `?`, with a note, if the sorted names need not be the order.
+
+    That is so if a file name stands in several folders, apart from the words of the label; if each
+    file name has a date, and one of these is not sorted by name, or the names are not in the order
+    of the dates; or if a column without another use has dates in another order.
+    """
+    paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
+    names = [path.rpartition("/")[2] for path in paths]
+    if len({*paths}) > len({*names}):
+        p.put("order", UNKNOWN, "name: by file name, or path: folder by folder")
+    matches = [*filter(None, map(DATE.search, names))]
+    dates = [match.string[match.start() :] for match in matches]
+    is_odd = any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key)
+    if is_odd and len(dates) == len(names):
+        text = "name, if that is the order; the names have dates, which are sorted otherwise"
+        p.put("order", UNKNOWN, f"{text}: rename the files, with year, month and day in front")
+    for column in p.unused:
+        ranks = [*map(natural_key, column.fixed)] if column.forms else []
+        if ranks != sorted(ranks):
+            p.put("order", UNKNOWN, f"name, or {column.name}, whose dates have another order")
