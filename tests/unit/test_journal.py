@@ -79,6 +79,12 @@ def test_each_line_counts_once_also_in_a_store_that_was_passed_open_and_stays_so
             assert engine.retrain().n_traces == 200 + 29
 
 
+def test_a_part_that_comes_twice_in_one_import_counts_once(store, X, tmp_path):
+    lines = [f"part,a-1,{label},,verify,verify,no_model,0,1,0,0" for label in (1, 1, 0)]
+    report = import_journal(store, write_lines(tmp_path / "cell.csv", X[[0, 0, 0]], lines))
+    assert (report.imported, report.repeated, report.contradicted) == (1, 1, 1)
+
+
 # Of each line: the part, and its label's bound, success, how many were silent before it, novelty.
 # Of each line: the part, and its label's bound, success and novelty; none is known of the last, and
 # of the second only where all stops are reported.

@@ -35,7 +35,7 @@ VERDICT = (
 )
 WHOLE = "(total|overall|final|part|teil|gesamt)"
 NAME = re.compile(rf"(?i)(({WHOLE}|test|{VERDICT})[-_ ./]?)?{VERDICT}([-_ .]?{WHOLE})?")
-GOOD_NAME = re.compile(r"(?i)(.*[./])?(success|ok|io|pass(ed)?|accept(ed)?|good)")
+GOOD_NAME = re.compile(r"(?i)(.*[./])?(y|success|ok|io|pass(ed)?|accept(ed)?|good)")
 IN_PATHS = (*GOOD, *BAD, "pending", "offen", "unchecked")
 WORD = "|".join(sorted(map(re.escape, IN_PATHS), key=len, reverse=True))
 NEGATED = re.compile(  # or of a name that may be bad, as in `leak=False`
