@@ -51,8 +51,6 @@ if TYPE_CHECKING:
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
 
-CONFIRM_BY_FEEDBACK = {"stops": False, "confirmed": True}
-
 
 @dataclass(frozen=True)
 class Stream:
@@ -238,19 +236,18 @@ POLICY_LISTS = GRID_LISTS | {
 )
 @options.data_options()
 @options.recipe_options
-@click.option("--confirm", is_flag=True, help="Accepted good parts are confirmed afterwards.")
 @stream_options(30, 1, 1, _SHUFFLES)
 @options.check_option
 @explain_option
 @options.out_option("replays.csv", "curves.png")
-def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
+def replay(choice: RecipeChoice, **played: Any) -> None:
     """Replay a recorded stream, shuffled, through fresh engines.
 
     Shows what was decided and how much of it was wrong, over all shuffles, and whether the accepted
     parts kept to LB, the --lower-bound. --out writes a CSV file and pictures. Ctrl-C, or an error
     in a replay, ends it and shows the replays that were finished.
     """
-    _replay_and_print([choice.make_contender()], {"confirms": [confirm]}, **played)
+    _replay_and_print([choice.make_contender()], {}, **played)
 
 
 @verb("dengine compare --data insertion --reducers conv,pca --repeats 2 --out out/")
@@ -268,17 +265,6 @@ def replay(choice: RecipeChoice, confirm: bool, **played: Any) -> None:
     "--paper", is_flag=True, help="The paper's whole grid: 3 alphas, 3 lower bounds, 2 intervals."
 )
 @options.bundle_options("lists", options.drop_none, POLICY_LISTS)
-@click.option(
-    "--feedback",
-    type=CommaList(click.Choice(list(CONFIRM_BY_FEEDBACK))),
-    default="stops",
-    show_default=True,
-    metavar="LIST",
-    help=(
-        "What the engine learns about accepted parts. stops: only line stops. confirmed: also "
-        "which parts are good."
-    ),
-)
 @stream_options(30, 1, 1, _SHUFFLES)
 @options.check_option
 @explain_option
@@ -288,7 +274,6 @@ def compare(
     settings: Options,
     paper: bool,
     lists: Options,
-    feedback: Sequence[str],
     **played: Any,
 ) -> None:
     """Replay the same streams through several methods.
@@ -309,7 +294,6 @@ def compare(
 
     grid: dict[str, Any] = {**(PAPER_GRID if paper else {}), **lists}
     _refuse_value_beside_list(settings, grid)
-    grid["confirms"] = [CONFIRM_BY_FEEDBACK[name] for name in feedback]
     contenders = [RecipeChoice(name, settings).make_contender() for name in names]
     _replay_and_print(contenders, grid, **played)
 
@@ -474,7 +458,6 @@ def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
     settings = {
         "guarantee": policy.guarantee,
         "stops": policy.stops,
-        "confirm": "good ones confirmed" if replay.confirm else "stops alone",
         "interval": policy.interval,
         "alpha": f"alpha {policy.alpha:g}",
         "lower_bound": f"LB {percent(policy.lower_bound, 'g')}",
@@ -639,11 +622,10 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
     not tried.
     """
     from ..experiments.costs import policy_name
-    from ..experiments.survey import survey_dataset
+    from ..folds import content_hash
 
     lines = [curve.sentence, curve.price_sentence]
-    repeats = survey_dataset(dataset).duplicates
-    if repeats:
+    if repeats := len(dataset) - len({*content_hash(dataset.cube).tolist()}):
         lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
     by_shuffles = [f"{policy_name(row.policy)} {amount(row.cost)}" for row in curve.left_behind]
     if by_shuffles:

@@ -57,15 +57,12 @@ class Task:
     cycles : int or None, default None
         How many; None plays the whole data set.
     shuffle : bool, default True
-    confirm : bool, default False
-        Whether accepted good parts are confirmed.
     """
 
     contender: Contender
     seed: int
     cycles: int | None = None
     shuffle: bool = True
-    confirm: bool = False
 
 
 class KeptReplays:
@@ -112,7 +109,6 @@ class KeptReplays:
             task.seed,
             task.cycles,
             task.shuffle,
-            task.confirm,
             contender.baseline,
             contender.recipe.to_toml(),
             # A transformer with everything that it holds: arrays and functions too.
@@ -330,16 +326,14 @@ def _play(data: Dataset, i: int, task: Task, on_cycle: Any) -> tuple[int, Replay
     Returns `i`, the position of the task among all tasks, and the replay. `on_cycle` is called with
     the number of finished cycles after each; None: nothing is called. Raises what `replay` raises.
     """
-    played = replay(
+    return i, replay(
         data,
         task.contender,
         task.seed,
         task.cycles,
         shuffle=task.shuffle,
-        confirm=task.confirm,
         on_cycle=on_cycle,
     )
-    return i, played
 
 
 def run_grid(
@@ -403,7 +397,6 @@ def grid_tasks(
     intervals: Sequence[str | None] = (None,),
     seeds: Iterable[int] = (0,),
     guarantees: Sequence[str | None] = (None,),
-    confirms: Sequence[bool] = (False,),
     cycles: int | None = None,
     shuffle: bool = True,
 ) -> list[Task]:
@@ -416,8 +409,6 @@ def grid_tasks(
     alphas, lower_bounds, intervals, guarantees : sequence
         Settings of the policy; None leaves one to the recipe.
     seeds : iterable of int
-    confirms : sequence of bool
-        Whether accepted good parts are confirmed.
     cycles : int or None, default None
         Parts of each replay; None plays all.
     shuffle : bool, default True
@@ -426,7 +417,7 @@ def grid_tasks(
     Returns
     -------
     tasks : list of Task
-        By contender, interval, alpha, lower bound, guarantee, confirm and seed.
+        By contender, interval, alpha, lower bound, guarantee and seed.
 
     Raises
     ------
@@ -435,15 +426,13 @@ def grid_tasks(
     """
     seeds = list(seeds)
     names = ("interval", "alpha", "lower_bound", "guarantee")
-    combinations = product(
-        load_contenders(recipes), intervals, alphas, lower_bounds, guarantees, confirms
-    )
+    combinations = product(load_contenders(recipes), intervals, alphas, lower_bounds, guarantees)
     tasks = []
-    for contender, *settings, confirm in combinations:
+    for contender, *settings in combinations:
         pairs = zip(names, settings, strict=True)
         changes = {name: value for name, value in pairs if value is not None}
         changed = contender.with_policy(**changes)
-        tasks += [Task(changed, seed, cycles, shuffle, confirm) for seed in seeds]
+        tasks += [Task(changed, seed, cycles, shuffle) for seed in seeds]
     return tasks
 
 

@@ -51,9 +51,6 @@ class Survey:
         Traces that the engine verifies and never learns from.
     not_finite_in : tuple of str
         Files, or rows, of those that are not finite.
-    duplicates, contradicting : int
-        Traces equal to an earlier one, by `content_hash`; and those of them with another label than
-        the first of them.
     near_repeats, looked_at : int
         Among the newest `looked_at` usable traces: those that are much nearer to another part's
         trace than parts are to each other.
@@ -79,20 +76,16 @@ class Survey:
     not_finite_in: tuple[str, ...]
     constant: int
     too_large: int
-    duplicates: int
-    contradicting: int
     near_repeats: int
     looked_at: int
     parts: int | None
 
 
 def survey_dataset(data: Dataset) -> Survey:
-    """Count the traces, labels, faults and repeats of a data set.
+    """Count the traces, labels, faults and near repeats of a data set.
 
-    A repeat is a trace that equals (by `content_hash`, which rounds), or nearly equals, that of
-    another recording. Repeats are looked for among the usable traces: finite, not constant, and
-    without a sample beyond 1e18; near repeats only among the newest 500 of these. Nothing is
-    trained, and the data set is not changed.
+    Near repeats are looked for among the newest 500 usable traces: finite, not constant, and
+    without a sample beyond 1e18. Nothing is trained, and the data set is not changed.
 
     Parameters
     ----------
@@ -108,15 +101,9 @@ def survey_dataset(data: Dataset) -> Survey:
     constant = finite & (X.min(axis=(1, 2)) == X.max(axis=(1, 2)))
     too_large = finite & ~constant & (np.abs(X).max(axis=(1, 2)) > LARGEST)
     usable = finite & ~constant & ~too_large
-    hashes = content_hash(X)
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
-    pairs = zip(hashes.tolist(), parts, strict=True)
+    pairs = zip(content_hash(X).tolist(), parts, strict=True)
     part_hashes = np.array([trace_hash(content, part) for content, part in pairs], dtype=np.int64)
-    _, firsts, contents = np.unique(hashes[usable], return_index=True, return_inverse=True)
-    n_usable = len(contents)
-    is_duplicate = np.zeros(len(data), dtype=np.bool_)
-    is_duplicate[usable] = firsts[contents] != np.arange(n_usable)
-    labels = data.y[usable]
     return Survey(
         **{
             name: getattr(data, name)
@@ -132,10 +119,8 @@ def survey_dataset(data: Dataset) -> Survey:
         not_finite_in=() if data.source is None else tuple(data.source[~finite].tolist()),
         constant=int(constant.sum()),
         too_large=int(too_large.sum()),
-        duplicates=int(is_duplicate.sum()),
-        contradicting=int((labels != labels[firsts[contents]]).sum()),
         near_repeats=near_repeats(X[usable], part_hashes[usable]),
-        looked_at=min(n_usable, NEWEST),
+        looked_at=min(int(usable.sum()), NEWEST),
         parts=None if data.part is None else len(set(parts)),
     )
 

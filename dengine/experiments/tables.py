@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 # Columns by which replays are pooled, and those that are counts.
-CONDITION = ["recipe", "interval", "alpha", "lower_bound", "guarantee", "stops", "confirm"]
+CONDITION = ["recipe", "interval", "alpha", "lower_bound", "guarantee", "stops"]
 COUNTS = [
     "certain",
     "accepted",
@@ -66,7 +66,7 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
 def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
     """Pool the replays that have the same settings, and return a row for each of these settings.
 
-    The settings are the columns in `CONDITION`, from the recipe to `confirm`. There is a row for
+    The settings are the columns in `CONDITION`, from the recipe to `stops`. There is a row for
     each combination of their values that the frame has, in the frame's order.
 
     Parameters
@@ -129,19 +129,13 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
 
     LB is the lower bound of the row's policy. The sentence ends with "kept" or "broken", or says
     that no part, or too few parts, were accepted. It always names the recipe and the guarantee. It
-    names the interval, alpha, and whether good parts are confirmed only if the rows differ in it.
+    names the interval and alpha only if the rows differ in it.
     It has the share of good parts, and the interval of the share of bad parts if the row has one.
     """
-    varying = [
-        name for name in ("interval", "alpha", "confirm") if len({row[name] for row in rows}) > 1
-    ]
+    varying = [name for name in ("interval", "alpha") if len({row[name] for row in rows}) > 1]
     lines = []
     for row in rows:
-        words = {
-            "interval": row["interval"],
-            "alpha": f"alpha {row['alpha']:g}",
-            "confirm": "good ones confirmed" if row["confirm"] else "stops alone",
-        }
+        words = {"interval": row["interval"], "alpha": f"alpha {row['alpha']:g}"}
         settings = ", ".join([row["guarantee"], *(words[name] for name in varying)])
         subject = f"{row['recipe']} ({settings})"
         if not row["total_accepted"]:
@@ -160,15 +154,14 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
 def pooled_table(rows: Sequence[Row], title: str = "Replays", legend: str = LEGEND) -> Table:
     """Return the rows that `pool` returned as a rich Table for the screen, with a legend below.
 
-    There must be at least one row. The first column has the recipe, the guarantee, "confirmed" if
-    accepted good parts were confirmed or else the policy's `stops`, and the interval if the rows
-    differ in it. The others are those of `CELLS`: counts, shares, times and savings.
+    There must be at least one row. The first column has the recipe, the guarantee, the policy's
+    `stops`, and the interval if the rows differ in it. The others are those of `CELLS`: counts,
+    shares, times and savings.
     """
     several_intervals = len({row["interval"] for row in rows}) > 1
     shown = []
     for row in rows:
-        feedback = "confirmed" if row["confirm"] else row["stops"]
-        name = f"{row['recipe']}\n{row['guarantee']}, {feedback}"
+        name = f"{row['recipe']}\n{row['guarantee']}, {row['stops']}"
         if several_intervals:
             name += f"\n{row['interval']}"
         cells = {column: format_cell(row) for column, format_cell in CELLS.items()}

@@ -28,7 +28,7 @@ GRID = {
 }
 
 
-def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_name_is_none(
+def test_another_setting_seed_length_or_data_is_another_replay_another_name_is_none(
     data, tmp_path
 ):
     kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
@@ -36,7 +36,7 @@ def test_another_setting_seed_length_feedback_or_data_is_another_replay_another_
     adding = [FunctionTransformer(np.add, kw_args={"x2": np.full(3, i)}) for i in range(2)]
     others = [who.with_policy(alpha=0.2), PCA(2), PCA(2, whiten=True), *adding, "knn"]
     tasks = [task, *(replace(task, contender=Contender.load(other)) for other in others)]
-    changes = {"seed": 2, "cycles": 61, "confirm": True, "shuffle": False}
+    changes = {"seed": 2, "cycles": 61, "shuffle": False}
     tasks += [replace(task, **{name: value}) for name, value in changes.items()]
     assert len({*map(kept.path, tasks)}) == len(tasks)
     assert kept.path(task) != KeptReplays(tmp_path, replace(data, y=1 - data.y)).path(task)

@@ -38,7 +38,6 @@ EPOCHS = (
     ("0.1 us", 11_644_473_600, "0.1 us since 1601"),
     ("0.1 us", 62_135_596_800, "0.1 us since the year 1"),
 )
-BY_SIZE = ", by the size of the numbers"
 YEARS = (946_684_800, 2_524_608_000)  # seconds since 1970 of the years 2000 to 2050
 # Steps between these are taken for seconds: larger ones may be milliseconds of a rate up to 50 kHz,
 # and smaller ones minutes.
@@ -105,23 +104,20 @@ def is_coarse(column: Column) -> bool:
 def is_rising(column: Column) -> bool:
     """Return whether the cells are numbers that rise, and fall in at most 10 % of the steps.
 
-    A counter that begins again may fall so. The numbers may also fall in all steps, if the newest
-    sample comes first.
+    A counter that begins again may fall so.
     """
     steps = column.steps
-    n_falling = int((steps < 0).sum())
-    return 0 < n_falling == len(steps) or bool((steps > 0).any() and n_falling <= FEW * len(steps))
+    return bool((steps > 0).any() and (steps < 0).sum() <= FEW * len(steps))
 
 
 def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     """Return the unit or the form of a column of times; `?` if none is certain.
 
     The form of dates or times of day comes first, then the unit that the file states, the one in
-    the column's name, and what the size of the numbers proves. The unit is `?` if the file or the
-    name states another one than the size proves of counts since some day. A note on `time.format`
-    in `p` says why it is `?`, or which size proves the unit. If several forms of dates fit, so that
-    day and month can be confused, the form is `?`; but if another column tells a part of the time,
-    too, and all recordings have one and the same date, it is the first of these forms.
+    the column's name, and what the size of the numbers proves. A note on `time.format` in `p` says
+    why it is `?`, or which size proves the unit. If several forms of dates fit, so that day and
+    month can be confused, the form is `?`; but if another column tells a part of the time, too, and
+    all recordings have one and the same date, it is the first of these forms.
 
     is_alone : whether no other column tells a part of the time.
     """
@@ -129,16 +125,12 @@ def form_of(column: Column, p: Proposal, is_alone: bool) -> str:
     if len(forms) > 1 and (is_alone or len({*column.fixed}) != 1):
         p.notes["time.format"] = f"{listed(forms)}: the cells prove neither"
         return UNKNOWN
-    by_size, note = _unit_by_size(column)
     for unit in (*forms, column.unit, _unit_in(column.name)):
         unit = unit.replace("sec", "s")
         if unit in forms or unit.lstrip("0123456789. ") in UNITS:
-            if note.endswith(BY_SIZE) and unit not in (*forms, by_size):
-                p.notes["time.format"] = f"{unit} as the file says, or {by_size}: {note}"
-                return UNKNOWN
             return unit
-    p.notes["time.format"] = note
-    return by_size
+    unit, p.notes["time.format"] = _unit_by_size(column)
+    return unit
 
 
 def _unit_in(name: str) -> str:
@@ -161,7 +153,7 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
     unit is s. Otherwise it is `?`, and the note lists the possible units. It is `?`, too, if the
     column has no numbers that rise; the note then asks for the form of its cells.
     """
-    rising = np.abs(column.steps[column.steps != 0])
+    rising = column.steps[column.steps > 0]
     if not len(rising):
         odd = listed([*column.odd][:3])
         return UNKNOWN, f"no form of times that is known fits {odd}: state it, or text.drop"
@@ -170,7 +162,7 @@ def _unit_by_size(column: Column) -> tuple[str, str]:
     for unit, zero, title in EPOCHS:
         scale = scale_of(unit)
         if YEARS[0] <= first * scale - zero <= YEARS[1] and is_rate(step * scale):
-            return unit, f"{title}{BY_SIZE}"
+            return unit, f"{title}, by the size of the numbers"
     if SECONDS[0] <= step <= SECONDS[1]:
         return "s", f"seconds, for steps of {step:.6g}; the unit is not stated"
     steps = {unit: step * UNITS[unit] for unit in ("s", "ms", "us", "ns", "min")}
@@ -188,28 +180,28 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
 
     `tables` has the samples of each recording. Steps below 0 are left out of the mean, and the rate
     is rounded to five digits. It is `?`, with a note, if it is not between 1 Hz and 1 MHz; then no
-    gaps are looked for. If more recordings
-    than 10 % plus one would be faults because of their times (`check_steps`, by the stated rate and
-    gap), `time.gap` is set to `?`, with a note on the first. If all recordings start after 1999
-    (UTC), `order` is set to `time`, also if the rate is `?`. Recordings whose times cannot be read are skipped. Stated keys stay. Raises DataError if a
+    gaps are looked for. If more recordings than 10 % plus one would be faults because of their
+    times (`check_steps`, by the stated rate and gap), `time.gap` is set to `?`, with a note on the
+    first. If all recordings start after 1999 (UTC), `order` is set to `time`, also if the rate is
+    `?`. Recordings whose times cannot be read are skipped. Stated keys stay. Raises DataError if a
     stated format is no form or unit of times, or if a setting in `[time]` is wrong (see
     `check_clock`).
     """
-    check_clock(p.description.time)
+    clock = p.description.time
+    check_clock(clock)
     clocks = list[tuple[Table, Floats, float]]()
     for table in tables:
         with suppress(UnreadableError):
-            seconds, start = times_of(table, p.description.time, p.description.text)
-            clocks.append((table, np.sort(seconds) if p.description.time.sort else seconds, start))
+            seconds, start = times_of(table, clock, p.description.text)
+            clocks.append((table, np.sort(seconds) if clock.sort else seconds, start))
     rising = [steps[steps >= 0] for steps in (np.diff(seconds) for _, seconds, _ in clocks)]
     if min((start for *_, start in clocks), default=0.0) > YEARS[0]:
         p.put("order", "time")
     usual = float(np.median([steps.mean() for steps in rising if len(steps)] or 0.0))
     if not is_rate(usual):
         text = (
-            f"steps of {usual:.6g} s are of no force: is time.format right? Times that fall are put "
-            "in order with time.sort=true; a footer is left out with text.drop, the words that it "
-            "begins with"
+            f"steps of {usual:.6g} s are of no force: is time.format right? A footer is left out "
+            "with text.drop, the words that it begins with"
         )
         p.put("time.rate_hz", UNKNOWN, text)
         return
@@ -217,7 +209,7 @@ def propose_rate(p: Proposal, tables: Tables) -> None:
     faults = list[Fault]()
     for table, seconds, _ in clocks:
         with caught(faults, table.source):
-            check_steps(seconds, p.description.time, table)
+            check_steps(seconds, p.description.time, table)  # with the rate
     if len(faults) > FEW * len(clocks) + 1:
         text = f"{len(faults)} of {len(clocks)} recordings have such times: {faults[0]}"
         p.put("time.gap", UNKNOWN, f"{text}; {ANSWERS}")

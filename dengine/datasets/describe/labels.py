@@ -69,8 +69,9 @@ def with_meanings(source: LabelSource, words: Names) -> LabelSource:
     A list that the source has already stays; the others get the words of known meaning, like "ok",
     in any case of letters. If a word stays without a meaning, `good` and `bad` become `?` if they
     would be empty. The same holds for a path if either is empty: `pass_1.csv` alone proves nothing.
-    A column, line or topic with only true, yes or 1, their opposites, and words for unchecked has
-    known meanings only if its name is one for good, like `success`; for `failed` they stay unknown.
+    True, yes or 1 and their opposites, alone or with words for unchecked, have known meanings only
+    if the name of the column, line or topic is one for good, like `success`, not `failed`; in a
+    path that takes any word they have none.
     """
     words = sorted({*words})
     name = source.column or source.line or source.topic or ("([^" in source.path and source.path)

@@ -14,6 +14,10 @@ DATE = re.compile(
     r"|\d ?[ap]m(?![a-z])|(?<!\d)\d\d?([-_])\d\d?\3(19|20)\d\d(?!\d)"
     r"|(?<!\d)[0-3]\d[01]\d20[0-3]\d(?!\d))|(?<!\d)(19|20)\d\d([-_.]?)[01]\d\6[0-3]\d"
 )
+ODD = (
+    "name, if that is the order; the names have dates that are sorted otherwise: rename the files, "
+    "with year, month and day in front"
+)
 
 
 def propose_order(p: Proposal) -> None:
@@ -31,8 +35,7 @@ def propose_order(p: Proposal) -> None:
     dates = [match.string[match.start() :] for match in matches]
     is_odd = any(match["odd"] for match in matches) or dates != sorted(dates, key=natural_key)
     if is_odd and len(dates) == len(names):
-        text = "name, if that is the order; the names have dates, which are sorted otherwise"
-        p.put("order", UNKNOWN, f"{text}: rename the files, with year, month and day in front")
+        p.put("order", UNKNOWN, ODD)
     for column in p.unused:
         ranks = [*map(natural_key, column.fixed)] if column.forms else []
         if ranks != sorted(ranks):

@@ -46,12 +46,12 @@ def propose_roles(p: Proposal) -> None:
     The columns are those of `p.tables`. In this order: columns that tell which rows are samples,
     clock, part, label, channels, and what follows from these: words for lost samples, rate, length
     of the traces, order, ignored columns and files. A key is `?` if no rule proves a value. If it
-    is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?` gives no
-    rate either. Stated keys stay, but a stated `ignored` is replaced (`list_others`), and a stated
-    `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is set.
-    Raises DataError if a stated column of times or channel does not exist, a setting in `[time]` is
-    wrong, or a stated source of labels has no words or cannot be read, and SettingError for a
-    malformed `windows.trigger`.
+    is open which rows are samples, `traces.samples` is `?` and no rate is set; a clock with `?`
+    gives no rate either. Stated keys stay, but a stated `ignored` is replaced (`list_others`), and
+    a stated `[rows]` gets further columns and words (`qualify_rows`, `find_lost`). `p.columns` is
+    set. Raises DataError if a stated column of times or channel does not exist, a setting in
+    `[time]` is wrong, or a stated source of labels has no words or cannot be read, and SettingError
+    for a malformed `windows.trigger`.
     """
     p.columns = columns_of(p.tables, p.description.text)
     for name in (*p.description.time.column, *p.description.channels):

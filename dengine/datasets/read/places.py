@@ -24,8 +24,7 @@ MARKS = " \t;,:=\"'"  # around the words of a line
 
 def without_label(source: LabelSource, path: str) -> str:
     """Return a path without the text that `source.path` finds in it; the whole path if none."""
-    match = re.search(source.path, path) if source.path else None
-    return path[: match.start(1)] + path[match.end(1) :] if match else path
+    return re.sub(source.path or "$^", lambda match: match[0].replace(match[1], "", 1), path)
 
 
 def without_suffix(path: str) -> str:
