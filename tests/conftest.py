@@ -18,7 +18,6 @@ import shutil
 import signal
 import subprocess
 import uuid
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,7 @@ os.environ.setdefault(
 import pytest
 
 if TYPE_CHECKING:  # what loads torch waits: the process that starts the workers runs no test
-    from dengine import Dataset, SqlStore
+    from dengine import Dataset
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 SCREW_DRIVING = REPO.parent / "shared" / "data" / "screw_driving.npz"
@@ -134,7 +133,7 @@ def insertion_like(
 
 
 @pytest.fixture(scope="session")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def programs(tmp_path_factory):
     """The folder of the built libraries and programs; kept, so that only the first run compiles."""
     missing = [tool for tool in ("cmake", "g++") if shutil.which(tool) is None]
     if missing:
@@ -166,35 +165,35 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def make_data() -> Callable[..., Dataset]:
+def make_data():
     return insertion_like
 
 
 @pytest.fixture(scope="session")
-def data() -> Dataset:
+def data():
     return insertion_like(200)
 
 
 @pytest.fixture(scope="session")
-def repo() -> Path:
+def repo():
     return REPO
 
 
 @pytest.fixture(scope="session")
-def screw_driving() -> Path:
+def screw_driving():
     if not SCREW_DRIVING.is_file():
         pytest.skip(f"the real screw-driving set is not at {SCREW_DRIVING}")
     return SCREW_DRIVING
 
 
 @pytest.fixture(scope="session")
-def proof_repeats() -> int:
+def proof_repeats():
     """Repeats of a statistical test: few in `make test`, many in `make proof`."""
     return int(os.environ.get("DENGINE_PROOF_REPEATS", "2"))
 
 
 @pytest.fixture(scope="session")
-def stream() -> Dataset:
+def stream():
     """Parts that come one after the other; a file that needs fewer, or more, has its own."""
     return insertion_like(400, samples=60, seed=3)
 
@@ -214,7 +213,7 @@ def url_of(kind: str, directory: Path) -> str | None:
 
 
 @pytest.fixture(params=["memory", *DATABASES])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SqlStore]:
+def store(request, tmp_path):
     """A new store of each kind."""
     from dengine import SqlStore
 
@@ -225,6 +224,6 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SqlStore]:
 
 
 @pytest.fixture(params=DATABASES)
-def place(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, str]:
+def place(request, tmp_path):
     """A URL and a cell of its own, to open again and again."""
     return url_of(request.param, tmp_path), uuid.uuid4().hex

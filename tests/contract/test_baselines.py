@@ -38,7 +38,7 @@ def new(name: str, policy: Policy = LOOSE, seed: int = 0, **params: Any) -> Base
 
 
 @pytest.fixture
-def traces(make_data) -> tuple[np.ndarray, np.ndarray]:
+def traces(make_data):
     """160 traces (n, 1, T) of two shapes; the first 120 are for training."""
     data = make_data(160, 60, failures=0.4)
     return data.X[:, None, :], data.y

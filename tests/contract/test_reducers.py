@@ -3,7 +3,6 @@ joins keeps it.
 """
 
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +48,7 @@ def new(name: str) -> Any:
 
 @every_check
 @every_reducer
-def test_a_shipped_reducer_keeps_the_contract(name: str, check: Any) -> None:
+def test_a_shipped_reducer_keeps_the_contract(name, check):
     check(new(name))
 
 
@@ -57,12 +56,12 @@ def test_a_shipped_reducer_keeps_the_contract(name: str, check: Any) -> None:
 @pytest.mark.parametrize(
     "reducer", [PCA(2, random_state=0), LinearDiscriminantAnalysis()], ids=["PCA", "LDA"]
 )
-def test_scikit_learns_transformers_keep_it_unchanged(reducer: Any, check: Any) -> None:
+def test_scikit_learns_transformers_keep_it_unchanged(reducer, check):
     check(reducer)
 
 
 @pytest.mark.parametrize("name", [*EXPORTED, "umap-learn"])
-def test_every_reducer_but_umap_learn_is_exported_restored_and_compiled(name: str) -> None:
+def test_every_reducer_but_umap_learn_is_exported_restored_and_compiled(name):
     X, y = toy_traces()
     fitted = new(name).fit(X, y)
     engine = DataEngine(reducer=new(name))
@@ -78,21 +77,21 @@ def test_every_reducer_but_umap_learn_is_exported_restored_and_compiled(name: st
 
 
 @every_reducer
-def test_no_traces_are_embedded_as_no_points(name: str) -> None:
+def test_no_traces_are_embedded_as_no_points(name):
     X, y = toy_traces()
     reducer = new(name).fit(X, y)
     assert reducer.embed(X[:0]).shape == (0, reducer.n_spaces, 2)
 
 
 @pytest.mark.parametrize("name", [*EXPORTED, "umap-learn"])
-def test_too_little_to_learn_from_is_a_setting_error(name: str) -> None:
+def test_too_little_to_learn_from_is_a_setting_error(name):
     X, _ = toy_traces(2)
     with pytest.raises(SettingError):
         ModelPrediction(new(name)).fit(X, np.ones(2))
 
 
 @every_reducer
-def test_an_unknown_setting_is_an_error_that_lists_the_known(name: str) -> None:
+def test_an_unknown_setting_is_an_error_that_lists_the_known(name):
     with pytest.raises(SettingError, match=r"no parameter dimm; it has .*random_state"):
         make_reducer(name, dimm=2)
 
@@ -165,7 +164,7 @@ class Unbounded(TransformerMixin, BaseEstimator):
         return np.full((len(X), 2), np.inf)
 
 
-def test_an_own_reducer_of_ten_lines_keeps_the_contract() -> None:
+def test_an_own_reducer_of_ten_lines_keeps_the_contract():
     check_reducer(Means())
 
 
@@ -180,12 +179,12 @@ def test_an_own_reducer_of_ten_lines_keeps_the_contract() -> None:
     ],
     ids=lambda value: type(value).__name__ if isinstance(value, BaseEstimator) else "",
 )
-def test_a_broken_reducer_is_told_which_clause_it_breaks(reducer: Any, clause: str) -> None:
+def test_a_broken_reducer_is_told_which_clause_it_breaks(reducer, clause):
     with pytest.raises(AssertionError, match=clause):
         check_reducer(reducer)
 
 
-def test_a_reducer_that_fails_at_every_retrain_is_told_with_its_reason(make_data: Any) -> None:
+def test_a_reducer_that_fails_at_every_retrain_is_told_with_its_reason(make_data):
     log = replay(make_data(120), Unsaid())
     assert "retrains dropped, the last dropped: AttributeError" in repr(log)
     assert log.summary()["retrains_dropped"] == len(log.retrains) > 0
@@ -225,8 +224,8 @@ TEACHABLE = {
 @pytest.mark.parametrize("first", [True, False], ids=["before the first retrain", "after it"])
 @pytest.mark.parametrize("name", TEACHABLE)
 def test_whatever_a_labelled_trace_holds_later_retrains_succeed_and_the_model_still_tells_parts_apart(
-    name: str, first: bool, tmp_path: Path
-) -> None:
+    name, first, tmp_path
+):
     X, y = toy_traces(180)
     X = X.reshape(len(X), -1)
     policy, options = Policy(alpha=0.4, lower_bound=0.7), {"replaying": True, "retrain_every": 1000}

@@ -187,15 +187,6 @@ def test_run_verifies_less_in_the_end_and_resumes_after_its_last_part(data, tmp_
     assert re.search(r"at most 2\d cycles, got 60", more.stderr)
 
 
-def test_everything_from_the_simulated_cell_is_called_simulated(tmp_path):
-    pytest.importorskip("mujoco")
-    words = f"run --cell simulated --cycles 2 --reducer pca --store {tmp_path}/e.db".split()
-    assert "simulated" in succeed(*words).lower()
-    assert document(*words)["simulated"] is True
-    with DataEngine.open(tmp_path / "e.db") as engine:  # the resumed run saw new parts
-        assert len({past.content_hash for past in engine.history()}) == 4
-
-
 FAILING = """status missing.db; replay --data missing.npz; replay --recipe missing.toml --data DATA; data DATA --set traces.samples=x
 replay --data DATA --cycles 5000; replay --data DATA --channel FX; simulate --n 1 --out x.npz --scenario missing
 run --cell replay --data DATA --store e.db --reducer nowhere:Nothing"""

@@ -66,14 +66,6 @@ def test_a_historys_filters_are_those_of_the_document(store):
         assert succeed("history", store, *words.split()) == "No decision of that kind.\n"
 
 
-def test_a_wrong_word_is_a_wrong_call(store):
-    for line in WRONG.strip().splitlines():
-        call, expected = re.split("  +", line)
-        code, verb, *words = call.split()
-        result = dengine(verb, store, *words)
-        assert (result.exit_code, expected in result.stderr) == (int(code), True), line
-
-
 def test_an_explanations_document_is_its_record(store, decisions, tmp_path):
     certain = next(item["id"] for item in decisions[::-1] if item["reason"] == "certain")
     out = tmp_path / "picture.png"

@@ -48,9 +48,7 @@ def error_rate(*played: Replay) -> float:
 
 
 @pytest.mark.parametrize("name", ["conv", "pca", "umap"])
-def test_labels_of_noise_yield_next_to_nothing_certain(
-    name: str, make_data, proof_repeats: int
-) -> None:
+def test_labels_of_noise_yield_next_to_nothing_certain(name, make_data, proof_repeats):
     recipe = RECIPES[name].with_policy(alpha=0.1, lower_bound=0.9).with_settings(retrain_every=30)
     repeats = proof_repeats // 2 if name == "conv" else proof_repeats  # it takes ten times as long
     played = [
@@ -82,9 +80,7 @@ def with_lda(honest: bool, data: Dataset, seed: int) -> Replay:
     return replay(data, engine, seed)
 
 
-def test_the_same_labels_counted_where_they_were_fitted_are_caught(
-    make_data, proof_repeats: int
-) -> None:
+def test_the_same_labels_counted_where_they_were_fitted_are_caught(make_data, proof_repeats):
     streams = [noise_labels(make_data, seed) for seed in range(proof_repeats)]
     honest = [with_lda(True, data, seed) for seed, data in enumerate(streams)]
     dishonest = [with_lda(False, data, seed) for seed, data in enumerate(streams)]
@@ -93,7 +89,7 @@ def test_the_same_labels_counted_where_they_were_fitted_are_caught(
     assert error_rate(*dishonest) > 1.5 * (1.0 - POLICY.lower_bound)
 
 
-def test_an_honest_engine_does_become_certain_where_the_trace_tells(make_data) -> None:
+def test_an_honest_engine_does_become_certain_where_the_trace_tells(make_data):
     # Or silence would pass the null test.
     played = with_lda(True, make_data(CYCLES, samples=100, noise=2.0), 0)
     assert certain(played) > CYCLES / 4

@@ -6,12 +6,11 @@ import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dengine import Dataset, Policy, Recipe
+from dengine import Policy, Recipe
 from dengine.errors import SettingError
 from dengine.experiments.costs import (
     CostCurve,
@@ -291,7 +290,7 @@ WORDS = shlex.split(
 
 
 @pytest.fixture
-def recordings(data: Dataset, tmp_path: Path, monkeypatch) -> Path:
+def recordings(data, tmp_path, monkeypatch):
     np.savez(tmp_path / "mine.npz", X=data.X, y=data.y)
     monkeypatch.chdir(tmp_path)
     return tmp_path

@@ -28,9 +28,7 @@ GRID = {
 }
 
 
-def test_another_setting_seed_length_or_data_is_another_replay_another_name_is_none(
-    data, tmp_path
-):
+def test_another_setting_seed_length_or_data_is_another_replay_another_name_is_none(data, tmp_path):
     kept, who = KeptReplays(tmp_path, data), Contender.load(RECIPE)
     task = Task(who, seed=1, cycles=60)
     adding = [FunctionTransformer(np.add, kw_args={"x2": np.full(3, i)}) for i in range(2)]

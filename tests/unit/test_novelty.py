@@ -28,7 +28,7 @@ MEAN, SD = float(KNOWN.mean()), float(KNOWN.std())
 
 
 @pytest.fixture(scope="module")
-def gate() -> NoveltyGate:
+def gate():
     return fit_novelty(KNOWN, 1.5)
 
 

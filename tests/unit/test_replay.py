@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dengine import DataEngine, Dataset, Outcome, Recipe, Replay, ReplayCell, replay
+from dengine import DataEngine, Dataset, Outcome, Recipe, ReplayCell, replay
 from dengine.errors import SettingError
 from dengine.experiments.replay import watch
 from tests.support.driving import RECIPE, drive
@@ -15,7 +15,7 @@ KNOWN = RECIPE.with_policy(guarantee="pooled", stops="all")
 
 
 @pytest.fixture(scope="module")
-def played(data: Dataset) -> Replay:
+def played(data):
     return replay(data, RECIPE, seed=1)
 
 

@@ -95,7 +95,7 @@ class FailingRule(SpokenRule):
 
 
 @pytest.fixture
-def outside(tmp_path: Path, monkeypatch) -> None:
+def outside(tmp_path, monkeypatch):
     """The module `fuse` of an outside author, by which a recipe names his rule."""
     source = Path(__file__).read_text(encoding="utf-8")
     rules = source[source.index("class FuseRule") : source.index("@pytest.fixture")]

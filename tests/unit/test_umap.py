@@ -1,6 +1,5 @@
 """UMAP in PyTorch agrees with umap-learn, goes on from training to training, and is restored."""
 
-from collections.abc import Iterator
 from itertools import count
 from typing import Any
 
@@ -38,14 +37,14 @@ Traces = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def insertion() -> Traces:
+def insertion():
     """The first traces of the bundled set, (n, 1, T), and their labels."""
     data = load_dataset("insertion")
     return np.ascontiguousarray(data.X[:N, None], dtype=np.float32), np.asarray(data.y[:N])
 
 
 @pytest.fixture(scope="module")
-def fitted(insertion: Traces) -> UmapReducer:
+def fitted(insertion):
     return UmapReducer().fit(insertion[0])
 
 
@@ -57,7 +56,7 @@ def train(reducer: UmapReducer, X: np.ndarray, numbers: np.ndarray, **limits: An
 
 
 @pytest.fixture
-def one_thread() -> Iterator[None]:
+def one_thread():
     """What umap-learn compiles sets the number of torch's threads."""
     yield
     torch.set_num_threads(1)
