@@ -49,7 +49,9 @@ def make_engine(url: str | None) -> sa.Engine:
 
     Its connections to SQLite sync each commit to the disk, and set the file of a store, or an empty
     one, to WAL mode; a file that cannot be written is only read. In memory all threads share one
-    connection. Connections to PostgreSQL use psycopg, unless the URL names another driver.
+    connection. Connections to PostgreSQL use psycopg, unless the URL names another driver. SQLite
+    waits up to `BUSY_SECONDS` (10 s) for another writer. PostgreSQL has `TIMEOUTS` of 5 to 10 s for
+    a server that does not answer, and a pooled connection is tested before use.
 
     Parameters
     ----------

@@ -296,8 +296,9 @@ class Journal:
 
         The header is the beginning of the journal, the head a small file beside it. `newest` is
         number and digest of the ledger entry; None: there is none yet. Nothing is synced: an older
-        header is harmless, since the store ignores a record that it is given twice. Raise
-        StoreError if the header cannot be written; a failure of the head is ignored.
+        header is harmless, since the store ignores a record that it is given twice. The attribute
+        `head` keeps the entry, also if it cannot be written. Raise StoreError if the header cannot
+        be written; a failure of the head is ignored.
         """
         with self._describing, _os_errors(self.path):
             self.head.newest = newest
@@ -307,7 +308,8 @@ class Journal:
     def _write_head(self) -> None:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
-        The file is created if need be, and stays open. A failure is ignored.
+        The file is created if need be, and stays open. A failure is ignored. The caller holds
+        `_describing`.
         """
         # An older head is harmless. The file stays open, since each report writes it.
         with suppress(OSError, ValueError):  # ValueError: closed by another thread meanwhile
@@ -320,9 +322,10 @@ class Journal:
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, which says that the store holds all, and space is
-        reserved and synced again; the head is not written. Raise StoreError if the file cannot be
-        written.
+        The file is synced first, so that no disk keeps the cut without the header. It is cut off
+        behind its header, which is written anew and says that the store holds all. Then space is
+        reserved (`reserve`; none on a full disk) and synced. The head file is not written. Raise
+        StoreError if the file cannot be written.
         """
         self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):
@@ -525,9 +528,9 @@ def journal_path(url: Any, cell_id: str) -> Path:
     Returns
     -------
     Path
-        Beside an SQLite file, STORE.CELL.journal. For a server CELL.DIGEST.journal in the folder
-        dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with the first 60
-        characters of the cell and a digest of the server, the database and the cell.
+        Beside an SQLite file, links resolved, STORE.CELL.journal. For a server CELL.DIGEST.journal
+        in the folder dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with
+        the first 60 characters of the cell and a digest of the server, the database and the cell.
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal

@@ -197,7 +197,7 @@ class JournalledStore(Outbox):
         """Record a decision in the place of an earlier one that is not on disk yet, and return it.
 
         Both have the same id. What is recorded and returned is a copy of `item` with time, trace
-        and number of the earlier decision. If the earlier one is on disk by now, nothing is
+        and row number of the earlier decision. If the earlier one is on disk by now, nothing is
         recorded, and the earlier one is returned. Raise KeyError for an id that is neither in
         memory nor in the journal, and StoreError if the journal is damaged where the earlier
         decision stands.

@@ -122,7 +122,8 @@ class Recorder:
     def oldest(self) -> float | None:
         """Time of recording of the oldest record that the database lacks, by `time.monotonic`.
 
-        None if it lacks none.
+        None if it lacks none. For a record that an earlier process left, it is the time of `adopt`.
+        Hold `changed` meanwhile.
         """
         for entries in (self.synced, self.unwritten):
             if entries:

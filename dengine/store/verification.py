@@ -424,8 +424,9 @@ class CellCheck:
     def _check_settings(self) -> Iterator[HistoryFault]:
         """Yield a fault for each setting that was changed, or is only in the table or the ledger.
 
-        The ledger has a copy of the cell's settings. If the setting with the version of the tables
-        is missing (no engine has opened the cell), that is a fault, too.
+        The ledger has a copy of the cell's settings, but not of those that the store itself keeps
+        (`RESERVED`), so a change of these is no fault here. If the setting with the version of the
+        tables is missing (no engine has opened the cell), that is a fault, too.
         """
         for key, problem in find_settings_faults(self.connection, self.cell_id).items():
             yield self._fault(SETTING.name, key, problem)

@@ -260,8 +260,8 @@ class VersionTable(CellTable):
     def _accepted_query(self) -> sa.Select[Any]:
         """Return the query for the versions of the cell or its product that were put in force.
 
-        The rows are newest first. The columns are `retrain`, `version`, and `kept`: whether the
-        state is kept.
+        The rows are newest first. The columns are the numbers `retrain` (dropped versions count)
+        and `version`, and `kept`: whether the state is kept.
         """
         return (
             sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))
