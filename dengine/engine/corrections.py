@@ -403,10 +403,12 @@ class Corrections:
         """Store a change of labels, and apply it to references, training window and rule.
 
         The decisions leave the outbox's memory. A model that cannot change its references is
-        retrained, in this thread. If a safe mode begins or ends by this, an event is recorded, and
-        `on_safe_mode`, the user's function, is called. Returns what was done. Raises StoreError if
-        the store does not answer; a change that is stored by then is applied with the next one, or
-        when the store is opened again.
+        retrained, in this thread, or, if it is pinned, fitted again as a new version. The store is
+        checked against its ledger; a difference sets the outbox's `integrity_error`. If a safe mode
+        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
+        called. Returns what was done. Raises StoreError if the store does not answer, and what a
+        pinned model raises that is fitted again; a change that is stored by then is applied with
+        the next one, or when the store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:

@@ -301,9 +301,10 @@ class LiveModel:
         Returns False if the model must be trained again: always for a baseline (a model that the
         user handed in), and if it cannot change a reference; the other references are changed all
         the same. The caller must retrain then, because each correction is applied only once.
-        Returns True before the first retrain. `corrected_to` is set to the last correction in any
-        case, without any it stays. The rule is left to `rebuild_rule`. Raises StoreError if the
-        store is unavailable, after the corrections before were applied.
+        Returns True before the first retrain. `corrected_to` is set to the last correction that was
+        applied, also if this raises; without any it stays. A damaged trace is reported by an event
+        in the store. The rule is left to `rebuild_rule`. Raises StoreError if the store is
+        unavailable, after the corrections before were applied.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

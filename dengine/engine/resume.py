@@ -30,12 +30,14 @@ def restore_model(
     """Return a new model, made from the untrained model `template`, as a stored version was.
 
     `state` holds the arrays of the version by name. A model like umap-learn, of which not the fit
-    but only the numbers of its traces are stored, is trained on these traces again (`refit`).
-    Returns None if one of these traces is damaged or missing. The new model and the template share
-    one rule, so the template gets the stored rule, too, if `state` holds one. Raises StoreError
-    (KeyError, ValueError or NotImplementedError, if it is of another reducer) for a state that this
-    dengine cannot restore, StoreError for a label that is neither 0 nor 1, and if the store cannot
-    be read, and what the training raises.
+    but only the numbers of its traces are stored, is trained on these traces again (`refit`), after
+    their labels are compared with the ledger: a difference sets the outbox's `integrity_error`.
+    Returns None if one of these traces is missing, or damaged, of which an event tells. The new
+    model and the template share one rule, so the template gets the stored rule, too, if `state`
+    holds one. Raises StoreError (KeyError, ValueError or NotImplementedError, if it is of another
+    reducer) for a state that this dengine cannot restore, StoreError for a label that is neither 0
+    nor 1, for traces of different shapes, and if the store cannot be read, and what the training
+    raises.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):

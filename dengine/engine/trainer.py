@@ -434,11 +434,11 @@ class Retrainer:
         return f"dropped: RuntimeError: {failure}"
 
     def _replace_executor(self) -> None:
-        """Start the executor again, or go on without it if it cannot be started.
+        """Start a `RestartableExecutor` again; go on without any other executor.
 
-        A `RestartableExecutor` is restarted; if that fails, it is logged. Any other executor is set
-        to None, which is logged. But if it still works on a discarded training, it is kept, and
-        used again once that is done.
+        A restart ends what it works on. If that raises OSError, it is logged, and tried again at
+        the next retrain. Any other executor is set to None, which is logged. But if it still works
+        on a discarded training, it is kept, and used again once that is done.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):
