@@ -152,7 +152,9 @@ class Baseline(ABC):
         The last result is cached: it is returned again for the same traces until the next `fit` or
         `add`. Before a training has succeeded, all bounds are 0 and 1. A baseline that counts no
         labels returns the integer 0, and no array, for both counts; so does an untrained one.
-        Raises TraceError for traces of another shape.
+        Traces (n, T) have one channel. Raises TraceError if X has neither shape, or has values that
+        are no real numbers. It is not checked here that the traces are as long as those of the
+        training.
         """
         traces = as_traces(X)
         key = traces.shape, traces.tobytes()

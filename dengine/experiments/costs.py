@@ -650,8 +650,9 @@ def curve_of(
 
     `groups` has each policy with its replays, all of the same shuffles in the same order. The
     choice is repeated with each price halved and doubled; what changes then is in the field
-    `price_changes` of the result. `left_behind`, `out_of_reach` and `fresh` become its fields with
-    these names.
+    `price_changes` of the result. Three arguments become fields of the result: `left_behind`, the
+    policies that were dearer in earlier shuffles; `out_of_reach`, policies that were not played,
+    each with the reason; and `fresh`, whether no policy was chosen by these shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)

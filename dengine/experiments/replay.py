@@ -541,6 +541,8 @@ def replay(
 ) -> Replay:
     """Play a data set through a fresh engine in memory, in one pass; return what was decided.
 
+    It limits this thread to one torch thread, for an engine of yours only if that trains in it.
+
     Parameters
     ----------
     dataset : object
@@ -551,7 +553,7 @@ def replay(
         it learned.
     seed : int, default 0
         Of the shuffle, and of the engine unless one is given; the same seed gives the same
-        decisions.
+        decisions, but not with an engine of yours whose trainings end by a time budget.
     cycles : int or None, default None
         Only the first so many parts, after the shuffle; None plays all.
     alpha, lower_bound : float or None, default None
@@ -572,10 +574,13 @@ def replay(
     ------
     SettingError
         A number of cycles that the data set does not have, anything that is no recipe, a baseline
-        that cannot be made, alpha or lower_bound beside an engine, or a policy with force limits in
-        seconds for a data set of an unknown rate.
+        that cannot be made, alpha or lower_bound out of range or beside an engine, a malformed
+        `windows.trigger` of the data's description, or a policy with force limits in seconds for a
+        data set of an unknown rate.
     DataError
         A data set that cannot be read.
+    StoreError
+        A store, given as the data set, that cannot be opened or read.
     TraceError
         For an engine of yours, traces that it does not take.
     """
@@ -622,10 +627,11 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     No model is asked. In shadow mode every part was verified, and the counts and embeddings of the
     model were recorded. The rule of the policy decides on these, and learns only outcomes that it
     would know in a replay of its own: checks, audits and line stops, and with `stops="all"` also
-    that an accepted part was good. One difference to such a replay stays: the predictions come from
-    a model that has learned all labels. Audits are drawn anew, by the seed of the replay. A part
-    for which the model was not asked, such as a novel one or one that left an operator's force
-    limits, is verified; the rule learns its outcome, too, with the bounds 0 and 1.
+    that an accepted part was good. Two differences to such a replay stay: the predictions come from
+    a model that has learned all labels, and the force limits are those of `scores`; those of
+    `policy` are not applied, since a replay has no traces. Audits are drawn anew, by the seed of
+    the replay. A part for which the model was not asked, such as a novel one or one that left an
+    operator's force limits, is verified; the rule learns its outcome, too, with the bounds 0 and 1.
 
     Parameters
     ----------

@@ -74,8 +74,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
     frame : DataFrame
         As `frame_of` gives it.
     replays : sequence of Replay, default ()
-        The replays of the frame's rows, in their order. Without them the error's interval is NaN,
-        and retrains_dropped is 0.
+        The replays of the frame's rows, in their order, all of one data set and none of a live run.
+        Without them the error's interval is NaN, and retrains_dropped is 0.
 
     Returns
     -------
