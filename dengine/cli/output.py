@@ -139,9 +139,10 @@ def print_result(
     Parameters
     ----------
     record : mapping
-        The JSON document, which `--json` prints alone. The subcommand's name, as "verb", and, with
-        `make_files`, the paths of the files that were written, as "files", are added to it, in a
-        copy.
+        The JSON document, which `--json` prints alone. Its values may be anything that
+        `to_jsonable` takes: NaN and infinities are printed as null, and passwords of URLs are
+        masked. The subcommand's name, as "verb", and, with `make_files`, the paths of the files
+        that were written, as "files", are added to it, in a copy.
     *parts : str or rich.Table
         What is printed without `--json`. A line for each file that was written follows.
     out : Out or None

@@ -233,11 +233,12 @@ class HttpApi:
         changed.
 
         The label as it was reported stays on record. A forgotten label counts again. If the part
-        already counts with this label, nothing changes. 404: an unknown id or part; 409: a part
+        already counts with this label, nothing changes, but a training under way begins again. Only
+        the newest 20 decisions on a part are looked at. 404: an unknown id or part; 409: a part
         with several decisions that are no rejects, or with nothing but several rejects; 422: a
         decision without a label, both or neither of id and part, no author (unless the token has a
-        name), or an author that is not the token's; 503: the queue is full, or the store does not
-        answer.
+        name), or an author that is not the token's; 503: the queue is full, the store does not
+        answer, or the decision's trace is damaged.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
