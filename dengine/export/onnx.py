@@ -278,7 +278,7 @@ class OnnxDecision(nn.Module):
         """Return the position in `Reason` of what is wrong with a trace, () int64; 0 if nothing is.
 
         Only the first fault that applies is returned: not finite, constant, at the sensor's limit,
-        too large. The result is the same as in an engine (`TraceGate`).
+        too large (beyond 1e18). The result is the same as in an engine (`TraceGate`).
         """
         low = trace.min()
         high = trace.max()

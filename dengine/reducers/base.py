@@ -445,7 +445,7 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
 
 
 def binary_labels(y: Any, n: int, name: str) -> Ints:
-    """Return labels of two classes as int64 (n,): 1 for the larger class, 0 for the other.
+    """Return labels of two classes as int64 (n,): 1 for the class that sorts last, else 0.
 
     Labels of 0 and 1 stay as they are, also if only one of them occurs. A single class that is
     neither 0 nor 1 becomes 1. A column (n, 1) is accepted with a warning.
@@ -608,8 +608,8 @@ class LabelFree(_Wrapping):
         """Fit a clone of the transformer, `reducer_`, on traces X; labels are ignored.
 
         X has the shape (n, T) or (n, C, T); a transformer that is no Reducer gets it as rows
-        (n, C * T). Returns self. `dim_` becomes the number of coordinates. Raises what
-        `check_traces` and the transformer raise.
+        (n, C * T). Returns self. `dim_` becomes the number of coordinates; `trace_shape_` and
+        `n_features_in_` are set, too. Raises what `check_traces` and the transformer raise.
         """
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.as_input(traces))

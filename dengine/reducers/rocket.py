@@ -395,9 +395,11 @@ class RocketReducer(Reducer):
 
         Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
         without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
-        and `numbers`, which must increase, are those of `train`. `net_` is changed in place.
-        Returns the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``,
-        whose head did not see the label of row i.
+        and `numbers`, those of the labels, which must increase, are as in `train`. `net_` is
+        changed in place; `towers_` and what a fit reports (`n_iter_`, `holdout_losses_`, `note_`)
+        are replaced, and with `numbers` the cache, which then has these traces alone. Returns the
+        points of the traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did
+        not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
