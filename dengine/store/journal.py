@@ -140,7 +140,7 @@ class Journal:
     Parameters
     ----------
     path : Path
-        The file; it is created if need be. A symbolic link is refused.
+        The file; if `owning`, it is created with its folder if need be. A symbolic link is refused.
     owning : bool, default True
         Lock the file and write to it. False: read what is in it now, whoever owns it.
 
@@ -222,6 +222,8 @@ class Journal:
             If the open file is no longer the one at its path, so that nobody would read it.
         StoreError
             If the disk fails.
+        OSError
+            If the system refuses to look whether the file is still at its path.
         """
         offsets = []
         framed = bytearray()
@@ -401,7 +403,10 @@ class Journal:
         self._file.write((MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0"), 0)
 
     def _write_header_and_reserve(self) -> None:
-        """Write the header, and reserve disk space for records."""
+        """Write the header, and reserve disk space for records.
+
+        Raise OSError if the header cannot be written, and StoreError if the sync fails.
+        """
         self._write_header()
         self.reserve()
 

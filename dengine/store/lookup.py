@@ -149,7 +149,7 @@ class DecisionIndex:
         Raises
         ------
         StoreError
-            If the journal is damaged where the decision stands.
+            If the journal is damaged where the decision stands, or cannot be read.
         """
         item = self.recent.get(decision_id)
         entry = self._decisions.get(decision_id)

@@ -164,11 +164,11 @@ class OwnedFile:
             raise OSError(f"only {written} of {len(content)} bytes were written")
 
     def sync(self) -> None:
-        """Return once what was written is on the disk."""
+        """Return once what was written is on the disk; raise OSError if the disk fails."""
         sync(self._fd)
 
     def truncate(self, size: int) -> None:
-        """Set the size in bytes: cut the file off, or extend it."""
+        """Set the size in bytes: cut the file off, or extend it; OSError if the system refuses."""
         os.ftruncate(self._fd, size)
 
     def reserve(self, size: int) -> None:

@@ -133,9 +133,9 @@ class Recorder:
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it to the journal.
 
-        Return at once the record's `Entry`, which will say where it stands in the journal. The
-        thread writes it within about BATCH_SECONDS (0.05 s), together with others. There is no
-        limit to the number of records that wait.
+        Return at once the record's `Entry`, which will say where it stands in the journal. If the
+        disk answers, the thread writes it within about BATCH_SECONDS (0.05 s), together with
+        others. There is no limit to the number of records that wait.
         """
         id_ = record.decision.id if isinstance(record, StoredDecision) else ""
         entry = Entry(record, id_)
