@@ -76,6 +76,11 @@ class KeptReplays:
     ----------
     folder : path
     data : Dataset
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made.
     """
 
     def __init__(self, folder: FilePath, data: Dataset) -> None:
@@ -274,7 +279,8 @@ def iterate_replays(
         Anything `load_dataset` takes.
     tasks : sequence of Task
     n_jobs : int, default 1
-        Replays at a time, as joblib counts them. Timings are right with 1 alone.
+        Replays at a time, as joblib counts them. Timings are right with 1 alone. 1 plays in this
+        thread, which then has one torch thread.
     keep : path or None, default None
         Folder of finished replays, made if it is missing: those in it are not played again, unless
         their file is damaged, and others are added as they end.
@@ -382,8 +388,8 @@ def run_grid(
 
     Raises
     ------
-    SettingError, DataError
-        As `grid_tasks` and `iterate_replays`; OutputError only with `keep`.
+    SettingError, DataError, StoreError
+        As `grid_tasks` and `iterate_replays`; OutputError and OSError only with `keep`.
 
     References
     ----------

@@ -57,7 +57,11 @@ LEGEND = (
 
 
 def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -> pd.DataFrame:
-    """Return a table with a row for each replay, as `Replay.summary` gives it."""
+    """Return a table with a row for each replay, as `Replay.summary` gives it.
+
+    `check_seconds` is how long a verification takes, for the time saved. Raises SettingError if it
+    is not finite or not above 0.
+    """
     import pandas as pd
 
     return pd.DataFrame([replay.summary(check_seconds) for replay in replays])
