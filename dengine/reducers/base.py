@@ -156,7 +156,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         X : array of float, shape (n, T) or (n, C, T)
             Traces.
         y : array, shape (n,), optional
-            Labels of two classes, the larger one for success. Only read if `uses_labels`.
+            Labels of two classes; the one that sorts last is success. Only read if `uses_labels`.
         """
 
     def transform(self, X: ArrayLike) -> Floats:
@@ -282,7 +282,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def restore_shape(self, state: Arrays) -> tuple[int, int]:
         """Read the shape of traces from the array "shape" of a state; return it, (C, T).
 
-        It sets `trace_shape_` and scikit-learn's `n_features_in_`.
+        It sets `trace_shape_` and scikit-learn's `n_features_in_`. Raises KeyError if the state has
+        no such array.
         """
         channels, samples = map(int, state["shape"])
         self.trace_shape_ = (channels, samples)
@@ -644,13 +645,14 @@ class CrossFitted(_Wrapping):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Fit clone k on the traces outside fold k, for every k, and replace `clones_` and `dim_`.
 
-        If a fit raises, `clones_` may already hold clones that are not fitted.
+        `trace_shape_` and `n_features_in_` are set, too. If a fit raises, `clones_` may already
+        hold clones that are not fitted.
 
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes, of which the larger is given to the clones as 1, the other as 0.
+            Labels of two classes; the clones get 1 for the one that sorts last, else 0.
         folds : array of int64, shape (n,), optional
             Fold of each trace, 0 to K - 1; it is not checked. None: by a hash of its content.
 

@@ -329,7 +329,7 @@ class RocketReducer(Reducer):
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes, the larger one for success.
+            Labels of two classes; the one that sorts last is success.
         folds : array of int64, shape (n,), optional
             Fold of each trace, 0 to K - 1. None: by a hash of its content.
 
@@ -426,7 +426,8 @@ class RocketReducer(Reducer):
 
         `train` finds them again by `numbers`, the numbers of the labels; without numbers nothing is
         cached. The cache then holds these traces and no others. The first call also draws the
-        kernels. With fewer than `MIN_TRACES` traces nothing is done.
+        kernels. With fewer than `MIN_TRACES` traces nothing is done. Raises the errors of
+        `check_traces`, and at the first call those of `build`.
         """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_initialize(X), numbers)

@@ -228,6 +228,11 @@ class SimulatedCell:
         Seconds of production so far.
     last : SimulatedInsertion or None
         The newest insertion with its label, for reports; an engine does not read it.
+
+    Raises
+    ------
+    SettingError
+        For an unknown scenario, or fewer cycles than 1.
     """
 
     spec = TraceSpec(SAMPLES, RATE_HZ, unit="N")
