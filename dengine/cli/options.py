@@ -476,7 +476,7 @@ class DataChoice:
         with `--json`. `description` is the description to read by; None takes the one that
         `describe` returns. Raises the errors of `load_dataset`: DataError if the data set cannot be
         read, if a description is needed and none is saved, or if it has a `?`; SettingError for a
-        malformed trigger; StoreError for a store that cannot be opened.
+        malformed trigger; StoreError for a store that cannot be opened or read.
         """
         from ..datasets import load_dataset
         from ..datasets.loading import count_files
