@@ -310,7 +310,7 @@ REDUCER_CHECKS: tuple[Callable[[Any], None], ...] = (
 def check_reducer(reducer: Any) -> None:
     """Run the checks in `REDUCER_CHECKS`, the contract of a reducer, one after another.
 
-    They work on clones of the reducer. This thread has one torch thread afterwards.
+    They work on clones of the reducer. The last one limits this thread to one torch thread.
 
     Parameters
     ----------

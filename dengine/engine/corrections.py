@@ -177,8 +177,9 @@ class Corrections:
             label is forgotten.
         StoreError
             If the store does not answer, the trace of a decision is damaged, another cell of the
-            product stores a version before a pinned one is released, or the engine is closed, was
-            opened for reading or before a fork. A change that was stored before the error stays.
+            product stores a version meanwhile and a pinned one is to be released, or the engine is
+            closed, was opened for reading or before a fork. A change that was stored before the
+            error stays.
         Exception
             What a pinned baseline raises that is fitted again; the change is stored then.
         """

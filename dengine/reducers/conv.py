@@ -201,7 +201,7 @@ class ConvReducer(TorchReducer):
         `train` finds them again by `numbers`; without numbers they are not kept. The first call
         also builds the network and draws the kernels. With fewer than `min_traces` traces nothing
         is done. No label is read. Raises the errors of `check_traces`, and at the first call those
-        of `_build`.
+        of `_initialize`.
         """
         if len(X) >= self.min_traces:
             traces = self._check_and_initialize(X)
