@@ -109,6 +109,8 @@ class Out:
         OutputError
             A file exists and `force` is not set, it cannot be written, or no format of figures has
             its suffix. The files before it in `contents` are written already.
+        OSError
+            A file cannot be read again for its checksum in the manifest.
         """
         from matplotlib.figure import Figure
 
@@ -154,8 +156,8 @@ def print_result(
     ------
     DengineError
         `make_files` raised it, or a file could not be written. It is raised after the result was
-        printed, so that what was computed is not lost; any other exception of `make_files` is
-        raised before.
+        printed, so that what was computed is not lost; any other exception of `make_files` or of
+        `Out.write` is raised before.
     """
     files: list[Path] = []
     refusal: DengineError | None = None

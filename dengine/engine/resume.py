@@ -89,8 +89,9 @@ def find_clean_start(
     it is returned. It is also returned if it begins anew with each training, like a baseline, or a
     model of which a stored version does not hold the fit. Otherwise the newest stored version of
     the cell or its product that saw no such label is returned, as a new model with the rule of
-    `template`; versions that are damaged or not kept are passed over. If there is none, it is
-    `template`, the untrained model with its initial weights.
+    `template`; versions that are damaged or not kept, or whose loading or restoring raises
+    StoreError for another reason, are passed over. If there is none, it is `template`, the
+    untrained model with its initial weights.
 
     Returns
     -------
@@ -101,7 +102,7 @@ def find_clean_start(
     Raises
     ------
     StoreError
-        If the store cannot be read.
+        If the corrections or the list of versions cannot be read.
     KeyError, ValueError, NotImplementedError
         For a version of another reducer that cannot be restored.
     """
