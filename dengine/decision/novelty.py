@@ -303,15 +303,14 @@ def _distort(x: Tensor) -> list[Tensor]:
 
 
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) -> Tensor:
-    """Return Fisher's discriminants between traces and their distortions, float32, shape (P, D).
+    """Return Fisher's discriminants of traces and their D distortions, float32 (P, D), P features.
 
-    P is the number of features, and D that of distortions (14). Column j separates the traces x (n,
-    C, T) from their j-th distortion (`_distort`); it is for features that are not standardised.
-    `plain` (n, P), float64, are the traces' features by `gate`. Only features that `used` (P,),
-    bool, marks are read; the rows of the others are 0. Of the traces fewer than 250, evenly spaced,
-    are distorted, for the mean difference. The covariance is that of all traces, shrunk towards the
-    identity, plus half of that of the distorted. Inside, standardised features are clipped at 6
-    deviations.
+    Column j separates the traces x (n, C, T) from their j-th distortion (`_distort`); it is for
+    features that are not standardised. `plain` (n, P), float64, are the traces' features by `gate`.
+    Only features that `used` (P,), bool, marks are read; the rows of the others are 0. Of the
+    traces fewer than 250, evenly spaced, are distorted, for the mean difference. The covariance is
+    that of all traces, shrunk towards the identity, plus half of that of the distorted. Inside,
+    standardised features are clipped at 6 deviations.
     """
     offset, gain = (used * values for values in _standardise(plain))
     z = torch.addcmul(offset, plain, gain).clamp(-6.0, 6.0)
