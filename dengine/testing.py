@@ -277,7 +277,7 @@ def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
     Its first retrain must be accepted. Its decisions on 20 further traces, made before the closing
     and again after it, must have the same action, bound, counts, embedding and version. `reducer`
-    may be unfitted and stays unchanged.
+    may be unfitted and stays unchanged. The engine limits this thread to one torch thread.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
@@ -310,7 +310,7 @@ REDUCER_CHECKS: tuple[Callable[[Any], None], ...] = (
 def check_reducer(reducer: Any) -> None:
     """Run the checks in `REDUCER_CHECKS`, the contract of a reducer, one after another.
 
-    They work on clones of the reducer.
+    They work on clones of the reducer. The last one limits this thread to one torch thread.
 
     Parameters
     ----------

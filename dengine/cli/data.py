@@ -61,13 +61,14 @@ def data(
     DATA is a folder of files, one for each insertion, or a file with many: text, Parquet, JSON,
     .npz, .ts or .mcap. The subcommand shows the saved description or, without one, a proposal, in
     which ? marks what you have to state with --set. While a ? is left, no recording is read, no
-    picture is drawn, and --check ends with exit code 1. Below, it shows what was read by the
-    description. --out draws the traces, and how they drift. Look at them, and write the description
-    with --save, because every other subcommand needs it to read the recordings; it replaces another
-    description only with --force.
+    picture is drawn, and --check ends with exit code 1; --save writes the description all the same.
+    Below, it shows what was read by the description. --out draws the traces, and how they drift.
+    Look at them, and write the description with --save, because every other subcommand needs it to
+    read the recordings; it replaces another description only with --force.
 
     DATA may also be a source that needs no description: a bundled set, the file of a store, or an
-    .npz file with X (traces, samples) and y (1 success, 0 failure).
+    .npz file with X (traces, samples) and y (1 success, 0 failure). For such a source --save does
+    nothing.
     """
     from ..datasets.description import Seen
     from ..datasets.sample import write_sample

@@ -139,7 +139,8 @@ class CommaList(click.ParamType[Any]):
     ) -> tuple[Any, ...]:
         """Return the converted values as a tuple; a usage error if there is none or one is wrong.
 
-        Empty items between commas are left out. A tuple, such as a default, is returned as it is.
+        White space around an item is removed, and empty items are left out. A tuple, such as a
+        default, is returned as it is.
         """
         if isinstance(value, tuple):
             return value
@@ -186,8 +187,8 @@ def drop_none(**values: Any) -> dict[str, Any]:
 def _address(store: str | None, cell_id: str | None, product: str | None = None) -> str | None:
     """Return a store's address: its file or URL, or a `CellAddress` if a cell or product is named.
 
-    A `CellAddress` has the file or URL and these names. The address is None without a store; a cell
-    or product is a usage error then.
+    A `CellAddress` has the file or URL and these names; if only a product is named, the cell is
+    "cell". The address is None without a store; a cell or product is a usage error then.
     """
     from ..store.records import address
 
@@ -475,7 +476,7 @@ class DataChoice:
         with `--json`. `description` is the description to read by; None takes the one that
         `describe` returns. Raises the errors of `load_dataset`: DataError if the data set cannot be
         read, if a description is needed and none is saved, or if it has a `?`; SettingError for a
-        malformed trigger; StoreError for a store that cannot be opened.
+        malformed trigger; StoreError for a store that cannot be opened or read.
         """
         from ..datasets import load_dataset
         from ..datasets.loading import count_files

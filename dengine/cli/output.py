@@ -109,6 +109,8 @@ class Out:
         OutputError
             A file exists and `force` is not set, it cannot be written, or no format of figures has
             its suffix. The files before it in `contents` are written already.
+        OSError
+            A file cannot be read again for its checksum in the manifest.
         """
         from matplotlib.figure import Figure
 
@@ -139,9 +141,10 @@ def print_result(
     Parameters
     ----------
     record : mapping
-        The JSON document, which `--json` prints alone. The subcommand's name, as "verb", and, with
-        `make_files`, the paths of the files that were written, as "files", are added to it, in a
-        copy.
+        The JSON document, which `--json` prints alone. Its values may be anything that
+        `to_jsonable` takes: NaN and infinities are printed as null, and passwords of URLs are
+        masked. The subcommand's name, as "verb", and, with `make_files`, the paths of the files
+        that were written, as "files", are added to it, in a copy.
     *parts : str or rich.Table
         What is printed without `--json`. A line for each file that was written follows.
     out : Out or None
@@ -153,8 +156,8 @@ def print_result(
     ------
     DengineError
         `make_files` raised it, or a file could not be written. It is raised after the result was
-        printed, so that what was computed is not lost; any other exception of `make_files` is
-        raised before.
+        printed, so that what was computed is not lost; any other exception of `make_files` or of
+        `Out.write` is raised before.
     """
     files: list[Path] = []
     refusal: DengineError | None = None

@@ -426,10 +426,12 @@ class Description:
         """Return a description in which the given keys, like `label.column`, have these values.
 
         Of the keys `column`, `path`, `line`, `topic` and `listing` in `[label]`, stating one clears
-        the others, and likewise those in `[part]`; words for good and bad stay. Stating a channel
-        replaces the channel `?`. A key without a dot may be a whole section, which its value then
-        replaces. The notes stay. Raises DataError for an unknown key, for a value of the wrong
-        type, and if what stands before the dot in a key is no section.
+        the others, and likewise of `column`, `path` and `line` in `[part]`; words for good and bad
+        stay. Stating a channel replaces the channel `?`. In `rows.NAME.keep` and keys like it
+        (`OF_COLUMN`) the name of a column may have dots; any other key is split at its first dot.
+        A key without a dot may be a whole section, which its value then replaces. The notes stay.
+        Raises DataError for an unknown key, for a value of the wrong type, and if what stands
+        before the dot in a key is no section.
         """
         values = self.to_dict()
         for section, sources in SOURCES.items():
@@ -522,9 +524,10 @@ def _as_kind(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file in the type of its key, `kind`; `?` is returned as it is.
 
     `kind` is a type in `KINDS`: text, whole number, number, boolean, or whole number or text. A
-    number or boolean becomes a text if only a text is expected, and a whole number a float if a
-    number is. Raises DataError for a value of another type and for a number that is not finite;
-    `where` is the name of the key in the message.
+    number or boolean becomes a text, as Python writes it (`True`, `nan`), if only a text is
+    expected, and a whole number a float if a number is. Raises DataError for a value of another
+    type, and for a number that is not finite if a number is expected; `where` is the name of the
+    key in the message.
     """
     if value == UNKNOWN:
         return value

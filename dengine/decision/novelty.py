@@ -281,8 +281,9 @@ def _distort(x: Tensor) -> list[Tensor]:
 
     They are what a sensor or a clock would make of the traces, each in both directions: a gain of
     0.6 and of 1.6, and one that falls or rises by 0.4 (4); an offset of 0.4, and a drift and a step
-    in the middle of 0.5 median deviations of the channel (6); 8 % of speed and a delay of a 30th
-    (4). Beyond its ends a trace is mirrored.
+    in the middle of 0.5, in units of the channel's standard deviation within a trace, the median
+    over the n traces (6); 8 % of speed and a delay of a 30th of the trace (4). Beyond its ends a
+    trace is mirrored.
     """
     n_samples = x.size(2)
     t = torch.linspace(0.0, 1.0, n_samples)
@@ -302,7 +303,7 @@ def _distort(x: Tensor) -> list[Tensor]:
 
 
 def _discriminants(gate: NoveltyGate, x: Tensor, plain: Tensor, used: Tensor) -> Tensor:
-    """Return Fisher's discriminants between traces and their distortions, float32, shape (P, D).
+    """Return Fisher's discriminants of traces and their D distortions, float32 (P, D), P features.
 
     Column j separates the traces x (n, C, T) from their j-th distortion (`_distort`); it is for
     features that are not standardised. `plain` (n, P), float64, are the traces' features by `gate`.

@@ -63,11 +63,13 @@ class Changed:
 class Corrections:
     """Carries out corrections in the store and in what the engine has learned.
 
-    Every method first finishes what is under way: it stores the labels that wait for the store, and
-    reads what peers have stored. So it waits for the store, and raises StoreError if the store does
-    not answer; `DataEngine` also raises it while another thread uses the engine. A training that is
-    under way in an executor is discarded, and another one begins afterwards, except after a
-    rollback.
+    Every method checks its arguments, and then finishes what is under way: it stores the labels
+    that wait for the store, and reads what peers have stored. So it waits for the store, and raises
+    StoreError if the store does not answer; `DataEngine` also raises it while another thread uses
+    the engine. A training that is under way in an executor is discarded, and another one begins
+    afterwards, except after a rollback. Nothing of this is done for a policy that is in force
+    already. A change of labels and a rollback also check the store against its ledger; a difference
+    sets the outbox's `integrity_error`, after which every part is verified.
 
     Parameters
     ----------
@@ -125,6 +127,8 @@ class Corrections:
             If the store does not answer, the decision's trace is damaged, or the engine is closed,
             was opened for reading or before a fork. A change that was stored before the error stays
             stored.
+        Exception
+            What a pinned baseline raises that is fitted again; the change is stored then.
         """
         label = as_success(success)
         (stored,) = self._find_labelled([decision_id])
@@ -145,8 +149,9 @@ class Corrections:
         until the next retrain, which starts from weights that never saw these labels. If a rollback
         pinned this version, and it was trained with one of these labels, it is released, so that
         retrains may replace it: it is stored as a new version, before the labels are forgotten. A
-        baseline is retrained before this returns. A training under way in the executor is
-        discarded, and begins again, even if nothing changes. If a safe mode begins or ends by this,
+        baseline is retrained before this returns; if it stays pinned, it is fitted again as a new
+        version. A training under way in the executor is discarded, and begins again, even if
+        nothing changes. If a safe mode begins or ends by this,
         an event is recorded, and `on_safe_mode`, the user's function, is called. Without an
         executor the call also waits until the features for the next training are computed, if that
         starts from another model now. A guarantee assumes that the choice of what is forgotten does
@@ -171,9 +176,12 @@ class Corrections:
             For an unknown decision, for a decision without a label, and if no id is given; then no
             label is forgotten.
         StoreError
-            If the store does not answer, the trace of a decision is damaged, or the engine is
+            If the store does not answer, the trace of a decision is damaged, another cell of the
+            product stores a version meanwhile and a pinned one is to be released, or the engine is
             closed, was opened for reading or before a fork. A change that was stored before the
             error stays.
+        Exception
+            What a pinned baseline raises that is fitted again; the change is stored then.
         """
         if not decision_ids:
             raise ReportError(
@@ -300,16 +308,17 @@ class Corrections:
         certificate is up to m alpha.
 
         A safe mode goes on until new outcomes end it. If the new rule has no safe mode, the safe
-        mode ends now, and `on_safe_mode`, the user's function, is called. An accepted part whose
-        outcome was not reported before the change stays unreported. With `Policy(shadow=True)` each
-        part that the model is certain of is an audit: `Decision.predicted` says what the model
-        would have done, and all outcomes are learned from as always. The shadow mode stays on when
-        the engine is opened again.
+        mode ends now, an event is recorded, and `on_safe_mode`, the user's function, is called. An
+        accepted part whose outcome was not reported before the change stays unreported. With
+        `Policy(shadow=True)` each part that the model is certain of is an audit:
+        `Decision.predicted` says what the model would have done, and all outcomes are learned from
+        as always. The shadow mode stays on when the engine is opened again.
 
         Parameters
         ----------
         policy : Policy
-            The whole policy. If it equals the policy in force, nothing changes.
+            The whole policy. If it equals the policy in force, nothing changes, and nothing is
+            waited for or discarded.
         author : str
             For the record.
 
@@ -400,13 +409,15 @@ class Corrections:
         return decisions
 
     def _change_labels(self, change: Change) -> Changed:
-        """Store a change of labels, and apply it to references, training window and rule.
+        """Store a change of labels, apply it to references, window and rule; return what was done.
 
         The decisions leave the outbox's memory. A model that cannot change its references is
-        retrained, in this thread. If a safe mode begins or ends by this, an event is recorded, and
-        `on_safe_mode`, the user's function, is called. Returns what was done. Raises StoreError if
-        the store does not answer; a change that is stored by then is applied with the next one, or
-        when the store is opened again.
+        retrained, in this thread, or, if it is pinned, fitted again as a new version. The store is
+        checked against its ledger; a difference sets the outbox's `integrity_error`. If a safe mode
+        begins or ends by this, an event is recorded, and `on_safe_mode`, the user's function, is
+        called. Raises StoreError if the store does not answer, and what a pinned model raises that
+        is fitted again; a change that is stored by then is applied with the next one, or when the
+        store is opened again.
         """
         number = self._store.corrections.apply(change)
         for id_ in change.decisions:

@@ -23,7 +23,10 @@ def frozen_objects() -> Iterator[None]:
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Switch Python's garbage collector off in the block, then on again if it was on before."""
+    """Switch Python's garbage collector off in the block, then on again if it was on before.
+
+    The whole process is affected.
+    """
     was_enabled = gc.isenabled()
     gc.disable()
     try:

@@ -148,8 +148,8 @@ class Learner:
         rebuilt, or all corrections that the store has by now are applied and it is rebuilt. This
         waits for a later call while the store lacks any record or has a fault. Before a correction
         a retrain under way is ended (`end_training`); a model that cannot change its references is
-        retrained here. If the store fails meanwhile, that is logged and not raised, and a later
-        call tries again.
+        retrained here, or, if it is pinned, fitted again, and what that raises is raised. If the
+        store fails meanwhile, that is logged and not raised, and a later call tries again.
         """
         self._feedback.number_labels()
         if self._feedback.remedy is None or not self._outbox.is_drained or self._outbox.fault:
@@ -188,11 +188,12 @@ class Learner:
         change what the training starts from. Then new labels count from zero, and the training
         begins.
 
-        With `wait` True, or if no executor takes work, all is done in this thread, and the report
-        is returned. Otherwise None is returned, and `advance` puts the version in force later. With
-        `wait` False, None is also returned if a training is under way already, and then nothing is
-        begun. If the executor still works on a discarded training, or the computing in advance is
-        not done, the training is requested, and `retrain_if_due` begins it later.
+        With `wait` True, or if no executor takes work, all is done in this thread, which then has
+        one torch thread, and the report is returned. Otherwise None is returned, and `advance` puts
+        the version in force later. With `wait` False, None is also returned if a training is under
+        way already, and then nothing is begun. If the executor still works on a discarded training,
+        or the computing in advance is not done, the training is requested, and `retrain_if_due`
+        begins it later.
 
         A version that fails or cannot be stored is dropped, and the report says so. If the version
         is stored, but labels that came since cannot be, it is put in force by a later call; its
@@ -587,8 +588,10 @@ class Learner:
         does so. If the next training does not start from the model in force, because labels were
         forgotten, its features are computed in advance (`_precompute_other_start`). The store is
         checked against its ledger; a difference sets the outbox's `integrity_error`, after which
-        every part is verified. With no new correction the window is read and the rule rebuilt, too;
-        a baseline is then retrained all the same. Raises StoreError if the store is unavailable.
+        every part is verified. A damaged trace is reported by an event in the store. With no new
+        correction the window is read and the rule rebuilt, too; a baseline is then retrained all
+        the same. Raises StoreError if the store is unavailable, and, for a pinned model that is
+        fitted again, what `roll_back` raises.
         """
         self._outbox.check_integrity(0)  # the rule is rebuilt from all of it
         corrections = self._store.corrections.after(self.live.corrected_to)
@@ -642,9 +645,10 @@ class Learner:
 
         It is stored together with `event`. Until then nothing changes, so all that can fail comes
         before: checking the store against its ledger, reading the version, restoring it, and adding
-        the later labels, up to the training window's capacity, as its references. Once it is in
-        force, new labels count from zero, since the version knows all labels until now. A retrain
-        that was requested before is not begun any more.
+        the later labels, up to the training window's capacity, as its references. A difference from
+        the ledger sets the outbox's `integrity_error`, and a damaged trace is reported by an event
+        in the store. Once it is in force, new labels count from zero, since the version knows all
+        labels until now. A retrain that was requested before is not begun any more.
 
         Raises StoreError if the version is not kept, if a trace is damaged that the model must be
         fitted on again, and if the version cannot be stored, also because another cell of the

@@ -111,8 +111,9 @@ class LiveModel:
         is trained on these traces again; any other is restored bit for bit, with its reference
         points. Without a version, or if one of those traces is damaged or missing, no model is in
         force, and the rule of the untrained model is updated with the stored outcomes since it
-        began. The outcomes that update the rule are checked against the store's ledger; a
-        difference sets the outbox's `integrity_error`, after which every part is verified. Labels
+        began. The outcomes that update the rule, and the labels of such a training, are checked
+        against the store's ledger; a difference sets the outbox's `integrity_error`, after which
+        every part is verified. A damaged trace is reported by an event in the store. Labels
         that came after the version was stored become references. If the version is from before the
         present rule, its stored rule is not taken. If the stored rule does not include what it must
         (`RuleProgress.last_seq`), the rule is rebuilt from all outcomes. An exception as the model
@@ -301,9 +302,10 @@ class LiveModel:
         Returns False if the model must be trained again: always for a baseline (a model that the
         user handed in), and if it cannot change a reference; the other references are changed all
         the same. The caller must retrain then, because each correction is applied only once.
-        Returns True before the first retrain. `corrected_to` is set to the last correction in any
-        case, without any it stays. The rule is left to `rebuild_rule`. Raises StoreError if the
-        store is unavailable, after the corrections before were applied.
+        Returns True before the first retrain. `corrected_to` is set to the last correction that was
+        applied, also if this raises; without any it stays. A damaged trace is reported by an event
+        in the store. The rule is left to `rebuild_rule`. Raises StoreError if the store is
+        unavailable, after the corrections before were applied.
         """
         store = self.outbox.store
         is_done = self.newest.keeps_references or self.answering is None

@@ -30,12 +30,14 @@ def restore_model(
     """Return a new model, made from the untrained model `template`, as a stored version was.
 
     `state` holds the arrays of the version by name. A model like umap-learn, of which not the fit
-    but only the numbers of its traces are stored, is trained on these traces again (`refit`).
-    Returns None if one of these traces is damaged or missing. The new model and the template share
-    one rule, so the template gets the stored rule, too, if `state` holds one. Raises StoreError
-    (KeyError, ValueError or NotImplementedError, if it is of another reducer) for a state that this
-    dengine cannot restore, StoreError for a label that is neither 0 nor 1, and if the store cannot
-    be read, and what the training raises.
+    but only the numbers of its traces are stored, is trained on these traces again (`refit`), after
+    their labels are compared with the ledger: a difference sets the outbox's `integrity_error`.
+    Returns None if one of these traces is missing, or damaged, of which an event tells. The new
+    model and the template share one rule, so the template gets the stored rule, too, if `state`
+    holds one. Raises StoreError (KeyError, ValueError or NotImplementedError, if it is of another
+    reducer) for a state that this dengine cannot restore, StoreError for a label that is neither 0
+    nor 1, for traces of different shapes, and if the store cannot be read, and what the training
+    raises.
     """
     model = template.successor()
     if model.needs_refit(state) and not refit(model, outbox, TrainedOn.from_state(state)):
@@ -87,8 +89,9 @@ def find_clean_start(
     it is returned. It is also returned if it begins anew with each training, like a baseline, or a
     model of which a stored version does not hold the fit. Otherwise the newest stored version of
     the cell or its product that saw no such label is returned, as a new model with the rule of
-    `template`; versions that are damaged or not kept are passed over. If there is none, it is
-    `template`, the untrained model with its initial weights.
+    `template`; versions that are damaged or not kept, or whose loading or restoring raises
+    StoreError for another reason, are passed over. If there is none, it is `template`, the
+    untrained model with its initial weights.
 
     Returns
     -------
@@ -99,7 +102,7 @@ def find_clean_start(
     Raises
     ------
     StoreError
-        If the store cannot be read.
+        If the corrections or the list of versions cannot be read.
     KeyError, ValueError, NotImplementedError
         For a version of another reducer that cannot be restored.
     """

@@ -259,7 +259,7 @@ class RestartableExecutor(Protocol):
     ready: Future[None]
 
     def restart(self) -> None:
-        """End what it works on, and start it anew without waiting for it."""
+        """End what it works on, and start it anew without waiting; OSError if that fails."""
 
 
 class Retrainer:
@@ -434,11 +434,12 @@ class Retrainer:
         return f"dropped: RuntimeError: {failure}"
 
     def _replace_executor(self) -> None:
-        """Start the executor again, or go on without it if it cannot be started.
+        """Start a `RestartableExecutor` again; go on without any other executor.
 
-        A `RestartableExecutor` is restarted; if that fails, it is logged. Any other executor is set
-        to None, which is logged. But if it still works on a discarded training, it is kept, and
-        used again once that is done.
+        A restart ends what it works on, also a discarded training. If it raises OSError, that is
+        logged, and the next retrain tries again. Any other executor is set to None, which is
+        logged. But if it still works on a discarded training, it is kept, and used again once that
+        is done.
         """
         executor = self.executor
         if isinstance(executor, RestartableExecutor):

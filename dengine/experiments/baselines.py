@@ -84,14 +84,15 @@ class Baseline(ABC):
         Parameters
         ----------
         X : array, shape (n, C, T)
-            Traces.
+            Traces; (n, T) for one channel.
         y : array, shape (n,)
             1 is success, any other value failure.
 
         Raises
         ------
         TraceError
-            For traces of another shape, or values that are no real numbers.
+            If X has neither shape, or has values that are no real numbers. Traces of another length
+            than before are taken.
         """
         traces = as_traces(X)
         good = np.asarray(y) == 1
@@ -102,8 +103,9 @@ class Baseline(ABC):
     def add(self, x: ArrayLike, y: Any) -> Self:
         """Learn one trace `x` (C, T) with its label `y`, 1 for success, and return self.
 
-        Nothing is learned before a training has succeeded, or if the method learns only in `fit`.
-        Raises TraceError for values that are no trace.
+        Nothing is learned or checked before a training has succeeded; nothing is learned if the
+        method learns only in `fit`. Raises TraceError for values that are no trace. It is not
+        checked here that the trace is as long as those of the training.
         """
         self._last = None
         if self.is_trained:
@@ -113,7 +115,7 @@ class Baseline(ABC):
     def count(self, X: ArrayLike) -> tuple[Ints, Ints]:
         """Return (n_success, n_failure), each (n,): the labels behind each prediction.
 
-        They are 0 if the method counts none.
+        They are 0 if the method counts none. Raises TraceError like `predict`.
         """
         prediction = self.predict(X)
         zeros = np.zeros(len(prediction.lower), dtype=np.int64)
@@ -123,6 +125,7 @@ class Baseline(ABC):
         """Return (lower, upper), each (n,), of the success probability.
 
         They are equal if the method has no interval, and 0 and 1 before a training has succeeded.
+        Raises TraceError like `predict`.
         """
         prediction = self.predict(X)
         return prediction.lower, prediction.upper
@@ -152,7 +155,9 @@ class Baseline(ABC):
         The last result is cached: it is returned again for the same traces until the next `fit` or
         `add`. Before a training has succeeded, all bounds are 0 and 1. A baseline that counts no
         labels returns the integer 0, and no array, for both counts; so does an untrained one.
-        Raises TraceError for traces of another shape.
+        Traces (n, T) have one channel. Raises TraceError if X has neither shape, or has values that
+        are no real numbers. It is not checked here that the traces are as long as those of the
+        training.
         """
         traces = as_traces(X)
         key = traces.shape, traces.tobytes()

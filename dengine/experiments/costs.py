@@ -356,8 +356,10 @@ class PolicySearch:
     Raises
     ------
     SettingError
-        A price, a policy, or a number of repeats or cycles out of range; recordings of one label,
-        or too few for any policy.
+        A price, a policy, or a number of repeats out of range; recordings of one label, or too few
+        for any policy. More cycles than the recordings have are refused only in `run`.
+    DataError, StoreError
+        A data set that cannot be read, as for `load_dataset`.
     """
 
     def __init__(
@@ -606,9 +608,11 @@ def cost_curve(
         parts that the model is certain of) and stops="some", the guarantees "pooled" and "cost" get
         an audit rate of 5 %, because they need outcomes of accepted parts.
     n_jobs : int, default 1
-        Replays at a time, as joblib counts them.
+        Replays at a time, as joblib counts them. 1 plays in this thread, which then has one torch
+        thread.
     keep : path or None, default None
-        Folder of finished replays: those in it are not played again, others are added.
+        Folder of finished replays, made if it is missing: those in it are not played again, unless
+        their file is damaged, and others are added.
     **settings
         alphas, lower_bounds : sequences of float to try; by default 0.1, and values around
         1 - check / escape that the number of recordings allows. repeats : fresh shuffles that the
@@ -628,8 +632,12 @@ def cost_curve(
         for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
+    StoreError
+        A store, given as the data set, that cannot be opened or read.
     OutputError
         With `keep`, a replay that cannot be written.
+    OSError
+        If the folder `keep` cannot be made.
     """
     data = load_dataset(dataset)
     search = PolicySearch(data, recipe, Costs(check, escape, false_reject), **settings)
@@ -650,8 +658,9 @@ def curve_of(
 
     `groups` has each policy with its replays, all of the same shuffles in the same order. The
     choice is repeated with each price halved and doubled; what changes then is in the field
-    `price_changes` of the result. `left_behind`, `out_of_reach` and `fresh` become its fields with
-    these names.
+    `price_changes` of the result. Three arguments become fields of the result: `left_behind`, the
+    policies that were dearer in earlier shuffles; `out_of_reach`, policies that were not played,
+    each with the reason; and `fresh`, whether no policy was chosen by these shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)

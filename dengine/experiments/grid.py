@@ -76,6 +76,11 @@ class KeptReplays:
     ----------
     folder : path
     data : Dataset
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made.
     """
 
     def __init__(self, folder: FilePath, data: Dataset) -> None:
@@ -274,10 +279,11 @@ def iterate_replays(
         Anything `load_dataset` takes.
     tasks : sequence of Task
     n_jobs : int, default 1
-        Replays at a time, as joblib counts them. Timings are right with 1 alone.
+        Replays at a time, as joblib counts them. Timings are right with 1 alone. 1 plays in this
+        thread, which then has one torch thread.
     keep : path or None, default None
-        Folder of finished replays, made if it is missing: those in it are not played again, and
-        others are added as they end.
+        Folder of finished replays, made if it is missing: those in it are not played again, unless
+        their file is damaged, and others are added as they end.
     on_cycle : callable or None, default None
         Called after each cycle with the number of finished cycles of its replay. It is not called
         if `n_jobs` is not 1, because a callback cannot travel to other processes.
@@ -294,8 +300,12 @@ def iterate_replays(
         `keep` also for a reducer that cannot be hashed.
     DataError
         A data set that cannot be read.
+    StoreError
+        A store, given as the data set, that cannot be opened or read.
     OutputError
         With `keep`, a replay that cannot be written.
+    OSError
+        If the folder `keep` cannot be made.
     """
     from joblib import Parallel, delayed
 
@@ -378,8 +388,8 @@ def run_grid(
 
     Raises
     ------
-    SettingError, DataError
-        As `grid_tasks` and `iterate_replays`; OutputError only with `keep`.
+    SettingError, DataError, StoreError
+        As `grid_tasks` and `iterate_replays`; OutputError and OSError only with `keep`.
 
     References
     ----------

@@ -438,10 +438,10 @@ def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[Obse
     """Let the engine drive a cell for a number of cycles, and yield each cycle as it ends.
 
     With the cycle come the truth, whether the part was good, and the clock, the seconds of
-    production. The truth is the cell's attribute `truth` if it has this attribute, otherwise the
-    label that was reported, or NaN if none was. The clock is the cell's attribute `clock`, or None.
-    Raises what `DataEngine.run` raises. An exception of the cell is raised, too, after the engine
-    has written its decisions and labels.
+    production. The truth is the cell's attribute `truth` if it has this attribute (NaN for None),
+    otherwise the label that was reported, or NaN if none was. The clock is the cell's attribute
+    `clock`, or None. Raises what `DataEngine.run` raises. An exception of the cell is raised, too,
+    after the engine has written its decisions and labels.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)
@@ -516,8 +516,9 @@ def watch(
     Returns
     -------
     run : Replay
-        The run of all `cycles`. An exception of the cell or of `on_cycle` goes on to the caller;
-        then nothing is returned, and only `on_cycle` has got the cycles before the exception.
+        The run of all `cycles`. An exception of the engine (as of `DataEngine.run`), of the cell or
+        of `on_cycle` goes on to the caller; then nothing is returned, and only `on_cycle` has got
+        the cycles before the exception.
     """
     observed = []
     for item in observe_cycles(engine, cell, cycles):
@@ -541,6 +542,8 @@ def replay(
 ) -> Replay:
     """Play a data set through a fresh engine in memory, in one pass; return what was decided.
 
+    It limits this thread to one torch thread, for an engine of yours only if that trains in it.
+
     Parameters
     ----------
     dataset : object
@@ -551,7 +554,7 @@ def replay(
         it learned.
     seed : int, default 0
         Of the shuffle, and of the engine unless one is given; the same seed gives the same
-        decisions.
+        decisions, but not with an engine of yours whose trainings end by a time budget.
     cycles : int or None, default None
         Only the first so many parts, after the shuffle; None plays all.
     alpha, lower_bound : float or None, default None
@@ -572,10 +575,13 @@ def replay(
     ------
     SettingError
         A number of cycles that the data set does not have, anything that is no recipe, a baseline
-        that cannot be made, alpha or lower_bound beside an engine, or a policy with force limits in
-        seconds for a data set of an unknown rate.
+        that cannot be made, alpha or lower_bound out of range or beside an engine, a malformed
+        `windows.trigger` of the data's description, or a policy with force limits in seconds for a
+        data set of an unknown rate.
     DataError
         A data set that cannot be read.
+    StoreError
+        A store, given as the data set, that cannot be opened or read.
     TraceError
         For an engine of yours, traces that it does not take.
     """
@@ -620,12 +626,15 @@ def replay_policy(scores: Replay, policy: Policy) -> Replay:
     """Let a policy decide on the predictions that a replay in shadow mode recorded.
 
     No model is asked. In shadow mode every part was verified, and the counts and embeddings of the
-    model were recorded. The rule of the policy decides on these, and learns only outcomes that it
-    would know in a replay of its own: checks, audits and line stops, and with `stops="all"` also
-    that an accepted part was good. One difference to such a replay stays: the predictions come from
-    a model that has learned all labels. Audits are drawn anew, by the seed of the replay. A part
-    for which the model was not asked, such as a novel one or one that left an operator's force
-    limits, is verified; the rule learns its outcome, too, with the bounds 0 and 1.
+    model were recorded. The rule of the policy decides on these; a rule that only sorts takes the
+    first axis of the embedding, if the reducer predicts a probability there, and no counts. It
+    learns only outcomes that it would know in a replay of its own: checks, audits and line stops,
+    and with `stops="all"` also that an accepted part was good. Two differences to such a replay
+    stay: the predictions come from a model that has learned all labels, and the force limits are
+    those of `scores`; those of `policy` are not applied, since a replay has no traces. Audits are
+    drawn anew, by the seed of the replay. A part for which the model was not asked, such as a novel
+    one or one that left an operator's force limits, is verified; the rule learns its outcome, too,
+    with the bounds 0 and 1.
 
     Parameters
     ----------

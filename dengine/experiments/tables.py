@@ -57,7 +57,11 @@ LEGEND = (
 
 
 def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -> pd.DataFrame:
-    """Return a table with a row for each replay, as `Replay.summary` gives it."""
+    """Return a table with a row for each replay, as `Replay.summary` gives it.
+
+    `check_seconds` is how long a verification takes, for the time saved. Raises SettingError if it
+    is not finite or not above 0.
+    """
     import pandas as pd
 
     return pd.DataFrame([replay.summary(check_seconds) for replay in replays])
@@ -74,8 +78,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
     frame : DataFrame
         As `frame_of` gives it.
     replays : sequence of Replay, default ()
-        The replays of the frame's rows, in their order. Without them the error's interval is NaN,
-        and retrains_dropped is 0.
+        The replays of the frame's rows, in their order, all of one data set and none of a live run.
+        Without them the error's interval is NaN, and retrains_dropped is 0.
 
     Returns
     -------

@@ -188,6 +188,13 @@ class OnnxModel:
         The ONNX program.
     metadata : dict
         The file's description of itself.
+
+    Raises
+    ------
+    ExportError
+        If a package for ONNX is missing.
+    Exception
+        What onnxruntime raises for a program that it cannot run.
     """
 
     def __init__(self, content: bytes, metadata: Metadata) -> None:
@@ -207,7 +214,7 @@ class OnnxModel:
         Returns action, reason, lower, upper, n_success, n_failure and embedding. Another T is cut,
         padded or resampled, or refused, as `TraceSpec.fit` says. A faulty trace, or a novel one,
         which is unlike all traces of the training, is verified, and its reason says so. Raises
-        TraceError for a wrong shape.
+        TraceError for a wrong shape, and for values that are no real numbers.
         """
         outputs = self.session.run(None, {"trace": as_trace(trace, self.trace)})
         action, reason, *counted, z = outputs
@@ -278,7 +285,7 @@ class OnnxDecision(nn.Module):
         """Return the position in `Reason` of what is wrong with a trace, () int64; 0 if nothing is.
 
         Only the first fault that applies is returned: not finite, constant, at the sensor's limit,
-        too large. The result is the same as in an engine (`TraceGate`).
+        too large (beyond 1e18). The result is the same as in an engine (`TraceGate`).
         """
         low = trace.min()
         high = trace.max()

@@ -603,7 +603,10 @@ class ModelPrediction(EngineModel):
 
     @property
     def predictor(self) -> Any:
-        """The `Predictor` in the decider; ValueError if nothing was fitted."""
+        """The `Predictor` in the decider; a decider is built and kept if none is.
+
+        Raises ValueError if nothing was fitted, and what `build_decider` raises.
+        """
         return self.decider(self._conditions).predictor
 
     def add(self, x: ArrayLike, y: ArrayLike) -> Self:
@@ -850,7 +853,7 @@ class ModelPrediction(EngineModel):
         """Compare the decider's embeddings of `examples` with the points that `defect` kept.
 
         Yields for each example why the model must not be used, "" if it may be used. Call `defect`
-        before.
+        before. The call raises what `build_decider` raises, and a step what the decider raises.
         """
         decider = self.decider(self._conditions)
         return compare_points(decider, self.examples, self._example_points)

@@ -156,7 +156,7 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
         X : array of float, shape (n, T) or (n, C, T)
             Traces.
         y : array, shape (n,), optional
-            Labels of two classes, the larger one for success. Only read if `uses_labels`.
+            Labels of two classes; the one that sorts last is success. Only read if `uses_labels`.
         """
 
     def transform(self, X: ArrayLike) -> Floats:
@@ -282,7 +282,8 @@ class Reducer(ClassNamePrefixFeaturesOutMixin, TransformerMixin, BaseEstimator):
     def restore_shape(self, state: Arrays) -> tuple[int, int]:
         """Read the shape of traces from the array "shape" of a state; return it, (C, T).
 
-        It sets `trace_shape_` and scikit-learn's `n_features_in_`.
+        It sets `trace_shape_` and scikit-learn's `n_features_in_`. Raises KeyError if the state has
+        no such array.
         """
         channels, samples = map(int, state["shape"])
         self.trace_shape_ = (channels, samples)
@@ -445,7 +446,7 @@ def space_scale(points: Floats, folds: Ints, n_spaces: int) -> Floats:
 
 
 def binary_labels(y: Any, n: int, name: str) -> Ints:
-    """Return labels of two classes as int64 (n,): 1 for the larger class, 0 for the other.
+    """Return labels of two classes as int64 (n,): 1 for the class that sorts last, else 0.
 
     Labels of 0 and 1 stay as they are, also if only one of them occurs. A single class that is
     neither 0 nor 1 becomes 1. A column (n, 1) is accepted with a warning.
@@ -608,8 +609,8 @@ class LabelFree(_Wrapping):
         """Fit a clone of the transformer, `reducer_`, on traces X; labels are ignored.
 
         X has the shape (n, T) or (n, C, T); a transformer that is no Reducer gets it as rows
-        (n, C * T). Returns self. `dim_` becomes the number of coordinates. Raises what
-        `check_traces` and the transformer raise.
+        (n, C * T). Returns self. `dim_` becomes the number of coordinates; `trace_shape_` and
+        `n_features_in_` are set, too. Raises what `check_traces` and the transformer raise.
         """
         traces = self.check_traces(X, reset=True)
         self.reducer_ = clone(self.reducer).fit(self.as_input(traces))
@@ -644,13 +645,14 @@ class CrossFitted(_Wrapping):
     def fit(self, X: ArrayLike, y: ArrayLike | None = None, *, folds: Ints | None = None) -> Self:
         """Fit clone k on the traces outside fold k, for every k, and replace `clones_` and `dim_`.
 
-        If a fit raises, `clones_` may already hold clones that are not fitted.
+        `trace_shape_` and `n_features_in_` are set, too. If a fit raises, `clones_` may already
+        hold clones that are not fitted.
 
         Parameters
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes, of which the larger is given to the clones as 1, the other as 0.
+            Labels of two classes; the clones get 1 for the one that sorts last, else 0.
         folds : array of int64, shape (n,), optional
             Fold of each trace, 0 to K - 1; it is not checked. None: by a hash of its content.
 

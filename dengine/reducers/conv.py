@@ -200,7 +200,8 @@ class ConvReducer(TorchReducer):
 
         `train` finds them again by `numbers`; without numbers they are not kept. The first call
         also builds the network and draws the kernels. With fewer than `min_traces` traces nothing
-        is done. No label is read.
+        is done. No label is read. Raises the errors of `check_traces`, and at the first call those
+        of `_initialize`.
         """
         if len(X) >= self.min_traces:
             traces = self._check_and_initialize(X)

@@ -329,7 +329,7 @@ class RocketReducer(Reducer):
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes, the larger one for success.
+            Labels of two classes; the one that sorts last is success.
         folds : array of int64, shape (n,), optional
             Fold of each trace, 0 to K - 1. None: by a hash of its content.
 
@@ -395,9 +395,11 @@ class RocketReducer(Reducer):
 
         Call `init_encoder` first: otherwise all kernels are 0, and the result is meaningless
         without an error. Traces are (n, C, T), labels (n,) 1 or 0; they may be of one class. `stop`
-        and `numbers`, which must increase, are those of `train`. `net_` is changed in place.
-        Returns the points of the traces, float32 (n, d), row i in embedding space ``folds[i]``,
-        whose head did not see the label of row i.
+        and `numbers`, those of the labels, which must increase, are as in `train`. `net_` is
+        changed in place; `towers_` and what a fit reports (`n_iter_`, `holdout_losses_`, `note_`)
+        are replaced, and with `numbers` the cache, which then has these traces alone. Returns the
+        points of the traces, float32 (n, d), row i in embedding space ``folds[i]``, whose head did
+        not see the label of row i.
         """
         raw = self.raw_features(traces, numbers)
         self._fit_heads(raw, labels, folds, stop, numbers)
@@ -424,7 +426,8 @@ class RocketReducer(Reducer):
 
         `train` finds them again by `numbers`, the numbers of the labels; without numbers nothing is
         cached. The cache then holds these traces and no others. The first call also draws the
-        kernels. With fewer than `MIN_TRACES` traces nothing is done.
+        kernels. With fewer than `MIN_TRACES` traces nothing is done. Raises the errors of
+        `check_traces`, and at the first call those of `build`.
         """
         if len(X) >= MIN_TRACES:
             self.raw_features(self._check_and_initialize(X), numbers)

@@ -213,7 +213,8 @@ class TorchReducer(Reducer):
         ----------
         X : array of float, shape (n, T) or (n, C, T)
         y : array, shape (n,)
-            Labels of two classes, the larger one for success; a single class is trained on, too.
+            Labels of two classes; the one that sorts last is success. A single class is trained on,
+            too.
         folds : array of int64, shape (n,), optional
             Fold of each trace, 0 to K - 1. None: by a hash of its content.
 

@@ -233,11 +233,12 @@ class HttpApi:
         changed.
 
         The label as it was reported stays on record. A forgotten label counts again. If the part
-        already counts with this label, nothing changes. 404: an unknown id or part; 409: a part
+        already counts with this label, nothing changes, but a training under way begins again. Only
+        the newest 20 decisions on a part are looked at. 404: an unknown id or part; 409: a part
         with several decisions that are no rejects, or with nothing but several rejects; 422: a
         decision without a label, both or neither of id and part, no author (unless the token has a
-        name), or an author that is not the token's; 503: the queue is full, or the store does not
-        answer.
+        name), or an author that is not the token's; 503: the queue is full, the store does not
+        answer, or the decision's trace is damaged.
         """
         decision_id = await self._find_id(id_, part)
         return await self._change(
@@ -257,8 +258,9 @@ class HttpApi:
         decision has no label, or no id is given (422), no label is forgotten. 422 also for a
         request without an author, unless the token has a name, and for an author that is not the
         token's. If a rollback pinned the version in force, and this version was trained with one of
-        the labels, it is released, so that retrains may replace it. 503: the queue is full, or the
-        store does not answer.
+        the labels, it is released, so that retrains may replace it. A training under way begins
+        again, even if the labels are forgotten already. 503: the queue is full, the store does not
+        answer, or the trace of a decision is damaged.
         """
         line = " ".join(reason.split())
         return await self._change(
@@ -272,9 +274,10 @@ class HttpApi:
     ) -> Json:
         """Let an earlier version of the model decide again, as a new version, and pin it: no
         automatic retrain replaces it, until /release or /retrain, or until /forget of a label that
-        it was trained with. If it is pinned already, nothing changes. 404: a version that is not
-        kept; 422: no author (unless the token has a name), or an author that is not the token's;
-        503: the queue is full, or the store does not answer.
+        it was trained with. A training under way is discarded. If it is pinned already, nothing
+        else changes. 404: a version that is not kept, or whose state is damaged; 422: no author
+        (unless the token has a name), or an author that is not the token's; 503: the queue is full,
+        the store does not answer, or the version cannot be restored.
         """
         return await self._change(author, lambda engine, by: engine.rollback(version, by))
 
@@ -304,9 +307,10 @@ class HttpApi:
 
         A pinned version is released, so that the new version may replace it. If a retrain is under
         way already, or was asked for and cannot begin yet, the response says so, and nothing
-        changes. /versions tells afterwards whether the new version was put in force or dropped.
-        422: no author (unless the token has a name), or an author that is not the token's. 503: the
-        queue is full, or the store does not answer.
+        changes. If no other process can train, the response comes after the retrain. /versions
+        tells afterwards whether the new version was put in force or dropped. 422: no author (unless
+        the token has a name), or an author that is not the token's. 503: the queue is full, or the
+        store does not answer.
         """
 
         def begin(engine: DataEngine, by: str) -> Changed:
@@ -439,14 +443,15 @@ class HttpApi:
 
     async def versions(self) -> Json:
         """Return every retrain of the cell or its product, dropped ones included, oldest first; a
-        version that is kept can be rolled back to.
+        version that is kept can be rolled back to. 503: the queue is full, or the store cannot be
+        read.
         """
         versions = await self.service.read(lambda store: store.versions.all())
         return response_fields("Versions", versions=versions)
 
     async def events(self, limit: Limit = 20) -> Json:
         """Return the newest events, such as changes by hand, safe modes and faults, and who caused
-        them, newest first.
+        them, newest first. 503: the queue is full, or the store cannot be read.
         """
         events = await self.service.read(lambda store: store.events.newest(limit))
         return response_fields("Events", events=events[::-1])

@@ -49,7 +49,9 @@ def make_engine(url: str | None) -> sa.Engine:
 
     Its connections to SQLite sync each commit to the disk, and set the file of a store, or an empty
     one, to WAL mode; a file that cannot be written is only read. In memory all threads share one
-    connection. Connections to PostgreSQL use psycopg, unless the URL names another driver.
+    connection. Connections to PostgreSQL use psycopg, unless the URL names another driver. SQLite
+    waits up to `BUSY_SECONDS` (10 s) for another writer. PostgreSQL has `TIMEOUTS` of 5 to 10 s for
+    a server that does not answer, and a pooled connection is tested before use.
 
     Parameters
     ----------
@@ -345,8 +347,9 @@ class Database:
     Raises
     ------
     StoreError
-        For another program's database, another schema, a ledger with another key, or another
-        product than the cell's.
+        For another program's database, another schema, a ledger with another key, another product
+        than the cell's, a URL that `make_engine` refuses, or a key file that cannot be read, and if
+        the database cannot be opened.
     """
 
     def __init__(
@@ -477,7 +480,10 @@ class Database:
             del self._commits.is_wanted
 
     def has_entry(self, number: int, digest: str) -> bool:
-        """Return whether the cell's ledger has an entry with this number and hexadecimal digest."""
+        """Return whether the cell's ledger has an entry with this number and hexadecimal digest.
+
+        Raise StoreError if the database fails.
+        """
         rows = self.read(
             sa.select(LEDGER.c.digest).where(
                 LEDGER.c.cell_id == self.cell_id, LEDGER.c.number == number

@@ -75,7 +75,7 @@ class Drainer:
 
     @property
     def is_drained(self) -> bool:
-        """Whether the database has taken every record."""
+        """Whether the database has every record, except those that are lost."""
         return self.n_drained == self._recorder.n_recorded
 
     @property
@@ -307,14 +307,14 @@ class Drainer:
         """Commit the oldest records that are on the journal's disk, at most DRAIN_CHUNK (500).
 
         There must be one. A decision is left out if a later record with the same id replaces it.
-        Records that are damaged on disk are taken from memory and reported by an event, which is
-        also logged. If a decision is not in memory either, it is lost, and the kind of that event
-        is DATA_LOST, an alarm. Then the journal's header notes that the database has the records,
-        `n_drained` counts them, and they leave the queue of the recorder and, except for the newest
-        decisions, the `DecisionIndex`, by which decisions are found in memory. In a product the
-        numbers of their labels are kept for `pop_label_numbers`. Raise StoreError if the database
-        fails; nothing of this is done then, and the next call commits the same records again, of
-        which some may be stored already.
+        Records that are damaged on disk, or cannot be read, are taken from memory and reported by
+        an event, which is also logged. If a decision is not in memory either, it is lost, and the
+        kind of that event is DATA_LOST, an alarm. Then the journal's header notes that the database
+        has the records, `n_drained` counts them, and they leave the queue of the recorder and,
+        except for the newest decisions, the `DecisionIndex`, by which decisions are found in
+        memory. In a product the numbers of their labels are kept for `pop_label_numbers`. Raise
+        StoreError if the database fails; nothing of this is done then, and the next call commits
+        the same records again, of which some may be stored already.
         """
         with self._changed:
             chunk = list(islice(self._recorder.synced, DRAIN_CHUNK))

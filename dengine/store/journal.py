@@ -140,7 +140,7 @@ class Journal:
     Parameters
     ----------
     path : Path
-        The file; it is created if need be. A symbolic link is refused.
+        The file; if `owning`, it is created with its folder if need be. A symbolic link is refused.
     owning : bool, default True
         Lock the file and write to it. False: read what is in it now, whoever owns it.
 
@@ -222,6 +222,8 @@ class Journal:
             If the open file is no longer the one at its path, so that nobody would read it.
         StoreError
             If the disk fails.
+        OSError
+            If the system refuses to look whether the file is still at its path.
         """
         offsets = []
         framed = bytearray()
@@ -296,8 +298,9 @@ class Journal:
 
         The header is the beginning of the journal, the head a small file beside it. `newest` is
         number and digest of the ledger entry; None: there is none yet. Nothing is synced: an older
-        header is harmless, since the store ignores a record that it is given twice. Raise
-        StoreError if the header cannot be written; a failure of the head is ignored.
+        header is harmless, since the store ignores a record that it is given twice. The attribute
+        `head` keeps the entry, also if it cannot be written. Raise StoreError if the header cannot
+        be written; a failure of the head is ignored.
         """
         with self._describing, _os_errors(self.path):
             self.head.newest = newest
@@ -307,7 +310,8 @@ class Journal:
     def _write_head(self) -> None:
         """Write the attribute `head` to the small file beside the journal, without a sync.
 
-        The file is created if need be, and stays open. A failure is ignored.
+        The file is created if need be, and stays open. A failure is ignored. The caller holds
+        `_describing`.
         """
         # An older head is harmless. The file stays open, since each report writes it.
         with suppress(OSError, ValueError):  # ValueError: closed by another thread meanwhile
@@ -320,9 +324,10 @@ class Journal:
     def clear(self) -> None:
         """Remove all records; the caller has made sure that the store holds them.
 
-        The file is cut off behind its header, which says that the store holds all, and space is
-        reserved and synced again; the head is not written. Raise StoreError if the file cannot be
-        written.
+        The file is synced first, so that no disk keeps the cut without the header. It is cut off
+        behind its header, which is written anew and says that the store holds all. Then space is
+        reserved (`reserve`; none on a full disk) and synced. The head file is not written. Raise
+        StoreError if the file cannot be written.
         """
         self.reserve()  # syncs, so that no disk keeps the cut without the header
         with self._describing, _os_errors(self.path):
@@ -398,7 +403,10 @@ class Journal:
         self._file.write((MAGIC + _pack_fields(fields)).ljust(HEADER, b"\0"), 0)
 
     def _write_header_and_reserve(self) -> None:
-        """Write the header, and reserve disk space for records."""
+        """Write the header, and reserve disk space for records.
+
+        Raise OSError if the header cannot be written, and StoreError if the sync fails.
+        """
         self._write_header()
         self.reserve()
 
@@ -525,9 +533,9 @@ def journal_path(url: Any, cell_id: str) -> Path:
     Returns
     -------
     Path
-        Beside an SQLite file, STORE.CELL.journal. For a server CELL.DIGEST.journal in the folder
-        dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with the first 60
-        characters of the cell and a digest of the server, the database and the cell.
+        Beside an SQLite file, links resolved, STORE.CELL.journal. For a server CELL.DIGEST.journal
+        in the folder dengine of the user's state folder (`XDG_STATE_HOME`, or ~/.local/state), with
+        the first 60 characters of the cell and a digest of the server, the database and the cell.
     """
     name = urllib.parse.quote(cell_id, safe="")
     if IGNORES_CASE:  # or cell A and cell a would have one journal

@@ -54,7 +54,10 @@ class JournalledStore(Outbox):
     Raises
     ------
     StoreError
-        If another engine owns the cell, or the database cannot take what the journal holds.
+        If another engine owns the cell, or the database cannot take what the journal holds, or
+        database or journal cannot be used.
+    OSError
+        If the disk fails while the journal's records are copied to the database.
     """
 
     def __init__(self, store: SqlStore, window: int, patient: bool = False) -> None:
@@ -114,8 +117,8 @@ class JournalledStore(Outbox):
         If records are damaged or missing in the journal, an event DATA_LOST is stored, which is an
         alarm until a person acknowledges it. Otherwise, if a killed process left an unfinished
         record, which was cut off, an event that is no alarm says so. Either is logged as an error.
-        Raise StoreError if the database fails, or another release wrote a record; the records that
-        were not copied then stay in the journal.
+        Raise StoreError if the database fails, or another release wrote a record, and OSError if
+        the journal cannot be read; the records that were not copied then stay in the journal.
         """
         newest = self.store.decisions.select(HistoryFilter(), limit=1)
         since = "".join(
@@ -197,10 +200,10 @@ class JournalledStore(Outbox):
         """Record a decision in the place of an earlier one that is not on disk yet, and return it.
 
         Both have the same id. What is recorded and returned is a copy of `item` with time, trace
-        and number of the earlier decision. If the earlier one is on disk by now, nothing is
+        and row number of the earlier decision. If the earlier one is on disk by now, nothing is
         recorded, and the earlier one is returned. Raise KeyError for an id that is neither in
         memory nor in the journal, and StoreError if the journal is damaged where the earlier
-        decision stands.
+        decision stands, or cannot be read.
         """
         id_ = item.decision.id
         with self._changed:
@@ -254,8 +257,8 @@ class JournalledStore(Outbox):
         A label that is not on disk yet is left out, unless `unsynced` is True. A label from memory
         comes without number and time. Raise StoreError if the database is needed and has a fault or
         does not answer within `limit` seconds, or if the stored trace, or the journal where the
-        decision stands, is damaged. Raise it also for an id whose last decision was not recorded,
-        because the id could not be looked up or the disk hung.
+        decision stands, is damaged or cannot be read. Raise it also for an id whose last decision
+        was not recorded, because the id could not be looked up or the disk hung.
         """
         with self._changed:
             if decision_id in self._unrecorded:

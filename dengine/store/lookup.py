@@ -139,9 +139,9 @@ class DecisionIndex:
         Returns
         -------
         decision : StoredDecision or None
-            From the newest N_RECENT decisions (1,000) in memory, or from the journal if the
-            database lacks it; otherwise None. In memory it has its label, if the database got the
-            label while it was there.
+            From the newest N_RECENT decisions (1,000) in memory, or, if the database lacks it, from
+            the records that wait for the disk or from the journal; otherwise None. Among the newest
+            it has its label, if the database got the label while it was there.
         label : NewLabel or None
             The label of the decision, if the database lacks it. None if there is none, or if it is
             not on disk yet and `unsynced` is False.
@@ -149,7 +149,7 @@ class DecisionIndex:
         Raises
         ------
         StoreError
-            If the journal is damaged where the decision stands.
+            If the journal is damaged where the decision stands, or cannot be read.
         """
         item = self.recent.get(decision_id)
         entry = self._decisions.get(decision_id)

@@ -21,8 +21,10 @@ LOCKED_BYTE = 2**31 - 2  # the last that the C library of Windows can lock
 def _lock_of_system() -> Callable[[int], object]:
     """Return a function that locks an open file, given by its descriptor, for this process.
 
-    The function does not wait: it raises BlockingIOError if another descriptor has the lock. It is
-    `flock`, or on Windows the function of `_lock_of_windows`.
+    The function does not wait: it raises BlockingIOError if another descriptor has the lock, and
+    otherwise the OSError of the system, for example if the file system has no locks. The lock ends
+    when the file is closed or the process ends. The function is `flock`, or on Windows that of
+    `_lock_of_windows`.
     """
     try:
         import fcntl
@@ -162,11 +164,11 @@ class OwnedFile:
             raise OSError(f"only {written} of {len(content)} bytes were written")
 
     def sync(self) -> None:
-        """Return once what was written is on the disk."""
+        """Return once what was written is on the disk; raise OSError if the disk fails."""
         sync(self._fd)
 
     def truncate(self, size: int) -> None:
-        """Set the size in bytes: cut the file off, or extend it."""
+        """Set the size in bytes: cut the file off, or extend it; OSError if the system refuses."""
         os.ftruncate(self._fd, size)
 
     def reserve(self, size: int) -> None:

@@ -122,7 +122,8 @@ class Recorder:
     def oldest(self) -> float | None:
         """Time of recording of the oldest record that the database lacks, by `time.monotonic`.
 
-        None if it lacks none.
+        None if it lacks none. For a record that an earlier process left, it is the time of `adopt`.
+        Hold `changed` meanwhile.
         """
         for entries in (self.synced, self.unwritten):
             if entries:
@@ -132,9 +133,9 @@ class Recorder:
     def record(self, record: Record) -> Entry:
         """Add a record in memory, and wake the thread that writes it to the journal.
 
-        Return at once the record's `Entry`, which will say where it stands in the journal. The
-        thread writes it within about BATCH_SECONDS (0.05 s), together with others. There is no
-        limit to the number of records that wait.
+        Return at once the record's `Entry`, which will say where it stands in the journal. If the
+        disk answers, the thread writes it within about BATCH_SECONDS (0.05 s), together with
+        others. There is no limit to the number of records that wait.
         """
         id_ = record.decision.id if isinstance(record, StoredDecision) else ""
         entry = Entry(record, id_)

@@ -540,7 +540,8 @@ def _plain_type(hint: Any) -> type:
 def to_row(record: Any, *names: str) -> Row:
     """Return the fields of a record as columns of a row, by name; only `names` if they are given.
 
-    Enumerations become text, tuples and dicts JSON, arrays packed float32.
+    Enumerations become text, tuples and dicts JSON, arrays packed float32. Raise ValueError or
+    TypeError for a value that cannot be converted to the type of its field.
     """
     record_type: Any = type(record)
     fields = columns(record_type)
@@ -653,7 +654,7 @@ def pack(values: NDArray[np.float32]) -> bytes:
 
 
 def unpack(blob: bytes) -> NDArray[np.float32]:
-    """Return what `pack` wrote as a flat array of float32."""
+    """Return what `pack` wrote as a flat array of float32; ValueError for a part of a number."""
     return np.frombuffer(blob, dtype="<f4").astype(np.float32)
 
 
@@ -714,7 +715,7 @@ class StoredVersion:
     n_bytes : int
         Size of its state; 0 if none is kept.
     kept : bool
-        Whether `load_version` can load it.
+        Whether its state is kept, so that `VersionTable.load` loads it unless it is damaged.
     """
 
     number: int

@@ -147,7 +147,9 @@ def verify_history(
     the store lacks, lost data that nobody has acknowledged, and an `expect` that no entry of the
     checked cells has. Of missing entries and of SQLite's findings only the first 20 and 100 are
     returned. A journal that is missing or cannot be read is no fault: `waiting` of the cell is None
-    then. Takes about 80 bytes of memory per row.
+    then. Of the settings that the store itself keeps (`RESERVED`) a changed product is not noticed.
+    An SQLite file that was not in WAL mode is set to it (`reading`). Takes about 80 bytes of memory
+    per row.
 
     Parameters
     ----------
@@ -172,7 +174,7 @@ def verify_history(
     StoreError
         For what is no store of the present schema, for an unknown cell, for an `expect` that is no
         digest, and for a ledger with another key than the one that DENGINE_LEDGER_KEY names, or if
-        the key's file cannot be read.
+        the key's file cannot be read, or the disk fails while a journal is read.
     """
     expected = "" if expect is None else expect.strip().lower()
     if expect is not None and not re.fullmatch("[0-9a-f]{8,64}", expected):
@@ -224,7 +226,8 @@ def _inspect_journal(path: Path) -> tuple[list[EntryName], int | None, str]:
     Return the ledger entries that it names (number and digest), the number of records that its
     store has not taken, and in words which records are damaged or missing, "" if none is. If there
     is no journal, or it cannot be read, the head, a small file beside it, gives the ledger entry,
-    the number is None and the text "".
+    the number is None and the text "". If the disk fails while the records are read, OSError is
+    raised.
     """
     with suppress(StoreError):  # it is missing, damaged, or another user's
         records, journal = read_undrained(path)
@@ -424,8 +427,9 @@ class CellCheck:
     def _check_settings(self) -> Iterator[HistoryFault]:
         """Yield a fault for each setting that was changed, or is only in the table or the ledger.
 
-        The ledger has a copy of the cell's settings. If the setting with the version of the tables
-        is missing (no engine has opened the cell), that is a fault, too.
+        The ledger has a copy of the cell's settings, but not of those that the store itself keeps
+        (`RESERVED`), so a change of these is no fault here. If the setting with the version of the
+        tables is missing (no engine has opened the cell), that is a fault, too.
         """
         for key, problem in find_settings_faults(self.connection, self.cell_id).items():
             yield self._fault(SETTING.name, key, problem)

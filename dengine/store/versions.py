@@ -140,7 +140,7 @@ class VersionTable(CellTable):
     def newest_number(self) -> int:
         """Return the number of the newest version that was put in force; 0 before the first.
 
-        Versions of all cells of the product count.
+        Versions of all cells of the product count. Raise StoreError if the database fails.
         """
         with self._database.reading() as connection:
             return self._scope.newest_version(connection)
@@ -157,6 +157,11 @@ class VersionTable(CellTable):
         ModelVersion or None
             None if there is no version yet, and if all arrays that are kept are damaged. The
             version of another cell is returned without the state of its rule.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
         """
         for i, row in enumerate(self._read(self._accepted_query())):
             if not row.kept and i > 0:
@@ -184,6 +189,8 @@ class VersionTable(CellTable):
         VersionError
             If no such version was put in force, or if its state, the stored arrays, was deleted
             since; the error names the versions whose states are kept. Also if its state is damaged.
+        StoreError
+            If the database fails.
         """
         retrains = {
             row.version: row.retrain
@@ -254,14 +261,17 @@ class VersionTable(CellTable):
         ]
 
     def retrains(self) -> list[RetrainReport]:
-        """Return the report of every retrain of the cell or its product, oldest first."""
+        """Return the report of every retrain of the cell or its product, oldest first.
+
+        Raise StoreError as `all` does.
+        """
         return [version.report for version in self.all()]
 
     def _accepted_query(self) -> sa.Select[Any]:
         """Return the query for the versions of the cell or its product that were put in force.
 
-        The rows are newest first. The columns are `retrain`, `version`, and `kept`: whether the
-        state is kept.
+        The rows are newest first. The columns are the numbers `retrain` (dropped versions count)
+        and `version`, and `kept`: whether the state is kept.
         """
         return (
             sa.select(*VERSION.c["retrain", "version"], VERSION.c.state.is_not(None).label("kept"))

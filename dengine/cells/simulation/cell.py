@@ -138,7 +138,7 @@ def insert_once(
     cycle : int
         Number of the cycle, from 0.
     time_step_s : float
-        Step of the physics in seconds.
+        Step of the physics in seconds; it must divide 2 ms.
 
     Returns
     -------
@@ -151,7 +151,7 @@ def insert_once(
     SettingError
         For a time step or sizes that cannot be simulated.
     ValueError
-        For ranges or probabilities that `draw_conditions` cannot draw from.
+        For ranges or probabilities, also of the sensor, that cannot be drawn from.
     """
     world_rng, sensor_rng, _ = _make_generators(seed, cycle)
     conditions = draw_conditions(parameters, world_rng)
@@ -228,6 +228,11 @@ class SimulatedCell:
         Seconds of production so far.
     last : SimulatedInsertion or None
         The newest insertion with its label, for reports; an engine does not read it.
+
+    Raises
+    ------
+    SettingError
+        For an unknown scenario, or fewer cycles than 1.
     """
 
     spec = TraceSpec(SAMPLES, RATE_HZ, unit="N")

@@ -263,9 +263,9 @@ def variant(parameters: CellParameters, cycle: int, cycles: int) -> CellParamete
     """Return the parameters of a cycle: unchanged in the first half, then those of another part.
 
     `cycle` counts from 0, and `cycles` is their number; of an odd number the first half is the
-    smaller one. The other part is 2.5 times as heavy. Its clearance in the hole is drawn from 0.04
-    to 0.16 mm, and the chamfer of the hole from 0.5 to 1.0 mm, whatever the parameters say; both
-    are smaller than by default.
+    smaller one. The other part is 2.5 times as heavy. Its clearance in the hole will be drawn from
+    0.04 to 0.16 mm, and the chamfer of the hole from 0.5 to 1.0 mm, whatever the parameters say;
+    both are smaller than by default. Nothing is drawn here.
     """
     if cycle < cycles // 2:
         return parameters

@@ -67,7 +67,10 @@ class Package(NamedTuple):
     payload: bytes
 
     def to_bytes(self) -> bytes:
-        """Return the package with its header, as it is sent."""
+        """Return the package with its header, as it is sent.
+
+        Raise struct.error for a payload of more than 65,532 bytes.
+        """
         return HEADER.pack(HEADER.size + len(self.payload), self.type) + self.payload
 
 

@@ -119,8 +119,8 @@ class RtdeClient:
     def send(self, values: Values) -> None:
         """Write all input fields in one package; a column that is left out is written as 0.
 
-        Names that are no columns are ignored. Raise CellError if the connection is lost, and the
-        errors of `RtdeRecipe.pack`.
+        Names that are no columns are ignored. The client must have been made with `inputs`. Raise
+        CellError if the connection is lost, and the errors of `RtdeRecipe.pack`.
         """
         self._send(self._inputs.pack(values))
 
@@ -236,10 +236,11 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
     """Receives packages in a thread and buffers them for `take`.
 
     The parameters are those of `RtdeClient`, and `clock`, a function that returns seconds. If the
-    first connection fails, CellError is raised, or SettingError for an unknown column. If a
-    connection is lost later, the thread reconnects, with as many attempts as that takes. It then
-    writes the newest inputs again, unless they are old or the controller was restarted. The buffer
-    holds 60 s of packages; older packages are dropped.
+    first connection fails, CellError is raised, or SettingError for an unknown column; if another
+    client still writes an input, only after further attempts for 2 s. If a connection is lost
+    later, the thread reconnects, with as many attempts as that takes. It then writes the newest
+    inputs again, unless they are old or the controller was restarted. The buffer holds 60 s of
+    packages; older packages are dropped.
 
     Attributes
     ----------
@@ -321,6 +322,8 @@ class RtdeStream(AbstractContextManager["RtdeStream"]):
         written again on the next connection, unless they are 10 s old by then or the controller was
         restarted. While there is a connection, raises struct.error for a number that its field
         cannot hold, and in an integer field ValueError for NaN and OverflowError for an infinity.
+        Such values stay the newest inputs all the same: if they are written again on a new
+        connection, they end the thread that receives packages.
 
         Parameters
         ----------
