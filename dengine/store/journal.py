@@ -61,7 +61,12 @@ MAGIC = b"dengine journal 2\n"
 MARK = b"\x89rec"  # where a record begins, to find the next one behind a damaged length
 IGNORES_CASE = sys.platform in ("win32", "darwin")  # of names in its usual file systems
 FRAME = struct.Struct("<4sII16s")  # before a record: mark, length, CRC-32, digest
-DAMAGES = (ValueError, LookupError, TypeError)  # of reading a damaged header or head
+DAMAGES = (
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+)  # of reading a damaged header or head
 
 Record = StoredDecision | NewLabel | Event
 
@@ -221,9 +226,7 @@ class Journal:
         LostJournalError
             If the open file is no longer the one at its path, so that nobody would read it.
         StoreError
-            If the disk fails.
-        OSError
-            If the system refuses to look whether the file is still at its path.
+            If the disk fails, or the system refuses to look whether the file is still at its path.
         """
         offsets = []
         framed = bytearray()
@@ -235,11 +238,11 @@ class Journal:
         with _os_errors(self.path):
             self._file.write(framed, self.end)
             self._file.sync()
-        if not self._file.in_place():
-            raise LostJournalError(
-                f"The journal {self.path} was deleted, moved or replaced while it was open; "
-                "leave it."
-            )
+            if not self._file.in_place():
+                raise LostJournalError(
+                    f"The journal {self.path} was deleted, moved or replaced while it was open; "
+                    "leave it."
+                )
         with self._describing:
             self.end += len(framed)
             self.head.n_synced += len(records)
@@ -613,9 +616,9 @@ def _pack_fields(fields: dict[str, Any]) -> bytes:
 def _unpack_fields(content: bytes) -> dict[str, Any]:
     """Return the fields of a header or head, by name; raise one of DAMAGES if it is damaged.
 
-    DAMAGES are ValueError, LookupError and TypeError. The field "newest", which names the newest
-    ledger entry, becomes a pair (number, digest) or None. The CRC-32 is compared only if there is
-    one: headers of earlier releases have none.
+    DAMAGES are ValueError, LookupError, TypeError and AttributeError. The field "newest", which
+    names the newest ledger entry, becomes a pair (number, digest) or None. The CRC-32 is compared
+    only if there is one: headers of earlier releases have none.
     """
     fields = json.loads(content.rstrip(b"\0 "))
     if isinstance(fields, list):
