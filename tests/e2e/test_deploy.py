@@ -67,17 +67,6 @@ def test_the_examples_are_written_by_serve_into_a_new_folder_alone(tmp_path):
     assert (refused.exit_code, "Expected a new or an empty folder" in refused.stderr) == (1, True)
 
 
-def test_the_container_gets_the_wheel_alone_and_the_projects_torch_and_extras():
-    wheel = steps("COPY")[0].split()[0]
-    ignored = (DEPLOY / "Containerfile.dockerignore").read_text(encoding="utf-8")
-    assert re.findall("^[^#].*", ignored, flags=re.M) == ["*", f"!{wheel}"]
-    (install,) = (step for step in steps("RUN") if "pip install" in step)
-    (pinned,) = re.findall("^torch==.*$", (REPO / "constraints.txt").read_text(), flags=re.M)
-    assert f" {pinned} " in install
-    (extras,) = re.findall(rf'"\$\(echo {re.escape(wheel)}\)\[([\w,]+)\]"', install)
-    assert {*extras.split(",")} <= {*PROJECT["optional-dependencies"]}
-
-
 def test_what_the_container_starts_is_an_option_each_of_serve():
     assert json.loads(steps("ENTRYPOINT")[0]) == ["dengine"]
     given = parse(json.loads(steps("CMD")[0]))

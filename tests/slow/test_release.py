@@ -82,17 +82,16 @@ def test_both_files_pass_the_checks_of_the_package_index(distributions):
 @pytest.mark.parametrize(("version", "code"), [("2.13.0", 0), ("2.13.0+cpu", 1)])
 def test_the_lock_refuses_a_build_that_the_public_index_lacks(repo, version, code):
     makefile = (repo / "Makefile").read_text("utf-8")
-    (program,) = re.findall(r"^define LOCKED\n(.*?)^endef$", makefile, flags=re.M | re.S)
+    program = makefile.split("define LOCKED\n")[1].split("\nendef")[0]
     report = (
         '{"install": [{"metadata": {"name": "torch", "version": "VERSION"},'
         ' "download_info": {"archive_info": {"hashes": {"sha256": "1"}}}}]}'
     ).replace("VERSION", version)
-    command = [sys.executable, "-c", program]
-    locked = subprocess.run(command, input=report, capture_output=True, text=True)
-    assert (locked.returncode, locked.stdout) == (
-        code,
-        "" if code else f"torch=={version} --hash=sha256:1\n",
+    locked = subprocess.run(
+        [sys.executable, "-c", program], input=report, capture_output=True, text=True
     )
+    assert locked.returncode == code
+    assert ("--hash=sha256:1" in locked.stdout) is not bool(code)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """The one loop: decide, report, retrain, run, open. Real reducers, real stores, real executors."""
 
+import subprocess
+import sys
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -20,6 +22,7 @@ from dengine import (
     TraceSpec,
 )
 from dengine.errors import SettingError, StoreError
+from dengine.reducers import ConvReducer
 from dengine.store import SqlStore
 from tests.support.driving import RECIPE, Counting, evidence, learn, make
 from tests.support.driving import drive as play
@@ -228,6 +231,35 @@ def test_a_second_thread_in_an_engine_is_refused(data):
             engine.decide(data.X[2])
         leave.set()
         assert deciding.result().action is Action.VERIFY
+
+
+class Slowing(ConvReducer):
+    """Takes, by a clock of its own, 0.02 s for a step and 0.2 s for what comes after the steps."""
+
+    now = 0.0
+
+    def train_step(self, *arguments):
+        Slowing.now += 0.02
+        return super().train_step(*arguments)
+
+    def estimate_statistics(self, x):
+        Slowing.now += 0.2
+        super().estimate_statistics(x)
+
+
+def test_a_retrain_leaves_the_time_that_the_last_one_needed_after_its_steps(data):
+    recipe = replace(RECIPE, reducer=Slowing(folds=2), retrain_every=1000, budget=0.45)
+    engine = DataEngine(recipe=recipe, clock=lambda: Slowing.now)
+    learn(engine, data, range(30))
+    first, second = engine.retrain(), engine.retrain()
+    assert first.seconds > 0.45 >= second.seconds
+    assert second.n_steps == first.n_steps - 4
+
+
+@pytest.mark.slow
+def test_an_engine_that_retrains_itself_has_loaded_what_a_retrain_imports():
+    words = "import dengine, sys; dengine.DataEngine(); assert 'torch._dynamo' in sys.modules"
+    assert subprocess.run([sys.executable, "-c", words]).returncode == 0
 
 
 def test_a_run_begins_once_what_a_retrain_imports_is_loaded(data):
