@@ -52,7 +52,8 @@ NO_RECORDING = re.compile(
 BAG = ".mcap"
 MOST_FILES = 60  # that are read
 MOST_ROWS = 50_000
-MOST_PIECES, LEAST_PARTS = 4, 10  # files with numbered pieces of a part's curve
+MOST_PIECES = 4  # of a part's curve, in files with numbers behind their names
+LEAST_PARTS = 10  # that have such pieces
 Names = Sequence[str]
 
 

@@ -24,7 +24,7 @@ MARKS = " \t;,:=\"'"  # around the words of a line
 
 def without_label(source: LabelSource, path: str) -> str:
     """Return a path without the text that `source.path` finds in it; the whole path if none."""
-    return re.sub(source.path or "$^", lambda match: match[0].replace(match[1], "", 1), path)
+    return re.sub(source.path or "$^", lambda match: match[0].replace(match[1] or "", "", 1), path)
 
 
 def without_suffix(path: str) -> str:

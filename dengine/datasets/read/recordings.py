@@ -81,12 +81,12 @@ def recording_of(
     part = part_of(description.part, table)
     if description.windows.trigger or description.windows.listing:
         part = part or table.path
-    rank = without_label(description.label, table.path) if description.order == "path" else ""
-    if description.order not in ORDERS:
-        rank = table.one_word(description.order, "first")
     label = label_of(labels, table, part)
     if label is None:
         return None
+    rank = without_label(description.label, table.path) if description.order == "path" else ""
+    if description.order not in ORDERS:
+        rank = table.one_word(description.order, "first")
     trace = fitted(samples, seconds, description)
     return Recording(table.source, trace, label, part, lengths[0], start, rank)
 
