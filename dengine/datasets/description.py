@@ -496,8 +496,10 @@ def _made(kind: Any, value: Any, where: str) -> Any:
     """Return a value of a TOML file, converted to `kind`, the annotated type of its key.
 
     A table becomes a dataclass or a dict, and a list a tuple; so does a single value if several are
-    expected. `?` may stand in place of a text, number, boolean or choice. Raises DataError for an
-    unknown key or choice, and for a value of another type; `where` is its name in the message.
+    expected. `?` may stand in place of a text, number, boolean or choice. A number or boolean
+    becomes a text if only a text is expected, and a whole number a float if a number is. Raises
+    DataError for an unknown key or choice, for a value of another type, and for a number that is
+    not finite if a number is expected; `where` is its name in the message.
     """
     origin = get_origin(kind)
     args = get_args(kind)

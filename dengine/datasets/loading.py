@@ -201,7 +201,7 @@ def _is_own_archive(path: Path) -> bool:
     """Return whether a file is an .npz archive with an array X, and numbers y that are all 1 or 0.
 
     A file of another suffix is not opened. Raises DataError for an .npz file that is damaged or
-    cannot be opened; of its arrays only y is read.
+    cannot be opened, or whose y holds Python objects or is too large; of its arrays only y is read.
     """
     if path.suffix.lower() != ".npz":
         return False

@@ -151,12 +151,13 @@ class Corrections:
         retrains may replace it: it is stored as a new version, before the labels are forgotten. A
         baseline is retrained before this returns; if it stays pinned, it is fitted again as a new
         version. A training under way in the executor is discarded, and begins again, even if
-        nothing changes. If a safe mode begins or ends by this,
-        an event is recorded, and `on_safe_mode`, the user's function, is called. Without an
-        executor the call also waits until the features for the next training are computed, if that
-        starts from another model now. A guarantee assumes that the choice of what is forgotten does
-        not depend on the label. The certificate counts a forgotten outcome of a certain decision as
-        wrong, so that forgetting earns nothing.
+        nothing changes; one that is done is put in force or dropped. See the class for what else
+        every change does first, and for the check against the ledger. If a safe mode begins or ends
+        by this, an event is recorded, and `on_safe_mode`, the user's function, is called. Without
+        an executor the call also waits until the features for the next training are computed, if
+        that starts from another model now. A guarantee assumes that the choice of what is forgotten
+        does not depend on the label. The certificate counts a forgotten outcome of a certain
+        decision as wrong, so that forgetting earns nothing.
 
         Parameters
         ----------
@@ -207,9 +208,10 @@ class Corrections:
     def release(self, author: str = "") -> Changed:
         """Let retrains replace again the version that `rollback` pinned.
 
-        The same model goes on, stored as a new version. Labels that came meanwhile count for the
-        next retrain, which may be due at once. A training under way in the executor is discarded,
-        and begins again, even if no version was pinned.
+        First a trained version is put in force or dropped, labels are stored, and news of peers is
+        taken in, even if no version was pinned. The same model goes on, stored as a new version.
+        Labels that came meanwhile count for the next retrain, which may be due at once. A training
+        under way in the executor is discarded, and begins again, even if no version was pinned.
 
         Parameters
         ----------

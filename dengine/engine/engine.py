@@ -281,7 +281,8 @@ class DataEngine(AbstractContextManager["DataEngine"]):
         When it returns, the modules that a retrain imports are loaded, and the features of the
         stored traces, which a retrain would compute first, are computed. If there are labels and no
         version yet, this call begins to compute them, and also has the code for decisions compiled
-        if the model can be compiled; in other cases `Learner.resume` began to.
+        if the model can be compiled; in other cases `Learner.resume` began to. There is no time
+        limit; if the computation fails, that is logged, and nothing is raised.
         """
         self._join_warm_up()
         if self.state.new_labels and not self.version:

@@ -496,7 +496,8 @@ class Learner:
 
         It is logged, and the previous version stays in force. As many labels as its training had
         are added to the count of new ones, so that the next retrain is soon. Its reason is added to
-        `dropped`. Missing steps are then no reason for another training (`retrain_if_due`).
+        `dropped`. Training steps that the time budget cut off are then no reason for another
+        training (`retrain_if_due`).
         """
         log.warning("a retrain was dropped, for it could not be stored: %s", error)
         self._candidate = None

@@ -310,8 +310,8 @@ class CostCurve:
 def policy_name(policy: Policy) -> str:
     """Return a policy's name for people, like "alpha 0.1, LB 95 %" or "pooled, LB 95 %".
 
-    Under the guarantee "cost" it is only "the cost guarantee". A user's own rule is named by its
-    `module:Class`.
+    For a user's own rule it is "module:Class, LB 95 %". Under the guarantee "cost" it is only "the
+    cost guarantee".
     """
     if policy.guarantee == "cost":
         return "the cost guarantee"

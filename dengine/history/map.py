@@ -133,10 +133,11 @@ def _known_marks(
 ) -> list[Mark]:
     """Return a `Mark`, a point of the map, for each of a version's newest references, oldest first.
 
-    There are at most N_KNOWN (250). References whose label this cell did not record, or is damaged,
-    are left out. [] if the version's references are not kept. `parts` maps decision ids to the
-    parts' numbers; the mark of an id that is missing there has no number. Marks of known parts have
-    no action.
+    There are at most N_KNOWN (250). `recipe` is the recipe of that version. Labels are as they were
+    reported. References whose label this cell did not record, or is damaged, are left out; a
+    damaged one is reported by an event in the store. [] if `load_past_version` returns None, as for
+    a version without references; raises what it raises. `parts` maps decision ids to the parts'
+    numbers; the mark of an id that is missing there has no number. These marks have no action.
     """
     past = load_past_version(store, version, recipe, None)
     if past is None:

@@ -133,8 +133,9 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
 
     A label without a point (the embedding of its trace) is left out. An index is full if older
     references have been removed from it for lack of room; each added reference then replaces the
-    oldest. Otherwise there is room for as many as the recipe's training window holds, after which
-    the oldest are replaced, too. The fold of a label is computed from the content hash.
+    oldest. Otherwise there is room for as many as the recipe's training window holds, but at least
+    for the stored ones, after which the oldest are replaced, too. The fold of a label is computed
+    from its `content_hash`, the hash of the part's number, or of the trace if it has none.
     """
     n = stored.state["points"].shape[1]
     spaces = len(stored.state["scale"])

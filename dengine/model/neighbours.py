@@ -636,11 +636,12 @@ class ModelPrediction(EngineModel):
         """Make one labelled trace (channels, samples) a reference in the space of its fold.
 
         The hash of its part, `hash_`, gives the fold, which is also the number of the embedding
-        space. The reference is `point` if given, otherwise the row of `embedding` for that space;
-        without both it is computed from the trace. A full index drops its oldest reference. `y` is
-        1 for success, 0 for failure; `number` is the sequence number of this label. Returns the
-        reference point, float32 (d,), divided by the scale of the space. Raises ValueError if it
-        must be computed and nothing was fitted, otherwise AttributeError if nothing was fitted.
+        space. The reference is `point` if given, otherwise the row of `embedding` for that space,
+        both divided by the scale already; without both it is computed from the trace. A full index
+        drops its oldest reference. `y` is 1 for success, 0 for failure; `number` is the sequence
+        number of this label. Returns the reference point, float32 (d,), divided by the scale of the
+        space. Raises ValueError if it must be computed and nothing was fitted, otherwise
+        AttributeError if nothing was fitted.
         """
         # The fold of a hash is also the space of its reference.
         fold = int(fold_of(np.array([hash_], dtype=np.int64), self.n_spaces)[0])

@@ -85,8 +85,9 @@ def make_reducer(name: str, **params: Any) -> Any:
         A name in `REDUCERS`, or `module:Class`.
     **params
         Parameters of its class. For a name in `REDUCERS` the type of each value must fit the
-        parameter's default, so `random_state` must be an integer, and integers must fit into 32
-        bits; `fit` checks narrower ranges.
+        parameter's default, so `random_state` must be an integer; integers must fit into 32 bits
+        (`folds`: from 2 to 1000), and a number must not be NaN. A parameter whose default is None
+        is not checked. `fit` checks narrower ranges.
 
     Returns
     -------

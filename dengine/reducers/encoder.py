@@ -203,9 +203,9 @@ def count_features(networks: nn.Module, count: int, channels: int, samples: int)
 
     `networks` maps (B, K, channels, samples) to (B, K, features); `count` is K, the number of
     copies. The trial is in evaluation mode, so that no statistics change; afterwards the networks
-    are in training mode. Raises ValueError unless the output, which must be a tensor, holds floats
-    and has three dimensions, three rows and at least one feature. What the networks' `forward`
-    raises is raised as it is; they stay in evaluation mode then.
+    are in training mode. Raises ValueError unless the output holds floats and has three dimensions,
+    three rows and at least one feature, and AttributeError if it is no tensor. What the networks'
+    `forward` raises is raised as it is; they stay in evaluation mode then.
     """
     networks.eval()
     with torch.no_grad():

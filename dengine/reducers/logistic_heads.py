@@ -93,9 +93,9 @@ class RidgeProblem:
     def cholesky_of_hessian(self, k: int, p: Tensor) -> Tensor:
         """Return the lower Cholesky factor of the Hessian of classifier head k.
 
-        The factor is float64 (W + 1, W + 1). The head is a logistic regression, whose Hessian
-        depends on `p` (n,), the probabilities that head k gives. The product of features is
-        computed in float32, since a Newton step may be inexact.
+        The factor is float64 (W + 1, W + 1), for W features and the bias. The head is a logistic
+        regression, whose Hessian depends on `p` (n,), the probabilities that head k gives. The
+        product of features is computed in float32, since a Newton step may be inexact.
         """
         curvature = (self.mask[k] * p * (1.0 - p)).float()
         product = (self.g32 * curvature[:, None]).T @ self.g32  # a step need not be exact

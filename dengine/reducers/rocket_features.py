@@ -279,12 +279,13 @@ class RocketEncoder(nn.Module):
     def learn_filters(self, x: Tensor, rng: np.random.Generator) -> None:
         """Draw the kernels, and set their scales and thresholds from their outputs on traces.
 
-        `x`, float32 (n, C, T), are traces whose channels are scaled by `shift` and `scale`, which
-        must be set before. `rng` draws the kernels: MiniRocket's for tower 1, normal weights less
-        their mean for tower 2. It writes `kernel`, `threshold` and, if there are groups,
-        `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the outputs, from 5
-        to 95 %. A kernel of tower 1 gets a ramp two standard deviations of its outputs wide; those
-        of tower 2 are scaled so that all outputs of a dilation have the deviation 1.
+        `x`, float32 (n, C, T), are traces whose channels the caller has scaled by `shift` and
+        `scale`, which must be set before. `rng` draws the kernels: MiniRocket's for tower 1, normal
+        weights less their mean for tower 2. It writes `kernel`, `threshold` and, if there are
+        groups, `competing_kernel`. Thresholds, which only tower 1 has, are quantiles of the
+        outputs, from 5 to 95 %. A kernel of tower 1 gets a ramp two standard deviations of its
+        outputs wide; those of tower 2 are scaled so that all outputs of a dilation have the
+        deviation 1.
         """
         # `x` is scaled already; averaging is linear, so the scale is taken out again.
         values = self.read_taps(self.average_samples((x - self.shift) / self.scale))  # (C, taps, n)

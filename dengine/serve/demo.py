@@ -29,8 +29,10 @@ async def playing(
 ) -> AsyncIterator[None]:
     """Play recordings through the service in a random order, in a task beside the context's block.
 
-    The task plays each recording once, and is cancelled when the context ends. Its errors are
-    logged (`drive`).
+    The task plays each recording once, and is cancelled when the context ends. It reports the
+    results of verified parts and of line stops, leaves a part or its report out if the queue is
+    full, and waits for retrains during the first `N_FAST` parts. Its errors are logged (see
+    `drive`).
 
     Parameters
     ----------

@@ -351,11 +351,12 @@ class CellService:
         """Let the engine write all that it has recorded to the store, call `work` with the store,
         and return what it returns.
 
-        The writing (`DataEngine.flush`) waits in the queue, and may also put the rule right.
-        Records that the disk or the store does not take in time are missing, without an error.
-        `work` must only read. It runs in another thread over a second connection to the store
-        (`read_store`), or in the engine's thread if the store is in memory. Raises BusyError if the
-        queue is full or the service is closing, and whatever `work` raises.
+        The writing (`DataEngine.flush`) waits in the queue. After a line stop or check that came
+        late it also corrects the rule, and may discard a training or retrain the model. Records
+        that the disk or the store does not take in time are missing, without an error. `work` must
+        only read. It runs in another thread over a second connection to the store (`read_store`),
+        or in the engine's thread if the store is in memory. Raises BusyError if the queue is full
+        or the service is closing, and whatever `work` raises.
         """
         with suppress(NotTakenError):
             await self.call(lambda engine: engine.flush(), read_only=True)

@@ -91,11 +91,12 @@ class RecordInsertion:
     def _insert(self, connection: sa.Connection, records: Sequence[Record]) -> LabelNumbers:
         """Insert the records that are not stored yet; nothing is committed.
 
-        A record that contradicts the store becomes an event, "dead letter". A line stop of a part
-        that had counted as good (`_is_late_stop`) corrects the label of that part. Return one pair
-        (decision id, number) for each decision of which a label is among the records: the number of
-        its first label, whether that is new, was stored before, or is corrected by a late stop. A
-        label that becomes a dead letter has no pair.
+        A record that contradicts the store, or a label whose decision is not stored, becomes an
+        event, "dead letter". No two decisions among the records may have one id. A line stop of a
+        part that had counted as good (`_is_late_stop`) corrects the label of that part, with an
+        event, unless it is a failure already. Return one pair (decision id, number) for each
+        decision that has a label among the records, unless that becomes a dead letter: the number
+        of its first label, whether that is new, was stored before, or is corrected by a late stop.
         """
         events = [record for record in records if isinstance(record, Event)]
         decisions = [record for record in records if isinstance(record, StoredDecision)]

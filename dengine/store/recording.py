@@ -282,9 +282,10 @@ class Recorder:
     def _recreate(self, error: LostJournalError) -> None:
         """Create a new file for a journal whose file was lost; log this, and record an event.
 
-        Records that the database lacks are copied into it. `error` is the text of log and event.
-        Raise StoreError, without an event, if the file cannot be written or another engine has
-        locked it.
+        Records that the database lacks are copied into it from the lost file, which is still open.
+        `error` is the text of log and event. Raise StoreError, after the log line but without an
+        event, if the file cannot be written, another engine has locked it, or the lost file cannot
+        be read; the journal then still uses the lost file.
         """
         log.error("%s It is created again with what the store lacks.", error)
         with self.changed:  # nobody reads it or writes its header meanwhile

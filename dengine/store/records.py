@@ -606,8 +606,9 @@ def _from_column(value: Any, type_: type) -> Any:
     """Return the value of a field from the column that `_to_column` wrote.
 
     `type_` is the type of the field. None stays None, and a value of a str, int or float field is
-    returned unchecked. A tuple must hold sequences, and becomes a tuple of tuples. An array becomes
-    a flat array of float32. Raise ValueError or TypeError for a value that cannot be converted.
+    returned unchecked. A tuple or a dict is read from JSON; a tuple must hold sequences, and
+    becomes a tuple of tuples. An array becomes a flat array of float32. Any other type is called
+    with the value. Raise ValueError or TypeError for a value that cannot be converted.
     """
     if value is None or type_ in (str, int, float):
         return value

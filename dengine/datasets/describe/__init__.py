@@ -211,15 +211,17 @@ def contents_of(p: Proposal) -> dict[str, bytes]:
 
 
 def read_tables(p: Proposal) -> list[Table]:
-    """Return the tables of some of the files `p.names`, at most 60, with the same column names.
+    """Return the tables of some of the files `p.names`, with the same column names.
 
-    Tables with other column names than the most frequent ones, of equal ones the first, are left
-    out. For text files the keys of `[text]` are set in `p` first, and files of another form move
-    from `p.names` to `p.others`. Damaged files are left out, also those with a line that has a
-    wrong number of cells; if there is only one file, such a line is left out instead. `p.is_cut` is
-    set if only the beginning of a file is read. The list is empty if files that are no text cannot
-    be opened. Raises DataError if all files are damaged, if the package that reads them is missing,
-    or if no text file can be opened, is a text and has a header that is certain.
+    At most 60 files are read, spread evenly, and no further file once 2 MB were read. Tables with
+    other column names than the most frequent ones, of equal ones the first, are left out. For text
+    files the keys of `[text]` are set in `p` first, and files of another form move from `p.names`
+    to `p.others`; if two or more of these have at least 8 rows of samples, `exclude` becomes `?`,
+    with a note. Damaged files are left out, also those with a line that has a wrong number of
+    cells; if there is only one file, such a line is left out instead. `p.is_cut` is set if only the
+    beginning of a file is read. The list is empty if files that are no text cannot be opened.
+    Raises DataError if all files are damaged, if the package that reads them is missing, or if no
+    text file can be opened, is a text and has a header that is certain.
     """
     contents = contents_of(p)
     if p.description.format == "text":

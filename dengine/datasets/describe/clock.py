@@ -56,8 +56,9 @@ def propose_clock(p: Proposal) -> None:
     like a date that is the same in all rows of a recording; such a date is not looked for beside a
     clock whose cells tell the day. It is `?`, too, if no column may (`is_clock`), but the columns
     have no names, or one is named `s`, which may be seconds or the stroke. Otherwise, if no column
-    may, it stays empty, and a note says that the rate is unknown. Stated columns are kept; only
-    their forms are found.
+    may, it stays empty, and a note says that the rate is unknown, as it does if none of the stated
+    columns is there. Stated columns are kept; only their forms are found. Raises SettingError for a
+    malformed `windows.trigger`.
     """
     stated = p.description.time.column
     clocks = [column for column in p.columns.values() if is_clock(column)]

@@ -67,7 +67,7 @@ def read_bag(
     description: Description,
     faults: list[Fault],
 ) -> Table:
-    """Return a table with a row for each message that has the channels, in the order of its time.
+    """Return a table with a row for each message that has the channels, in the order of `log_time`.
 
     Its columns are the channels, `log_time`, the time of the log, and `stamp`, that in the
     message's header, 0 without one; both are in nanoseconds. Other topics that the description

@@ -150,7 +150,8 @@ class LabelReader:
         Raises
         ------
         UnreadableError
-            If there are no words for the recording.
+            If there are no words for the recording, or if its rows have different ones and
+            `source.at` is "same".
         DataError
             If `source.path` is no regular expression with one group.
         """
