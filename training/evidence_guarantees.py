@@ -106,7 +106,10 @@ def shuffle_rows(data: Dataset, replays: dict[str, Replay]) -> list[dict[str, An
 
 
 def read_rows(path: Path, commit: str, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """Return the rows of a table that this commit played of other shuffles; none without a file."""
+    """Return the rows of a CSV file of `commit`, but those whose seed is in `seeds`.
+
+    Each seed is a shuffle; those in `seeds` are played anew. The list is empty without a file.
+    """
     if not path.exists():
         return []
     rows = pd.read_csv(path, dtype={"commit": str})

@@ -229,9 +229,12 @@ class Run:
         self._write()
 
     def take_over(self, published: dict[str, Any]) -> None:
-        """Let published parts count as finished, and put their files where later parts continue.
+        """Let the parts of `published`, a manifest as `publish` writes it, count as finished.
 
-        Nothing happens if a part was begun here, which may have taken them over.
+        Their files are copied from the repository into the folders of the parts, where later parts
+        continue them, and the manifest is written. Nothing happens if the manifest here has any
+        part, begun here or taken over before. Raises KeyError for a part that is not in `PARTS`, and
+        FileNotFoundError for a file that is missing in the repository.
         """
         if self.manifest["parts"]:
             return

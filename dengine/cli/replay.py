@@ -622,10 +622,11 @@ def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
     not tried.
     """
     from ..experiments.costs import policy_name
-    from ..folds import content_hash
+    from ..experiments.survey import survey_dataset
 
     lines = [curve.sentence, curve.price_sentence]
-    if repeats := len(dataset) - len({*content_hash(dataset.cube).tolist()}):
+    repeats = survey_dataset(dataset).duplicates
+    if repeats:
         lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
     by_shuffles = [f"{policy_name(row.policy)} {amount(row.cost)}" for row in curve.left_behind]
     if by_shuffles:

@@ -202,8 +202,8 @@ class Policy:
         range, TypeError for a name that is no setting.
         """
         implied: dict[str, Any] = {}
-        has_own = "guarantee" in settings or self.guarantee not in ("local", "pooled")
-        if "prices" in settings and not has_own:
+        has_prices_alone = settings.keys() & {"prices", "guarantee"} == {"prices"}
+        if has_prices_alone and self.guarantee in ("local", "pooled"):
             implied = {"guarantee": "cost", "audit_rate": self.audit_rate or AUDIT_RATE}
         return replace(self, **(implied | settings))
 

@@ -326,7 +326,7 @@ def baseline_class(name: str) -> type[Baseline]:
     """Return the class of a baseline by its name in `BASELINES`, or import it from `module:Class`,
     which runs the module's code.
 
-    Raises SettingError if there is no such name or class, or the class is no `Baseline`.
+    Raises SettingError for an unknown name, a class that cannot be imported, or no `Baseline`.
     """
     kind = import_class(name) if ":" in name else BASELINES.get(name, object)
     if not issubclass(kind, Baseline):

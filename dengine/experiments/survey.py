@@ -5,14 +5,13 @@
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..datasets import Dataset, Fault
 from ..folds import content_hash, trace_hash
 from ..model.neighbours import NEWEST, near_repeats
+from ..records import Ints
 from ..traces import LARGEST, as_traces
 
 
@@ -51,6 +50,8 @@ class Survey:
         Traces that the engine verifies and never learns from.
     not_finite_in : tuple of str
         Files, or rows, of those that are not finite.
+    duplicates : int
+        Usable traces that equal an earlier one, by `content_hash`.
     near_repeats, looked_at : int
         Among the newest `looked_at` usable traces: those that are much nearer to another part's
         trace than parts are to each other.
@@ -76,13 +77,14 @@ class Survey:
     not_finite_in: tuple[str, ...]
     constant: int
     too_large: int
+    duplicates: int
     near_repeats: int
     looked_at: int
     parts: int | None
 
 
 def survey_dataset(data: Dataset) -> Survey:
-    """Count the traces, labels, faults and near repeats of a data set.
+    """Count the traces, labels, faults and repeats of a data set.
 
     Near repeats are looked for among the newest 500 usable traces: finite, not constant, and
     without a sample beyond 1e18. Nothing is trained, and the data set is not changed.
@@ -101,8 +103,10 @@ def survey_dataset(data: Dataset) -> Survey:
     constant = finite & (X.min(axis=(1, 2)) == X.max(axis=(1, 2)))
     too_large = finite & ~constant & (np.abs(X).max(axis=(1, 2)) > LARGEST)
     usable = finite & ~constant & ~too_large
+    n_usable = int(usable.sum())
     parts: list[str | None] = [None] * len(data) if data.part is None else data.part.tolist()
-    pairs = zip(content_hash(X).tolist(), parts, strict=True)
+    hashes = content_hash(X)
+    pairs = zip(hashes.tolist(), parts, strict=True)
     part_hashes = np.array([trace_hash(content, part) for content, part in pairs], dtype=np.int64)
     return Survey(
         **{
@@ -119,13 +123,15 @@ def survey_dataset(data: Dataset) -> Survey:
         not_finite_in=() if data.source is None else tuple(data.source[~finite].tolist()),
         constant=int(constant.sum()),
         too_large=int(too_large.sum()),
+        duplicates=n_usable - len({*hashes[usable].tolist()}),
         near_repeats=near_repeats(X[usable], part_hashes[usable]),
-        looked_at=min(int(usable.sum()), NEWEST),
+        looked_at=min(n_usable, NEWEST),
         parts=None if data.part is None else len(set(parts)),
     )
 
 
-def _spread(values: NDArray[Any] | None) -> Spread | None:
-    """Return the spread of the finite values; None if there is none."""
-    finite = np.empty(0) if values is None else values[np.isfinite(values)]
-    return Spread(*np.quantile(finite, (0.0, 0.5, 1.0)).tolist()) if len(finite) else None
+def _spread(lengths: Ints | None) -> Spread | None:
+    """Return the smallest, median and largest length; None without lengths."""
+    if lengths is None or not len(lengths):
+        return None
+    return Spread(*np.quantile(lengths, (0.0, 0.5, 1.0)).tolist())

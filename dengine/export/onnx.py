@@ -153,9 +153,8 @@ def load_onnx(path: FilePath, *, key: FilePath | None = None) -> "OnnxModel":
     ):  # protobuf's errors have no common base
         properties = {p.key: p.value for p in onnx.load_from_string(content).metadata_props}
         metadata = json.loads(properties[METADATA])
-    metadata = check_schema(metadata, target)
     with instead(ExportError, f"onnxruntime cannot run {target}", Exception):
-        return OnnxModel(content, metadata)
+        return OnnxModel(content, check_schema(metadata, target))
 
 
 def _refuse_unsupported(source: Exportable) -> None:

@@ -650,7 +650,8 @@ class TorchReducer(Reducer):
 
         It is a preprocessed trace whose channels rise from -1 to 1.
         """
-        channels, samples = self.preprocessor_.channels, self.preprocessor_.samples
+        channels = self.preprocessor_.channels
+        samples = self.preprocessor_.samples
         ramp = torch.linspace(-1.0, 1.0, samples).expand(1, self.folds, channels, samples)
         return self.encoder_.embed(ramp).numpy()
 

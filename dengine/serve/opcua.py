@@ -121,7 +121,9 @@ async def _load_identity(server: Server, cert: FilePath, key: FilePath) -> None:
     with instead(
         SettingError,
         f"Cannot use {cert} and {key} for OPC UA",
-        *(OSError, ValueError, TypeError),
+        OSError,
+        ValueError,
+        TypeError,
         do="use PEM files, and a key without a password",
     ):
         await server.load_certificate(os.fspath(cert), "pem")

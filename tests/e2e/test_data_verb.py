@@ -90,6 +90,7 @@ def test_what_is_wrong_with_traces_is_counted(make_data):
     X[52:60] = X[20:28] + np.float32(1e-3)
     survey = survey_dataset(replace(data, X=X, y=y))
     assert (survey.not_finite, survey.constant, survey.too_large) == (1, 1, 1)
+    assert survey.duplicates == 2
     assert 14 <= survey.near_repeats <= 20
     assert survey_dataset(data).near_repeats <= 3
 

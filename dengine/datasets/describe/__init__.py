@@ -161,9 +161,11 @@ def signal_endings(names: Names) -> Names:
     endings = sorted({name[-1] for name in words})
     n_parts = len({name[0] for name in words})
     has_all = n_parts * len(endings) == len(names) and min(n_parts, len(endings)) > 1
-    has_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
-    other = rf"(?i)\b({WORD})\." if has_pieces else rf"(?i)\d|\b({WORD})\."
-    is_other = re.search(other, " ".join(endings)) is not None
+    may_be_pieces = len(endings) <= MOST_PIECES and n_parts >= LEAST_PARTS
+    text = " ".join(endings)
+    is_other = re.search(rf"(?i)\b({WORD})\.", text) or (
+        re.search(r"\d", text) and not may_be_pieces
+    )
     return endings if has_all and not is_other else ()
 
 

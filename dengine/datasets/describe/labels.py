@@ -127,8 +127,8 @@ def may_be_labels(source: LabelSource, words: Names) -> bool:
 
     `words` has the word of each recording, or of each row of a listing. There must be 2 to 12
     different ones, and on average at least two recordings for each. If the source is named like a
-    verdict, 12 words are allowed for any number of recordings, and one word is enough if it is
-    known as good or bad.
+    verdict (`is_named_like_verdict`), the average does not matter, and one word is enough if `good`
+    or `bad`, after `with_meanings`, has a word.
     """
     words = [*words]
     n = len({*words})

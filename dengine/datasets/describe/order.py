@@ -21,11 +21,13 @@ ODD = (
 
 
 def propose_order(p: Proposal) -> None:
-    """Set `order` in `p` to `?`, with a note, if the sorted names need not be the order.
+    """Set `order` in `p` to `?`, with a note, if the file names, sorted, need not be the order.
 
-    That is so if a file name stands in several folders, apart from the words of the label; if each
-    file name has a date, and one of these is not sorted by name, or the names are not in the order
-    of the dates; or if a column without another use has dates in another order.
+    That is so if a file name stands in several folders, once the text of `label.path` is left out;
+    if each file name has a date, and one is written with the day, the month or AM and PM so that
+    names do not sort by it, or the names are not in the order of the dates; or if a column of
+    `p.unused` has one date or time per recording, and these, as `natural_key` sorts texts, are in
+    another order. An `order` that the user stated stays.
     """
     paths = [without_label(p.description.label, without_suffix(name)) for name in p.names]
     names = [path.rpartition("/")[2] for path in paths]

@@ -130,12 +130,12 @@ def _first_row(rows: Rows, width: int) -> int:
     """Return the index of the first row of samples, from 0; 0 if there is none.
 
     `rows` has the cells of each line, of which `width` is the usual number. It is the first of four
-    successive rows, or fewer at the end, that have `width` cells and at least 60 % of the median
-    number of numbers (over all rows but the first third), at least one. Rows directly above it
-    belong to the samples, too, if they have `width` cells and the first is alike but for a number:
-    `0.0,,` above `0.1,5,` (a lost sample), but not `time,force,`. If the first row then has 20
-    numbers or more, each larger than the one before, and the next row has not, it names columns,
-    and the next row is the first.
+    successive rows, or fewer at the end, that have `width` cells and enough numbers: one, and 60 %
+    of the median of the numbers per row. The median leaves out the first third of the rows; a row
+    of another width counts as 0. Rows directly above belong to the samples, too, if they have
+    `width` cells and their first cell differs only by a number and is not empty: `0.0,,` above
+    `0.1,5,` (a lost sample), but not `time,force,`. If the row found is a numbering
+    (`is_numbering`) and the row below it is none, it names columns, and the row below is the first.
     """
     counts = [_count_numbers(row) if len(row) == width else 0 for row in rows]
     least = max(0.6 * float(np.median(counts[len(counts) // 3 :])), 1)
@@ -143,12 +143,15 @@ def _first_row(rows: Rows, width: int) -> int:
     forms = [NUMBER.sub("0", row[0]) if len(row) == width else "" for row in rows]
     while first and "" < forms[first - 1] == forms[first]:
         first -= 1
-    has_names = [is_numbering(row) for row in rows[first : first + 2]]
-    return first + (has_names == [True, False])
+    is_header = [is_numbering(row) for row in rows[first : first + 2]] == [True, False]
+    return first + is_header
 
 
 def is_numbering(cells: Sequence[str]) -> bool:
-    """Return whether 20 cells or more are numbers, each larger than the one before."""
+    """Return whether 20 cells or more are numbers, and all these rise; other cells are ignored.
+
+    They rise as `natural_key` sorts texts: 9, 10, but not 0.25, 0.5 or -2, -1.
+    """
     numbers = [*filter(NUMBER.fullmatch, cells)]
     return len(numbers) >= MOST_NAMES and numbers == sorted({*numbers}, key=natural_key)
 

@@ -21,9 +21,10 @@ Key = list[tuple[int, int, str]]
 
 
 def natural_key(text: str) -> Key:
-    """Return a key that sorts numbers in texts by their size: run_2 before run_10.
+    """Return a key that sorts runs of digits in texts by their size: run_2 before run_10.
 
-    Dates like 31.12.2025 are sorted by year, month and day.
+    Decimals and signs do not count: 0.5 is before 0.25. Dates like 31.12.2025 are sorted by year,
+    month and day.
     """
     text = DATE.sub(r"\3.\2.\1", text)
     pieces = re.split(r"([0-9]+)", text)

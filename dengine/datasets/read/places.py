@@ -23,7 +23,11 @@ MARKS = " \t;,:=\"'"  # around the words of a line
 
 
 def without_label(source: LabelSource, path: str) -> str:
-    """Return a path without the text that `source.path` finds in it; the whole path if none."""
+    """Return a path without the text of the group of `source.path`, removed in each match.
+
+    Without a match, or if `source.path` is "", it is the whole path. Raises re.error if that is no
+    regular expression, and IndexError if it matches but has no group.
+    """
     return re.sub(source.path or "$^", lambda match: match[0].replace(match[1] or "", "", 1), path)
 
 
