@@ -113,7 +113,7 @@ audit: $(VENV)/.dev
 # For a project of one's own: a wheel and an sdist; and what they need with these extras, with versions and hashes, for this
 # version of Python and this system. `===` takes the public index's build of PyTorch, which is found on every machine, and not
 # one like 2.13.0+cpu. An old pip downloads all of it, with CUDA's libraries.
-EXTRAS = serve,files,mcap,onnx,postgres,opcua,ur,sim,dask
+EXTRAS = serve,files,mcap,onnx,postgres,opcua,sim,dask
 dist: $(VENV)/.dev
 	rm -rf dist
 	$(VENV)/bin/python -m build --no-isolation > /dev/null
