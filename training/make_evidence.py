@@ -233,8 +233,8 @@ class Run:
 
         Their files are copied from the repository into the folders of the parts, where later parts
         continue them, and the manifest is written. Nothing happens if the manifest here has any
-        part, begun here or taken over before. Raises KeyError for a part that is not in `PARTS`, and
-        FileNotFoundError for a file that is missing in the repository.
+        part, begun here or taken over before. Raises KeyError for a part that is not in `PARTS`,
+        and FileNotFoundError for a file that is missing in the repository.
         """
         if self.manifest["parts"]:
             return
