@@ -1,7 +1,7 @@
 """The subcommands `dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
 
-All three take the options of `stream_options` for how streams are played. Ctrl-C keeps and shows
-the replays that were finished.
+All three take the options of `stream_options` for how streams are played. After Ctrl-C the first
+two show the replays that were finished.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -34,6 +34,7 @@ from .options import (
 )
 from .output import (
     Out,
+    Record,
     exit_interrupted,
     explain_option,
     format_value,
@@ -77,73 +78,23 @@ class Stream:
     keep: Path | None = None
 
 
-class PlayedTasks(NamedTuple):
-    """The replays that were finished.
+def _play(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Iterator[PlayedReplay]:
+    """Play tasks, each a replay to be played, with a progress bar, and yield each as it ends.
 
-    Attributes
-    ----------
-    replays : list of Replay
-        In the order of their tasks.
-    costs : dict of str to float
-        seconds : wall time. core_seconds : of one core, over all replays. kept : how many replays
-        had been kept by an earlier run.
-    error : BaseException or None
-        The error or Ctrl-C that ended the work early; None if all tasks were played.
-    """
-
-    replays: list[Replay]
-    costs: dict[str, float]
-    error: BaseException | None
-
-
-def _play_tasks(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> PlayedTasks:
-    """Play tasks, each a replay to be played, with a progress bar; return what was finished.
-
-    That is the finished replays in the order of their tasks, and the time they took; kept replays
-    count with the time of the run that played them. Of `stream` the cycles, the number of processes
-    and the folder of kept replays are used. Ctrl-C or an error ends the work and is not raised: the
-    replays that were finished until then are returned, with the error, which the caller must pass
-    to `_end`.
+    Of `stream` the cycles, the number of processes and the folder of kept replays are used. Raises
+    what `iterate_replays` raises.
     """
     from ..experiments.grid import iterate_replays
 
-    played: list[PlayedReplay] = []
-    begin = time.perf_counter()
-    interruption: BaseException | None = None
     n_cycles = len(tasks) * (stream.cycles or len(dataset))
     with progress_bar(f"replaying {dataset.name}", n_cycles) as advance:
         # A callback cannot travel to other processes: there the bar moves by whole replays.
         on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
-        try:
-            for item in iterate_replays(
-                dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
-            ):
-                played.append(item)
-                advance(len(item.replay) if on_cycle is None or item.kept else 0)
-        except (KeyboardInterrupt, Exception) as error:  # what was finished is shown first
-            interruption = error
-    replays = [item.replay for item in sorted(played, key=lambda item: item.position)]
-    costs = {
-        "seconds": time.perf_counter() - begin,
-        "core_seconds": sum(replay.seconds for replay in replays),
-        "kept": sum(item.kept for item in played),
-    }
-    return PlayedTasks(replays, costs, interruption)
-
-
-def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
-    """End the subcommand if an error or Ctrl-C interrupted its replays; do nothing if `error` is
-    None.
-
-    `text` says which replays are shown. After Ctrl-C it is printed to stderr, and the exit code is
-    130. Any other error is raised; before, `text` is printed to stderr if `is_shown`.
-    """
-    if isinstance(error, KeyboardInterrupt):
-        exit_interrupted(text)
-    if error is not None:
-        if is_shown:
-            click.echo(text, err=True)
-        raise error
+        for item in iterate_replays(
+            dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
+        ):
+            advance(len(item.replay) if on_cycle is None or item.kept else 0)
+            yield item
 
 
 _SHUFFLES = "Number of shuffled replays of each recipe."
@@ -326,9 +277,9 @@ def _replay_and_print(
 ) -> None:
     """Play a grid of replays, print tables or one JSON document, and write the files of `out`.
 
-    After Ctrl-C or an error the finished replays are shown, if there are some. Then the process
-    ends with exit code 130, or the error is raised. Errors of the data set or the policies are
-    raised before anything is played.
+    After Ctrl-C or an error the finished replays are shown, if there are some, and a line on stderr
+    says how many. Then the process ends with exit code 130, or the error is raised. Errors of the
+    data set or the policies are raised before anything is played.
 
     Parameters
     ----------
@@ -352,10 +303,22 @@ def _replay_and_print(
     tasks = grid_tasks(
         contenders, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid
     )
-    replays, costs, error = _play_tasks(dataset, tasks, stream)
-    interrupted = f"Interrupted: {len(replays)} of {len(tasks)} replays were finished"
-    if not replays:
-        _end(error, f"{interrupted}; there is nothing to show.", False)
+    played: list[PlayedReplay] = []
+    begin = time.perf_counter()
+    error: BaseException | None = None
+    try:
+        played.extend(_play(dataset, tasks, stream))
+    except (KeyboardInterrupt, Exception) as interruption:  # what was finished is shown first
+        if not played:
+            raise
+        error = interruption
+    played.sort(key=lambda item: item.position)
+    replays = [item.replay for item in played]
+    costs = {
+        "seconds": time.perf_counter() - begin,
+        "core_seconds": sum(replay.seconds for replay in replays),
+        "kept": sum(item.kept for item in played),
+    }
     frame = tables.frame_of(replays, check_seconds)
     rows = tables.pool(frame, replays)
     by_name = _group_replays(replays, lambda replay: replay.name)
@@ -377,14 +340,21 @@ def _replay_and_print(
     print_result(
         record, *parts, out=out, make_files=lambda: dict(_replay_files(frame, replays, title))
     )
-    _end(error, f"{interrupted}; the table shows those.")
+    if error is None:
+        return
+    n_done = f"{len(played)} of {len(tasks)}"
+    text = f"Interrupted: {n_done} replays were finished; the table shows those."
+    if isinstance(error, KeyboardInterrupt):
+        exit_interrupted(text)
+    click.echo(text, err=True)
+    raise error
 
 
 def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
     """Return a sentence: how many replays there are, the wall time and the time of one core that
     they took, and how many of them an earlier run had kept, if any.
 
-    `costs` has these numbers, as in `PlayedTasks`.
+    `costs` has these numbers: seconds, core_seconds and kept.
     """
     seconds = format_value("seconds", costs["seconds"])
     core_seconds = format_value("core_seconds", costs["core_seconds"])
@@ -487,7 +457,6 @@ CURVE_FIELDS = (
     "costs",
     "cycles",
     "shuffles",
-    "fresh",
 )
 
 
@@ -544,48 +513,37 @@ def costs(
     --lower-bound, around break-even, where accepting costs as much as verifying (or those of
     --lower-bounds); a baseline or a rule of your own is tried without pooled and cost. One value
     (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
-    seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
-    replay, ends it and shows what was finished, if at least two shuffles are finished by every
-    policy that is left.
+    seconds of production or money. --out writes costs.csv and costs.png. After Ctrl-C, or an error
+    in a replay, nothing is shown; with --keep the same command continues there.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
-    from ..experiments.costs import PolicySearch, settings_of
+    from ..experiments.costs import cost_curve, settings_of
     from ..experiments.figures import cost_picture
-    from ..experiments.metrics import Costs
     from ..experiments.tables import table_of_numbers
 
     dataset = source.load()
-    search = PolicySearch(
+
+    def play(tasks: Sequence[Task]) -> list[Replay]:
+        """Play tasks with a progress bar, and return their replays in the order of the tasks."""
+        played = sorted(_play(dataset, tasks, stream), key=lambda item: item.position)
+        return [item.replay for item in played]
+
+    curve = cost_curve(
         dataset,
-        choice.make_contender(),
-        Costs(**part_prices),
+        recipe=choice.make_contender(),
         repeats=len(stream.seeds),
         seed=stream.seeds[0],
         cycles=stream.cycles,
+        play=play,
+        **part_prices,
         **lists,
     )
-    error: BaseException | None = None
-
-    def play(tasks: Sequence[Task]) -> list[Replay]:
-        """Play tasks with a progress bar; return the finished replays, and keep what interrupted
-        them in `error`.
-        """
-        nonlocal error
-        played = _play_tasks(dataset, tasks, stream)
-        error = played.error
-        return played.replays
-
-    search.run(play)
-    curve = search.curve()
-    if curve is None:
-        _end(error, "Interrupted: too little was finished; there is nothing to show.", False)
-        return
     check = amount(curve.costs.check)
     verify_all = ("" if curve.policy else ">", "check all", "-", check, check, "100 %", "-", "-")
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
     title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
     lines = _curve_lines(curve, dataset)
-    record = {"data": curve.dataset, "unit": cost_unit, "interrupted": error is not None}
+    record: Record = {"data": curve.dataset, "unit": cost_unit}
     record |= {name: getattr(curve, name) for name in CURVE_FIELDS}
     if curve.policy is not None:
         settings = settings_of(curve.policy)
@@ -610,7 +568,6 @@ def costs(
             "costs.png": cost_picture(curve, unit=cost_unit),
         },
     )
-    _end(error, "Interrupted: what was finished is shown.")
 
 
 def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:

@@ -11,7 +11,7 @@ everything costs `check` per part. A part that an operator's limits reject costs
 that no policy pays by the limits, which are the same under each.
 
 The candidates are values of LB around break-even, 1 - check / escape, and the guarantees "pooled"
-and "cost". `PolicySearch` halves them: all play two shuffles, the cheaper half plays two more, and
+and "cost". `cost_curve` halves them: all play two shuffles, the cheaper half plays two more, and
 so on. The last two play fresh shuffles, which are all that is reported, so that no figure was
 picked for being small. The early rounds replay one engine that checks every part, and play each
 candidate's rule on its scores (`replay_policy`): in replays of their own, which the last two have,
@@ -23,8 +23,7 @@ ends of their intervals, whose unit is the part, and the spread over the shuffle
 
 import math
 from bisect import bisect_left
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -32,7 +31,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import t as student
 
-from ..datasets import load_dataset
+from ..datasets import Dataset, load_dataset
 from ..decision.intervals import normal_quantile, wilson_interval
 from ..decision.policy import AUDIT_RATE, RULES, Policy
 from ..errors import SettingError, amount, expect, percent
@@ -157,9 +156,6 @@ class CostCurve:
         Their names.
     cycles, shuffles : int
         Parts of each shuffle, and number of shuffles that are reported.
-    fresh : bool
-        Whether the reported shuffles are fresh: no policy was chosen by them. False if the search
-        was interrupted before it could play fresh ones.
     """
 
     costs: Costs
@@ -173,7 +169,6 @@ class CostCurve:
     recipe: str
     cycles: int
     shuffles: int
-    fresh: bool
 
     @property
     def policy(self) -> Policy | None:
@@ -239,7 +234,7 @@ class CostCurve:
         pay, how many more parts would show that it pays.
 
         They begin with "Nothing pays" if no policy pays or may pay. They also say if another policy
-        is cheaper, but not significantly, and if the search was interrupted.
+        is cheaper, but not significantly.
         """
         row = self.marked
         cheapest = self.rows[0]
@@ -276,8 +271,6 @@ class CostCurve:
                 f"count as {missing.seen:,}: {missing.recordings:,} more recordings, or "
                 f"{missing.production:,} parts of production {how}."
             )
-        if not self.fresh:
-            text += " The search was not finished: these shuffles also chose the policy."
         return text[0].upper() + text[1:]
 
     @property
@@ -335,186 +328,6 @@ def settings_of(policy: Policy) -> dict[str, Any]:
     if policy.audit_rate != default.audit_rate:
         settings["audit_rate"] = policy.audit_rate
     return settings | ({"stops": "all"} if policy.stops == "all" else {})
-
-
-class PolicySearch:
-    """Finds the policy that pays, by halving.
-
-    Parameters
-    ----------
-    dataset, recipe, alphas, lower_bounds, repeats, seed, cycles
-        As of `cost_curve`.
-    costs : Costs
-
-    Attributes
-    ----------
-    remaining : list of Contender
-        The candidates that were not left behind, each with its policy.
-    out_of_reach : list of str
-        Policies that are not tried, each with the reason.
-
-    Raises
-    ------
-    SettingError
-        A price, a policy, or a number of repeats out of range; recordings of one label, or too few
-        for any policy. More cycles than the recordings have are refused only in `run`.
-    DataError, StoreError
-        A data set that cannot be read, as for `load_dataset`.
-    """
-
-    def __init__(
-        self,
-        dataset: Any,
-        recipe: Any,
-        costs: Costs,
-        *,
-        alphas: Sequence[float] = (),
-        lower_bounds: Sequence[float] = (),
-        repeats: int = REPEATS,
-        seed: int = 0,
-        cycles: int | None = None,
-    ) -> None:
-        data = load_dataset(dataset)
-        contender = Contender.load(recipe)
-        expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
-        expect(
-            costs.check < costs.escape,
-            "a check below an escape",
-            astuple(costs)[:2],
-            "where a bad part costs no more than its check, accept every part unchecked",
-        )
-        expect(
-            costs.false_reject > 0.0,
-            "a false reject that costs something",
-            0,
-            "where a wrong decision costs nothing, there is nothing to check",
-        )
-        expect(
-            0.0 < data.y.mean() < 1.0,
-            "good and bad recordings",
-            f"{int(data.y.sum()):,} good and {int((1 - data.y).sum()):,} bad ones",
-            "record until both have come: one kind does not show what errors cost",
-        )
-        self.costs = costs
-        self._repeats = repeats
-        self._seed = seed
-        self._cycles = len(data) if cycles is None else cycles
-        self.remaining: list[Contender] = []
-        self.out_of_reach: list[str] = []
-        for changes in candidates(contender, costs, alphas, lower_bounds):
-            self._add(contender, changes, self._cycles * float(data.y.mean()))
-        expect(
-            bool(self.remaining),
-            "recordings enough for one policy",
-            len(data),
-            f"this is what they lack: {'; '.join(self.out_of_reach)}",
-        )
-        # Plays the scores of all candidates; a baseline has none.
-        self._scores: Contender | None = None
-        if contender.baseline is None:
-            shadow = Policy(shadow=True, force_limits=contender.recipe.policy.force_limits)
-            self._scores = replace(contender, recipe=replace(contender.recipe, policy=shadow))
-        self._replays: dict[Policy, dict[int, Replay]] = defaultdict(dict)  # by seed
-        self._fresh: set[int] = set()  # seeds of the shuffles that choose nothing
-
-    def _add(self, contender: Contender, changes: dict[str, Any], n_good: float) -> None:
-        """Add a policy to be tried to `remaining`, or to `out_of_reach` a note on why it is not.
-
-        The policy is that of the contender with the settings `changes`. It is not tried if its
-        settings are refused, or if it needs more good parts before it can accept one
-        (`needed_parts`) than `n_good`, the number of good parts that a shuffle plays.
-        """
-        try:
-            candidate = contender.with_policy(**changes)
-        except SettingError as error:
-            self.out_of_reach.append(f"guarantee {changes['guarantee']}: {error}".rstrip("."))
-            return
-        policy = candidate.recipe.policy
-        n_needed = needed_parts(policy)
-        if n_needed > n_good:
-            parts = "accepted parts without a bad one"
-            if policy.guarantee == "local":
-                parts = "good neighbours"
-            self.out_of_reach.append(
-                f"{policy_name(policy)} needs {n_needed:,} {parts}, {n_good:,.0f} good parts are "
-                "played"
-            )
-        else:
-            self.remaining.append(candidate)
-
-    def run(self, play: Play) -> None:
-        """Halve the number of policies in rounds, and let the last two play fresh shuffles.
-
-        Fresh shuffles are those by which no policy was chosen. While more than two policies remain,
-        they play two shuffles (on the scores of one engine that checks every part, unless a
-        baseline plays; see `_play`), and the dearer half (of an odd number the larger half) is
-        removed from `remaining`, until two are left; policies that verified every part count as the
-        dearest. Others are compared by their expected cost over all shuffles so far. The replays
-        are kept in this object, and `curve` computes the result from them. Call this once.
-
-        Parameters
-        ----------
-        play : callable
-            Returns the replays of tasks. If it returns fewer, as after Ctrl-C, these are kept and
-            nothing more is played.
-        """
-        seed = self._seed
-        while len(self.remaining) > N_LAST:
-            if not self._play(play, range(seed, seed + N_SCREENING), self._scores):
-                return
-            self.remaining.sort(key=self._screening_key)
-            del self.remaining[max(N_LAST, len(self.remaining) // 2) :]
-            seed += N_SCREENING
-        fresh = range(seed, seed + self._repeats)
-        self._fresh.update(fresh)
-        self._play(play, fresh, None)
-
-    def _play(self, play: Play, seeds: range, scores: Contender | None) -> bool:
-        """Play the remaining policies, each over a shuffle for each seed, and keep the replays.
-
-        `play` returns the replays of tasks, perhaps not of all. If `scores` is None, each policy
-        has a replay of its own for each seed. Otherwise only `scores`, a contender in shadow mode,
-        is replayed, and the rule of each policy decides on its predictions (`replay_policy`).
-        Returns whether `play` returned as many replays as there were tasks.
-        """
-        players = [scores] if scores else self.remaining
-        tasks = [Task(player, seed, self._cycles) for seed in seeds for player in players]
-        replays = play(tasks)
-        policies = [candidate.recipe.policy for candidate in self.remaining]
-        for replay in replays:
-            for policy in policies if scores else [replay.recipe.policy]:
-                played = replay_policy(replay, policy) if scores else replay
-                self._replays[policy][replay.seed] = played
-        return len(replays) == len(tasks)
-
-    def _screening_key(self, contender: Contender) -> tuple[bool, float]:
-        """Return the key by which policies are sorted: whether every part was verified, and the
-        expected cost (see `PolicyCost`). So policies that verified every part come last.
-        """
-        row = self._row(contender.recipe.policy)
-        return row.accepted + row.rejected == 0.0, row.expected_cost
-
-    def _row(self, policy: Policy) -> PolicyCost:
-        """Return what a part costs under a policy, over all its shuffles."""
-        return _policy_cost(policy, list(self._replays[policy].values()), self.costs)
-
-    def curve(self) -> CostCurve | None:
-        """Return what a part costs under each policy that was played; nothing is played here.
-
-        A shuffle counts if every policy in `remaining` has finished it. The result is computed from
-        the fresh shuffles, which did not choose the policies that play them. If fewer than two of
-        them count, because the search was interrupted, it is computed from the earlier shuffles,
-        and its field `fresh` is False. If fewer than two of these count, too, the result is None.
-        """
-        played = {c.recipe.policy: self._replays[c.recipe.policy] for c in self.remaining}
-        behind = [self._row(policy) for policy in self._replays if policy not in played]
-        seeds = set.intersection(*map(set, played.values()))
-        is_fresh = len(seeds & self._fresh) > 1
-        chosen = sorted(seeds & self._fresh if is_fresh else seeds - self._fresh)
-        if len(chosen) < 2:
-            return None
-        groups = {policy: [by_seed[seed] for seed in chosen] for policy, by_seed in played.items()}
-        return curve_of(groups, self.costs, tuple(behind), tuple(self.out_of_reach), is_fresh)
 
 
 def candidates(
@@ -586,14 +399,22 @@ def cost_curve(
     escape: float,
     false_reject: float,
     recipe: Any = "conv",
+    alphas: Sequence[float] = (),
+    lower_bounds: Sequence[float] = (),
+    repeats: int = REPEATS,
+    seed: int = 0,
+    cycles: int | None = None,
     n_jobs: int = 1,
     keep: FilePath | None = None,
-    **settings: Any,
+    play: Play | None = None,
 ) -> CostCurve:
     """Find the policy that pays by three prices, and what a part costs under it.
 
-    The candidate policies are replayed on shuffles of the recordings, in several rounds that each
-    leave some behind.
+    The candidate policies are replayed on shuffles of the recordings. While there are more than
+    two, they play two shuffles (on the scores of one engine that checks every part, unless a
+    baseline plays), and the dearer half (of an odd number the larger half) is left behind; policies
+    that verified every part count as the dearest. Others are compared by their expected cost over
+    all shuffles so far. The last two play fresh shuffles, by which no policy was chosen.
 
     Parameters
     ----------
@@ -607,17 +428,24 @@ def cost_curve(
         lower_bound and prices of its policy are replaced. If its policy has no audits (checks of
         parts that the model is certain of) and stops="some", the guarantees "pooled" and "cost" get
         an audit rate of 5 %, because they need outcomes of accepted parts.
+    alphas, lower_bounds : sequence of float
+        Values to try; by default 0.1, and values around 1 - check / escape that the number of
+        recordings allows.
+    repeats : int, default 4
+        Fresh shuffles that the last policies play, at least 2.
+    seed : int, default 0
+        Of the first shuffle.
+    cycles : int or None, default None
+        Parts of each shuffle; None plays all.
     n_jobs : int, default 1
         Replays at a time, as joblib counts them. 1 plays in this thread, which then has one torch
         thread.
     keep : path or None, default None
         Folder of finished replays, made if it is missing: those in it are not played again, unless
         their file is damaged, and others are added.
-    **settings
-        alphas, lower_bounds : sequences of float to try; by default 0.1, and values around
-        1 - check / escape that the number of recordings allows. repeats : fresh shuffles that the
-        last policies play, 4, at least 2. seed : of the first shuffle, 0. cycles : parts of each
-        shuffle, by default all.
+    play : callable or None, default None
+        Returns the replays of a list of tasks; `n_jobs` and `keep` are then without effect. None
+        plays them by `play_tasks`.
 
     Returns
     -------
@@ -640,11 +468,128 @@ def cost_curve(
         If the folder `keep` cannot be made.
     """
     data = load_dataset(dataset)
-    search = PolicySearch(data, recipe, Costs(check, escape, false_reject), **settings)
-    search.run(lambda tasks: play_tasks(data, tasks, n_jobs=n_jobs, keep=keep))
-    curve = search.curve()
-    assert curve is not None  # all was played
-    return curve
+    contender = Contender.load(recipe)
+    costs = Costs(check, escape, false_reject)
+    _check_search(data, costs, repeats)
+    n_cycles = len(data) if cycles is None else cycles
+    changes = candidates(contender, costs, alphas, lower_bounds)
+    policies, out_of_reach = _within_reach(contender, changes, n_cycles * float(data.y.mean()))
+    expect(
+        bool(policies),
+        "recordings enough for one policy",
+        len(data),
+        f"this is what they lack: {'; '.join(out_of_reach)}",
+    )
+    play = play or partial(play_tasks, data, n_jobs=n_jobs, keep=keep)
+    screened: dict[Policy, list[Replay]] = {policy: [] for policy in policies}
+
+    def screening_key(policy: Policy) -> tuple[bool, float]:
+        """Return whether every part was verified, so that such policies come last, and the expected
+        cost.
+        """
+        row = _policy_cost(policy, screened[policy], costs)
+        return row.accepted + row.rejected == 0.0, row.expected_cost
+
+    while len(policies) > N_LAST:
+        seeds = range(seed, seed + N_SCREENING)
+        for replay in _screen(play, contender, policies, seeds, n_cycles):
+            screened[replay.recipe.policy].append(replay)
+        policies.sort(key=screening_key)
+        del policies[max(N_LAST, len(policies) // 2) :]
+        seed += N_SCREENING
+    fresh: dict[Policy, list[Replay]] = {policy: [] for policy in policies}
+    seeds = range(seed, seed + repeats)
+    for replay in play(_tasks(contender, policies, seeds, n_cycles)):
+        fresh[replay.recipe.policy].append(replay)
+    left_behind = tuple(
+        _policy_cost(policy, replays, costs)
+        for policy, replays in screened.items()
+        if policy not in fresh
+    )
+    return curve_of(fresh, costs, left_behind, tuple(out_of_reach))
+
+
+def _check_search(data: Dataset, costs: Costs, repeats: int) -> None:
+    """Raise SettingError if no policy can be chosen: by these prices, by recordings of one label,
+    or by fewer than two repeats.
+    """
+    expect(repeats >= 2, "2 or more repeats", repeats, "one says nothing of luck")
+    expect(
+        costs.check < costs.escape,
+        "a check below an escape",
+        astuple(costs)[:2],
+        "where a bad part costs no more than its check, accept every part unchecked",
+    )
+    expect(
+        costs.false_reject > 0.0,
+        "a false reject that costs something",
+        0,
+        "where a wrong decision costs nothing, there is nothing to check",
+    )
+    expect(
+        0.0 < data.y.mean() < 1.0,
+        "good and bad recordings",
+        f"{int(data.y.sum()):,} good and {int((1 - data.y).sum()):,} bad ones",
+        "record until both have come: one kind does not show what errors cost",
+    )
+
+
+def _within_reach(
+    contender: Contender, changes: Iterable[dict[str, Any]], n_good: float
+) -> tuple[list[Policy], list[str]]:
+    """Return the policies to be tried, without repeats, and notes on why others are not tried.
+
+    Each policy is that of the contender with some settings, an item of `changes`. It is not tried
+    if its settings are refused, or if it needs more good parts before it can accept one
+    (`needed_parts`) than `n_good`, the number of good parts that a shuffle plays.
+    """
+    policies: dict[Policy, None] = {}
+    out_of_reach = []
+    for settings in changes:
+        try:
+            policy = contender.with_policy(**settings).recipe.policy
+        except SettingError as error:
+            out_of_reach.append(f"guarantee {settings['guarantee']}: {error}".rstrip("."))
+            continue
+        n_needed = needed_parts(policy)
+        if n_needed > n_good:
+            parts = "accepted parts without a bad one"
+            if policy.guarantee == "local":
+                parts = "good neighbours"
+            out_of_reach.append(
+                f"{policy_name(policy)} needs {n_needed:,} {parts}, {n_good:,.0f} good parts are "
+                "played"
+            )
+        else:
+            policies[policy] = None
+    return list(policies), out_of_reach
+
+
+def _tasks(
+    contender: Contender, policies: Sequence[Policy], seeds: range, cycles: int
+) -> list[Task]:
+    """Return the replays of a contender under each policy, for each seed, as tasks."""
+    players = [
+        replace(contender, recipe=replace(contender.recipe, policy=policy)) for policy in policies
+    ]
+    return [Task(player, seed, cycles) for seed in seeds for player in players]
+
+
+def _screen(
+    play: Play, contender: Contender, policies: Sequence[Policy], seeds: range, cycles: int
+) -> Iterator[Replay]:
+    """Yield a replay of each policy for each seed; its recipe has the policy.
+
+    A contender is replayed in shadow mode, and the rule of each policy decides on its predictions
+    (`replay_policy`). A baseline has no such predictions: each policy has a replay of its own.
+    """
+    if contender.baseline is not None:
+        yield from play(_tasks(contender, policies, seeds, cycles))
+        return
+    shadow = Policy(shadow=True, force_limits=contender.recipe.policy.force_limits)
+    for scores in play(_tasks(contender, [shadow], seeds, cycles)):
+        for policy in policies:
+            yield replay_policy(scores, policy)
 
 
 def curve_of(
@@ -652,15 +597,14 @@ def curve_of(
     costs: Costs,
     left_behind: tuple[PolicyCost, ...] = (),
     out_of_reach: tuple[str, ...] = (),
-    fresh: bool = True,
 ) -> CostCurve:
     """Return what a part costs under some policies at these prices, and which policy to choose.
 
     `groups` has each policy with its replays, all of the same shuffles in the same order. The
     choice is repeated with each price halved and doubled; what changes then is in the field
-    `price_changes` of the result. Three arguments become fields of the result: `left_behind`, the
-    policies that were dearer in earlier shuffles; `out_of_reach`, policies that were not played,
-    each with the reason; and `fresh`, whether no policy was chosen by these shuffles.
+    `price_changes` of the result. Two arguments become fields of the result: `left_behind`, the
+    policies that were dearer in earlier shuffles; and `out_of_reach`, policies that were not
+    played, each with the reason.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
@@ -684,7 +628,6 @@ def curve_of(
         recipe=replays[0].name,
         cycles=len(replays[0]),
         shuffles=len(replays),
-        fresh=fresh,
     )
 
 

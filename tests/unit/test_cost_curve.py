@@ -14,7 +14,6 @@ from dengine import Policy, Recipe
 from dengine.errors import SettingError
 from dengine.experiments.costs import (
     CostCurve,
-    PolicySearch,
     candidates,
     cost_curve,
     curve_of,
@@ -209,33 +208,25 @@ def test_the_cheaper_half_plays_on_and_the_last_two_report_on_shuffles_that_chos
         seeds.append([task.seed for task in tasks])
         return cheaper_by_level(tasks)
 
-    search = PolicySearch(data, "knn", COSTS, lower_bounds=BOUNDS, alphas=(0.2,), repeats=3, seed=7)
-    search.run(play)
+    result = cost_curve(
+        data,
+        recipe="knn",
+        lower_bounds=BOUNDS,
+        alphas=(0.2,),
+        repeats=3,
+        seed=7,
+        play=play,
+        **PRICES,
+    )
     assert [(len(item), {*item}) for item in seeds] == [
         (12, {7, 8}),
         (6, {9, 10}),
         (6, {11, 12, 13}),
     ]
-    result = search.curve()
     assert [row.policy.lower_bound for row in result.rows] == [0.6, 0.7]
     assert len(result.left_behind) == 4
-    assert (result.shuffles, result.fresh) == (3, True)
+    assert result.shuffles == 3
     assert result.to_frame()["reported"].sum() == 2
-
-
-@pytest.mark.parametrize(("n_rounds", "fresh"), [(0, None), (1, False), (2, False)])
-def test_a_search_that_is_interrupted_shows_what_was_finished(n_rounds, fresh, data):
-    rounds = []
-
-    def play(tasks: Sequence[Task]) -> list[Replay]:
-        rounds.append(tasks)
-        return cheaper_by_level(tasks if len(rounds) <= n_rounds else tasks[:1])
-
-    search = PolicySearch(data, "knn", COSTS, lower_bounds=BOUNDS)
-    search.run(play)
-    result = search.curve()
-    assert (result and result.fresh) is fresh
-    assert not result or "these shuffles also chose the policy" in result.sentence
 
 
 @pytest.mark.parametrize(
