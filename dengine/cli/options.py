@@ -57,8 +57,8 @@ def names_of(kind: str) -> tuple[str, ...]:
     Parameters
     ----------
     kind : str
-        guarantee, interval, stops, recipe, baseline, method (recipes and baselines), fit (what is
-        done with live traces of another length), label, action or reason. Any other is a KeyError.
+        guarantee, interval, stops, recipe, method (recipes and baselines), fit (what is done with
+        live traces of another length), label, action or reason. Any other is a KeyError.
     """
     from ..decision.intervals import INTERVALS
     from ..decision.policy import RULES, Stops
@@ -72,7 +72,6 @@ def names_of(kind: str) -> tuple[str, ...]:
         "interval": INTERVALS,
         "stops": get_args(Stops),
         "recipe": RECIPES,
-        "baseline": BASELINES,
         "method": [*RECIPES, *BASELINES],
         "fit": FITS,
         "label": LABELS,
@@ -271,10 +270,18 @@ class RecipeChoice:
     name: str | None
     settings: Options
 
-    def load(self, base: Any = "conv") -> Recipe:
-        """Return the recipe that the user named, with the settings that the user gave.
+    def load_if_given(self) -> Recipe | None:
+        """Return the recipe if a name or a setting was given; None means the store's own recipe.
 
-        If no name was given, `base` is taken, which is anything that `Recipe.load` takes.
+        The recipe is conv if only settings were given. Raises SettingError like `make_contender`.
+        """
+        return self.make_contender().recipe if self.name or self.settings else None
+
+    def make_contender(self) -> Contender:
+        """Return who plays a replay: a `Contender`, which is a recipe or a baseline with its name.
+
+        It is what `Contender.load` returns for the name, or for conv without one, with the settings
+        that were given. Its name is shortened, as `short_name` does.
 
         Raises
         ------
@@ -283,37 +290,17 @@ class RecipeChoice:
             This is checked here, before a store is created; a reducer of the user's own, given as
             module:Class, is imported for that, but a rule of the user's own is not.
         """
-        from ..recipe import Recipe
+        from ..experiments.replay import Contender
         from ..reducers import REDUCERS, reducer_class
 
+        name = self.name or "conv"
+        contender = Contender.load(name)
         policy = {name: value for name, value in self.settings.items() if name != "novelty"}
-        recipe = Recipe.load(self.name or base).with_policy(**policy)
+        recipe = contender.recipe.with_policy(**policy)
         recipe = recipe.with_settings(novelty=self.settings.get("novelty"))
         if recipe.reducer not in REDUCERS:
             reducer_class(recipe.reducer)
-        return recipe
-
-    def load_if_given(self) -> Recipe | None:
-        """Return the recipe if a name or a setting was given; None means the store's own recipe.
-
-        Raises SettingError like `load`.
-        """
-        return self.load() if self.name or self.settings else None
-
-    def make_contender(self) -> Contender:
-        """Return who plays a replay: a `Contender`, which is a recipe or a baseline with its name.
-
-        It is the baseline if the name is that of a baseline, and otherwise the recipe that `load`
-        returns. Both get the settings that were given. Without a name it is the recipe conv. A
-        recipe's name is shortened, as `short_name` does. Raises SettingError like `load`.
-        """
-        from ..experiments.replay import Contender
-
-        if self.name in names_of("baseline"):
-            baseline = Contender.load(self.name)
-            recipe = RecipeChoice(None, self.settings).load(baseline.recipe)
-            return replace(baseline, recipe=recipe)
-        return Contender(short_name(self.name or "conv"), self.load())
+        return replace(contender, name=short_name(name), recipe=recipe)
 
 
 # No option of a policy has a default here: the recipe, or the store, has it.

@@ -25,7 +25,6 @@ from .output import (
     exit_interrupted,
     explain_option,
     field_rows,
-    format_value,
     interruptible_steps,
     legend_or_hint,
     print_result,
@@ -200,11 +199,11 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
             suppress(StepInterruptedError, KeyboardInterrupt),
             interruptible_steps(name, cycles) as count,
         ):
-            for item in observe_cycles(engine, cell, cycles):
-                observed.append(item)
-                if item.cycle.safe_mode != reason:
-                    reason = item.cycle.safe_mode
-                    changes.append({"cycle": item.cycle.index + 1, "reason": reason})
+            for cycle, truth in observe_cycles(engine, cell, cycles):
+                observed.append((cycle, truth))
+                if cycle.safe_mode != reason:
+                    reason = cycle.safe_mode
+                    changes.append({"cycle": cycle.index + 1, "reason": reason})
                     if not as_json():
                         click.echo(_safe_mode_line(changes[-1]), err=True)
                 count(1)  # may end the run here, between two cycles
@@ -354,8 +353,7 @@ CAPTION = (
     "FP: bad parts accepted; stops: those of them that stopped the system. FN: good parts "
     "rejected. FP and FN count as far as the cell tells the truth about parts that were not "
     "verified. novel: parts verified because they are unlike all known ones; safe: cycles of safe "
-    "mode; outside: parts beyond the force limits, verified or rejected; good/h: good parts passed "
-    "on per hour."
+    "mode; outside: parts beyond the force limits, verified or rejected."
 )
 COLUMNS = {  # title -> count of a stretch
     "accepted": "accepted",
@@ -427,9 +425,8 @@ def _print_run(replay: Replay, record: Record, cell: Any, out: Out | None) -> No
 def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict[str, str]:
     """Return a table row, title -> cell, for the counts of a stretch of cycles.
 
-    `stretch` and `total`, the counts of the whole run, are as `Replay.stretch` returns them. Two
-    columns are left out if they say nothing in the whole run: parts outside the force limits, if
-    there were none, and good parts per hour, if the cell has no clock.
+    `stretch` and `total`, the counts of the whole run, are as `Replay.stretch` returns them. Parts
+    outside the force limits have no column if there were none in the whole run.
     """
     cells = {
         "cycles": f"{stretch['first_cycle']} to {stretch['last_cycle']}",
@@ -438,6 +435,4 @@ def _stretch_cells(stretch: Mapping[str, Any], total: Mapping[str, Any]) -> dict
     for title, name in COLUMNS.items():
         if name != "outside" or total[name]:
             cells[title] = str(stretch[name])
-    if total["parts_per_hour"] is not None:
-        cells["good/h"] = format_value("", stretch["parts_per_hour"])
     return cells

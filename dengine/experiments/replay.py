@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
 Bools = NDArray[np.bool_]
 Row = dict[str, Any]  # of a table, by column
+ObservedCycle = tuple[Cycle, float]  # a finished cycle, and whether the part was good
 # Fields of a decision that a replay keeps -> their type in its arrays.
 DECISION_FIELDS: dict[str, Any] = {
     "action": np.str_,
@@ -71,6 +72,10 @@ COUNTED = (
     "safe_mode",
     "outside",
 )
+
+
+# Settings of a policy that are columns of tables.
+POLICY_COLUMNS = ("interval", "alpha", "lower_bound", "guarantee", "stops")
 
 
 @dataclass(frozen=True)
@@ -171,8 +176,6 @@ class Replay:
         Of the model; 0 before the first retrain.
     safe_mode : array of bool, shape (n,)
         After this cycle every part is verified, whatever the model says.
-    clock_s : array of float, shape (n,), or None
-        Seconds of production when the cycle was done; None for a cell without a clock.
     retrains : tuple of RetrainReport
         Those that ended in this run.
     recipe : Recipe
@@ -204,7 +207,6 @@ class Replay:
     reason: NDArray[np.str_]
     version: Ints
     safe_mode: Bools
-    clock_s: Floats | None = None
     retrains: tuple[RetrainReport, ...] = ()
     recipe: Recipe = field(default_factory=Recipe)
     name: str = ""
@@ -218,13 +220,10 @@ class Replay:
         return len(self.action)
 
     def __repr__(self) -> str:
-        where = f" on {self.dataset}, seed {self.seed}" if self.dataset else ""
         counts = self.stretch()
         summary = ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in COUNTED[:5])
-        if self.dropped:
-            summary += f"; {len(self.dropped)} retrains dropped, the last {self.dropped[-1]}"
         cycles = f"{self.recipe.policy.summary}, {len(self)} cycles"
-        return f"<Replay of {self.name or 'a run'}{where}: {cycles}, {summary}>"
+        return f"<Replay of {self.name}: {cycles}, {summary}>"
 
     @property
     def dropped(self) -> list[str]:
@@ -269,11 +268,6 @@ class Replay:
         """The trace left an operator's limits: the model was not asked; (n,) bool."""
         return np.asarray(self.reason == Reason.OUTSIDE)
 
-    @property
-    def finished(self) -> Bools:
-        """A good part was passed on, as far as the truth is known; (n,) bool."""
-        return np.asarray((self.action != Action.REJECT) & (self.truth == 1.0))
-
     def to_frame(self) -> "pd.DataFrame":
         """Return a DataFrame with a row for each cycle, numbered from 1.
 
@@ -317,27 +311,16 @@ class Replay:
             of cycles: verified, accepted, rejected (by the model), false_positive (accepted and
             bad), false_negative (rejected and good), novel (verified as novel), safe_mode (after
             which every part is verified), outside (the trace left the force limits), and stops, the
-            line stops. parts_per_hour, the good parts passed on per hour: None if the cell has no
-            clock, no time passed, or there is no cycle. The time of the first cycle of the run
-            begins at 0 of the cell's clock.
+            line stops.
         """
         begin, end, _ = cycles.indices(len(self))
         counts = {name: int(getattr(self, name)[cycles].sum()) for name in COUNTED}
-        share = float("nan")
-        rate = None
-        if end > begin:
-            share = counts["verified"] / (end - begin)
-            if self.clock_s is not None:
-                seconds = np.diff(self.clock_s, prepend=0.0)[begin:end].sum()
-                if seconds > 0:
-                    rate = float(3600.0 * self.finished[cycles].sum() / seconds)
         return {
             "first_cycle": begin + 1,
             "last_cycle": end,
-            "verified_share": share,
+            "verified_share": counts["verified"] / (end - begin) if end > begin else float("nan"),
             **counts,
             "stops": int(self.stopped[cycles].sum()),
-            "parts_per_hour": rate,
         }
 
     def summary(self, check_seconds: float = VERIFY_SECONDS) -> dict[str, Any]:
@@ -390,11 +373,7 @@ class Replay:
             first_certain = float(np.argmax(self.accepted | self.rejected) + 1)
         return {
             "recipe": self.name,
-            "interval": policy.interval,
-            "alpha": policy.alpha,
-            "lower_bound": policy.lower_bound,
-            "guarantee": policy.guarantee,
-            "stops": policy.stops,
+            **{name: getattr(policy, name) for name in POLICY_COLUMNS},
             "confirm": self.confirm,
             "seed": self.seed,
             "cycles": len(self),
@@ -417,36 +396,17 @@ class Replay:
         }
 
 
-class ObservedCycle(NamedTuple):
-    """A finished cycle, with what its cell tells beside it.
-
-    Attributes
-    ----------
-    cycle : Cycle
-    truth : float
-        1.0 good, 0.0 bad, NaN if the cell does not tell.
-    clock : float or None
-        Seconds of production; None for a cell without a clock.
-    """
-
-    cycle: Cycle
-    truth: float
-    clock: float | None
-
-
 def observe_cycles(engine: DataEngine, cell: Cell, cycles: int) -> Iterator[ObservedCycle]:
     """Let the engine drive a cell for a number of cycles, and yield each cycle as it ends.
 
-    With the cycle come the truth, whether the part was good, and the clock, the seconds of
-    production. The truth is the cell's attribute `truth` if it has this attribute (NaN for None),
-    otherwise the label that was reported, or NaN if none was. The clock is the cell's attribute
-    `clock`, or None. Raises what `DataEngine.run` raises. An exception of the cell is raised, too,
-    after the engine has written its decisions and labels.
+    With the cycle comes the truth: 1.0 if the part was good, 0.0 if it was bad. It is the cell's
+    attribute `truth` if it has this attribute (NaN for None), otherwise the label that was
+    reported, or NaN if none was. Raises what `DataEngine.run` raises. An exception of the cell is
+    raised, too, after the engine has written its decisions and labels.
     """
     for cycle in engine.run(cell, cycles):
         truth = getattr(cell, "truth", cycle.success)
-        truth = float("nan") if truth is None else float(truth)
-        yield ObservedCycle(cycle, truth, getattr(cell, "clock", None))
+        yield cycle, float("nan") if truth is None else float(truth)
 
 
 def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
@@ -454,24 +414,21 @@ def to_replay(observed: Sequence[ObservedCycle], recipe: Recipe) -> Replay:
 
     `recipe` is the recipe of the engine that drove the cell. The fields that only a replay of a
     recorded data set has (`index`, `dataset`, `seed`, `confirm`, `seconds`) keep their defaults.
-    Either all cycles have a clock or none has.
     """
-    cycles = [item.cycle for item in observed]
+    cycles = [cycle for cycle, _ in observed]
     decisions = [cycle.decision for cycle in cycles]
-    clocks = [item.clock for item in observed if item.clock is not None]
     arrays: dict[str, Any] = {
         name: np.array([getattr(decision, name) for decision in decisions], dtype=dtype)
         for name, dtype in DECISION_FIELDS.items()
     }
     stopped = [cycle.outcome is Outcome.STOPPED for cycle in cycles]
     return Replay(
-        truth=np.array([item.truth for item in observed], dtype=np.float64),
+        truth=np.array([truth for _, truth in observed], dtype=np.float64),
         position=_positions(decisions),
         decide_seconds=np.array([cycle.decide_seconds for cycle in cycles], dtype=np.float64),
         stopped=np.array(stopped, dtype=np.bool_),
         version=np.array([decision.model_version for decision in decisions], dtype=np.int64),
         safe_mode=np.array([cycle.safe_mode != "" for cycle in cycles], dtype=np.bool_),
-        clock_s=np.array(clocks, dtype=np.float64) if clocks else None,
         retrains=tuple(cycle.retrain for cycle in cycles if cycle.retrain is not None),
         recipe=recipe,
         name=recipe.name,
@@ -524,7 +481,7 @@ def watch(
     for item in observe_cycles(engine, cell, cycles):
         observed.append(item)
         if on_cycle is not None:
-            on_cycle(item.cycle)
+            on_cycle(item[0])
     return to_replay(observed, engine.recipe)
 
 
@@ -604,11 +561,8 @@ def replay(
     order = order[:n_cycles]
     engine: DataEngine = recipe if contender is None else contender.engine(seed, data.spec)
 
-    def report(cycle: Cycle) -> None:
-        if on_cycle is not None:
-            on_cycle(cycle.index + 1)
-
     begin = time.perf_counter()
+    report = None if on_cycle is None else lambda cycle: on_cycle(cycle.index + 1)
     run = watch(engine, ReplayCell(data, order, confirm), n_cycles, report)
     return replace(
         run,

@@ -17,14 +17,14 @@ from ..errors import percent
 from ..files import write_output
 from ..records import RetrainReport
 from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
-from .replay import Replay, Row
+from .replay import POLICY_COLUMNS, Replay, Row
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
 # Columns by which replays are pooled, and those that are counts.
-CONDITION = ["recipe", "interval", "alpha", "lower_bound", "guarantee", "stops"]
+CONDITION = ["recipe", *POLICY_COLUMNS]
 COUNTS = [
     "certain",
     "accepted",

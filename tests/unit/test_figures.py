@@ -100,14 +100,11 @@ TRUTH = [1.0] * 59 + [0.0] + [1.0] * 29 + [0.0] * 10 + [1.0]
 LOG = by_hand(ACTIONS, TRUTH, stopped=np.arange(100) == 89)
 
 
-def test_a_run_is_summed_up_by_stretches_that_add_up_and_by_an_hour_where_there_is_a_clock():
-    log = replace(LOG, clock_s=np.cumsum(np.full(100, 36.0)))
-    total, parts = log.stretch(), log.stretches(7)
+def test_a_run_is_summed_up_by_stretches_that_add_up():
+    total, parts = LOG.stretch(), LOG.stretches(7)
     for name in ("verified", "accepted", "rejected", "false_positive", "false_negative", "stops"):
         assert total[name] == sum(part[name] for part in parts)
     assert (total["false_positive"], total["false_negative"], total["stops"]) == (1, 1, 1)
-    assert total["parts_per_hour"] == pytest.approx(88.0)  # 59 verified and 29 accepted good ones
-    assert LOG.stretch()["parts_per_hour"] is None
 
 
 UNTRAINED = replay_of(["verify"] * 5, [1] * 5, position=np.full((5, 2), np.nan))
