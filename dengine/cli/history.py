@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from heapq import merge
 from typing import TYPE_CHECKING, Any
@@ -96,14 +96,13 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     type=Moment(),
     help="Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.",
 )
-@click.option("--until", type=Moment(), help="Only decisions before then, given as for --since.")
 @click.option("--events", is_flag=True, help="Show the retrains and events between them too.")
 def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
     STORE is the file or URL of an engine's store, and must exist. The options choose which
     decisions; --events adds the retrains and events since the first of these decisions (if no
-    decision fits, all), or since --since, and before --until. In the table good and bad are the
+    decision fits, all), or since --since. In the table good and bad are the
     labels that were counted, bound is the interval of the success rate that follows from them, v is
     the version of the model, and label is what the part turned out to be. If there is nothing to
     list, a sentence says so. `dengine explain` tells more about one decision.
@@ -121,14 +120,12 @@ def history(store: str, events: bool, **criteria: Any) -> None:
         if events:
             others["retrains"] = opened.versions.all(cell_only=True)
             others["events"] = opened.events.newest()
-    first = since or 0.0
-    end = math.inf if criteria["until"] is None else criteria["until"]
     for name, items in others.items():
-        others[name] = [item for item in items if first <= item.time < end]
+        others[name] = [item for item in items if item.time >= (since or 0.0)]
     rows = [to_jsonable(decision) | {"label": decision.label} for decision in decisions]
     record = {"store": store, "decisions": rows} | others
     in_order = merge(*others.values(), decisions, key=lambda item: item.time)
-    print_result(record, _history_table(in_order))
+    print_result(record, _history_table(list(in_order)))
 
 
 def _label_text(stored: StoredDecision) -> str:
@@ -175,7 +172,7 @@ COLUMNS: dict[str, Callable[[StoredDecision], str]] = {
 }
 
 
-def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> str:
+def _history_table(items: Sequence[StoredDecision | StoredVersion | Event]) -> str:
     """Return a table of decisions as text, in the order of the items.
 
     It has a row for each decision, with the columns in `COLUMNS`, from its time to its label.
@@ -184,23 +181,23 @@ def _history_table(items: Iterable[StoredDecision | StoredVersion | Event]) -> s
     """
     from ..store.records import StoredDecision
 
-    lines: list[str | list[str]] = []
+    if not items:
+        return "No decision of that kind."
+    decisions = [item for item in items if isinstance(item, StoredDecision)]
+    columns = []
+    for name, cell in COLUMNS.items():
+        texts = [name[1:], *map(cell, decisions)]
+        width = max(map(len, texts))
+        texts.insert(1, "-" * width)
+        columns.append([f"{text:{name[0]}{width}}" for text in texts])
+    rows = ("  ".join(row).rstrip() for row in zip(*columns, strict=True))
+    lines = [next(rows), next(rows)]
     for item in items:
         if isinstance(item, StoredDecision):
-            lines.append([cell(item) for cell in COLUMNS.values()])
+            lines.append(next(rows))
         else:
             lines.append(_event_line(item)[: TABLE_WIDTH - 1])
-    if not lines:
-        return "No decision of that kind."
-    titles = [name[1:] for name in COLUMNS]
-    rows = [titles, *(line for line in lines if isinstance(line, list))]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    cells = [f"{{:{name[0]}{width}}}" for name, width in zip(COLUMNS, widths, strict=True)]
-    row_format = "  ".join(cells)
-    lines = [titles, ["-" * width for width in widths], *lines]
-    return "\n".join(
-        line if isinstance(line, str) else row_format.format(*line).rstrip() for line in lines
-    )
+    return "\n".join(lines)
 
 
 def _event_line(item: StoredVersion | Event) -> str:

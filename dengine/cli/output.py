@@ -89,10 +89,8 @@ class Out:
     force: bool = False
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
-        """Write files into the folder `path`, and a manifest that lists them; return their paths.
-
-        The folder is created if it is missing. If one of the files is `path` itself, there is no
-        manifest.
+        """Write files into the folder `path`, which is created if it is missing; return their
+        paths.
 
         Parameters
         ----------
@@ -102,32 +100,25 @@ class Out:
         Returns
         -------
         paths : list of Path
-            Of the files that were written, the manifest last.
+            Of the files that were written.
 
         Raises
         ------
         OutputError
             A file exists and `force` is not set, it cannot be written, or no format of figures has
             its suffix. The files before it in `contents` are written already.
-        OSError
-            A file cannot be read again for its checksum in the manifest.
         """
         from matplotlib.figure import Figure
 
         from ..experiments.figures import save
         from ..experiments.tables import write_csv
-        from ..files import write_manifest
 
-        paths = []
-        for name, content in contents.items():
-            path = self.path / name
-            if isinstance(content, Figure):
-                paths.append(save(content, path, force=self.force))
-            else:
-                paths.append(write_csv(content, path, self.force))
-        if "" not in contents:
-            paths.append(write_manifest(self.path, paths, self.force))
-        return paths
+        return [
+            save(content, self.path / name, force=self.force)
+            if isinstance(content, Figure)
+            else write_csv(content, self.path / name, self.force)
+            for name, content in contents.items()
+        ]
 
 
 def print_result(
@@ -363,22 +354,9 @@ def progress_bar(label: str, total: int | None) -> Iterator[Callable[[int], None
             yield advance
         return
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import MofNCompleteColumn, Progress
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(without_password(label), total=total)
         yield lambda n: bar.advance(task, n)

@@ -6,10 +6,10 @@ two show the replays that were finished.
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,6 @@ from .options import (
     COUNT,
     LOWER_BOUND,
     OWN_RECIPE,
-    OWN_RULE,
     CommaList,
     DataChoice,
     NameChoice,
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..datasets import Dataset
-    from ..experiments.costs import CostCurve, PolicyCost
+    from ..experiments.costs import PolicyCost
     from ..experiments.grid import PlayedReplay, Task
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
@@ -174,9 +173,6 @@ GRID_LISTS = {
 POLICY_LISTS = GRID_LISTS | {
     "intervals": click.option(
         "--intervals", type=CommaList(NameChoice("interval")), help="Names to try."
-    ),
-    "guarantees": click.option(
-        "--guarantees", type=CommaList(NameChoice("guarantee", OWN_RULE)), help="Names to try."
     ),
 }
 
@@ -322,7 +318,7 @@ def _replay_and_print(
     frame = tables.frame_of(replays, check_seconds)
     rows = tables.pool(frame, replays)
     by_name = _group_replays(replays, lambda replay: replay.name)
-    title = _title(dataset.name, by_name, not stream.shuffle)
+    title = _title(dataset.name, replays, by_name, not stream.shuffle)
     record = {
         "data": dataset.name,
         "in_order": not stream.shuffle,
@@ -365,31 +361,21 @@ def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
 def _group_replays(
     replays: Sequence[Replay], key: Callable[[Replay], str]
 ) -> dict[str, list[Replay]]:
-    """Return a dict: `key(replay)` -> the replays with this key, in their order.
-
-    The keys stand in the order of their first replay.
-    """
-    groups: dict[str, list[Replay]] = {}
-    for replay in replays:
-        groups.setdefault(key(replay), []).append(replay)
-    return groups
+    """Return a dict: `key(replay)` -> the replays with this key, which follow each other."""
+    return {name: list(group) for name, group in groupby(replays, key)}
 
 
-def _title(data: str, by_name: Mapping[str, list[Replay]], in_order: bool) -> str:
+def _title(data: str, replays: Sequence[Replay], names: Iterable[str], in_order: bool) -> str:
     """Return the title of tables and pictures.
 
-    It names the recipes and baselines (the keys of `by_name`), the data set, the order of the parts
-    (recorded if `in_order`, else shuffled), the number of seeds that each played, and the number of
-    cycles, of the first replay. The bundled data set is called "simulated insertions". There must
-    be at least one replay.
+    It names the recipes and baselines (`names`), the data set, the order of the parts (recorded if
+    `in_order`, else shuffled), the number of seeds, and the number of cycles of a replay. The
+    bundled data set is called "simulated insertions". There must be at least one replay.
     """
-    counts = sorted({len({replay.seed for replay in group}) for group in by_name.values()})
-    n_cycles = len(next(iter(by_name.values()))[0])
     order = "in recorded order" if in_order else "shuffled"
     dataset = "simulated insertions" if data == "insertion" else data
-    plural = "s" if counts[-1] > 1 else ""
-    repeats = f"{' or '.join(map(str, counts))} replay{plural} of {n_cycles} cycles"
-    return f"{', '.join(by_name)} on {dataset}, {order}, {repeats}"
+    repeats = counted(len({replay.seed for replay in replays}), "replay")
+    return f"{', '.join(names)} on {dataset}, {order}, {repeats} of {len(replays[0])} cycles"
 
 
 def _replay_files(
@@ -411,13 +397,8 @@ def _replay_files(
     yield "curves.png", curves(groups, title)
     for name, (first, *_) in _group_replays(replays, lambda replay: replay.name).items():
         if not np.isnan(first.position).all():  # baselines embed nothing
-            # In characters that every file system takes.
-            yield (
-                re.sub(r"[^\w.=-]+", "_", f"map_{name}") + ".png",
-                embedding_map(
-                    first, title=f"{name}, newest parts of one replay (seed {first.seed})"
-                ),
-            )
+            map_title = f"{name}, newest parts of one replay (seed {first.seed})"
+            yield f"map_{name}.png", embedding_map(first, map_title)
 
 
 def _row_name(replay: Replay, frame: pd.DataFrame) -> str:
@@ -482,9 +463,6 @@ PRICES = {
 )
 @options.data_options()
 @options.bundle_options("part_prices", dict, PRICES)
-@click.option(
-    "--cost-unit", default="s", show_default=True, help="Unit of these costs: s, EUR, ..."
-)
 @options.recipe_options
 @options.bundle_options("lists", options.drop_none, GRID_LISTS)
 @stream_options(
@@ -497,8 +475,7 @@ PRICES = {
 @options.out_option("costs.csv", "costs.png")
 def costs(
     choice: RecipeChoice,
-    part_prices: dict[str, float],
-    cost_unit: str,
+    part_prices: dict[str, Any],
     lists: Options,
     source: DataChoice,
     stream: Stream,
@@ -541,9 +518,11 @@ def costs(
     check = amount(curve.costs.check)
     verify_all = ("" if curve.policy else ">", "check all", "-", check, check, "100 %", "-", "-")
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
-    title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
-    lines = _curve_lines(curve, dataset)
-    record: Record = {"data": curve.dataset, "unit": cost_unit}
+    title = f"{curve.recipe} on {curve.dataset}: what a part costs"
+    lines = [curve.sentence, curve.price_sentence]
+    if curve.out_of_reach:
+        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
+    record: Record = {"data": curve.dataset}
     record |= {name: getattr(curve, name) for name in CURVE_FIELDS}
     if curve.policy is not None:
         settings = settings_of(curve.policy)
@@ -565,32 +544,9 @@ def costs(
         out=out,
         make_files=lambda: {
             "costs.csv": frame,
-            "costs.png": cost_picture(curve, unit=cost_unit),
+            "costs.png": cost_picture(curve),
         },
     )
-
-
-def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
-    """Return the sentences below the table of a cost curve: what a part costs under each policy.
-
-    They say which policy was chosen, and how the choice depends on the prices. If there are any,
-    they also say how many recordings of the data set equal an earlier one (by `content_hash`),
-    which policies were left behind because they were dearer in the first shuffles, and which were
-    not tried.
-    """
-    from ..experiments.costs import policy_name
-    from ..experiments.survey import survey_dataset
-
-    lines = [curve.sentence, curve.price_sentence]
-    repeats = survey_dataset(dataset).duplicates
-    if repeats:
-        lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
-    by_shuffles = [f"{policy_name(row.policy)} {amount(row.cost)}" for row in curve.left_behind]
-    if by_shuffles:
-        lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")
-    if curve.out_of_reach:
-        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
-    return lines
 
 
 def _as_flags(settings: Options) -> str:

@@ -37,17 +37,10 @@ if TYPE_CHECKING:
     from ..experiments.replay import Replay
     from ..records import TraceSpec
 
+    # The `TraceSpec` of a cell, and a function that makes the cell and its name for people.
+    CellToDrive = tuple[TraceSpec, Callable[[DataEngine], tuple[Cell, str]]]
+
 STRETCHES = 6  # rows of the table
-
-
-class CellToDrive(NamedTuple):
-    """The `TraceSpec` of a cell, and a function that makes the cell for an engine.
-
-    The function returns the cell and its name for people.
-    """
-
-    trace_spec: TraceSpec
-    make: Callable[[DataEngine], tuple[Cell, str]]
 
 
 class DrivenRun(NamedTuple):
@@ -131,19 +124,19 @@ def run(
     from ..store.opening import opening
 
     recipe = choice.load_if_given()
-    to_drive = CELLS[kind](cycles=cycles, check_seconds=check_seconds, **cell_settings)
+    spec, make_cell = CELLS[kind](cycles=cycles, **cell_settings)
     with opening(store) as opened_store:
         opened = DataEngine.open_or_create(
             opened_store,
             seed,
             recipe=recipe,
-            trace=agreed_trace_spec(opened_store, to_drive.trace_spec),
+            trace=agreed_trace_spec(opened_store, spec),
             allow_import=allow_import,
         )
     with ExitStack() as stack, opened as engine:
         if shadow:
             engine.set_shadow(True)
-        cell, name = to_drive.make(engine)
+        cell, name = make_cell(engine)
         stack.callback(getattr(cell, "close", lambda: None))
         driven = _drive(engine, cell, cycles, name)
         record: Record = {
@@ -223,19 +216,16 @@ def _safe_mode_line(change: Record) -> str:
     return f"After cycle {change['cycle']}: {event}."
 
 
-def _simulated_cell(
-    scenario: str, cycles: int, check_seconds: float, source: DataChoice, **others: Any
-) -> CellToDrive:
+def _simulated_cell(scenario: str, cycles: int, source: DataChoice, **others: Any) -> CellToDrive:
     """Return the `TraceSpec` of the simulated cell, and a function that makes the cell.
 
     The `TraceSpec` has what the options of `source` state; the rest is the simulation's own. The
     cell's seed depends on the number of decisions in the store, and in a product also on the cell,
-    so that no part comes twice. A verification takes `check_seconds` of simulated time. `scenario`
-    says what changes in the course of the `cycles`; for an unknown one SettingError is raised when
-    the cell is made. `others` are settings of other kinds of cell, and are ignored.
+    so that no part comes twice. `scenario` says what changes in the course of the `cycles`; for an
+    unknown one SettingError is raised when the cell is made. `others` are settings of other kinds
+    of cell, and are ignored.
     """
     from ..cells.simulation.cell import SimulatedCell
-    from ..cells.simulation.conditions import CellParameters
 
     def make(engine: DataEngine) -> tuple[Cell, str]:
         """Return the simulated cell for this engine's store, and its name; SettingError for an
@@ -247,13 +237,12 @@ def _simulated_cell(
         if store.product is not None:
             # The cells of one product have one seed, but each makes other parts.
             seed += crc32(store.cell_id.encode())
-        parameters = CellParameters(verify_s=check_seconds)
-        cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles, parameters=parameters)
+        cell = SimulatedCell(scenario=scenario, seed=seed, cycles=cycles)
         return cell, f"simulated cell, {scenario}"
 
     stated = options.trace_spec_from(source.options)
     spec = SimulatedCell.spec if stated is None else stated.completed(SimulatedCell.spec)
-    return CellToDrive(spec, make)
+    return spec, make
 
 
 def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
@@ -296,7 +285,7 @@ def _replay_cell(source: DataChoice, cycles: int, **others: Any) -> CellToDrive:
         cell = ReplayCell(dataset, np.arange(first, len(dataset)))
         return cell, f"recording {dataset.name} from part {first + 1}"
 
-    return CellToDrive(dataset.spec, make)
+    return dataset.spec, make
 
 
 def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDrive:
@@ -323,9 +312,7 @@ def _robot_cell(source: DataChoice, host: str | None, **others: Any) -> CellToDr
     settings, spec = options.recorder_settings(source.options)
     settings |= options.drop_none(trigger=source.options.get("trigger"))
     name, port = host_and_port(host)
-    return CellToDrive(
-        spec, lambda engine: (UrCell(name, port=port, **settings), f"robot at {host}")
-    )
+    return spec, lambda engine: (UrCell(name, port=port, **settings), f"robot at {host}")
 
 
 def host_and_port(address: str) -> tuple[str, int]:

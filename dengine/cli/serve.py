@@ -35,13 +35,6 @@ DEMO_DEADLINE = 5.0
     ),
 )
 @click.option(
-    "--speed",
-    type=click.FloatRange(0.01, 1000.0),
-    default=1.0,
-    show_default=True,
-    help="Parts per second of --demo.",
-)
-@click.option(
     "--host",
     default="127.0.0.1",
     show_default=True,
@@ -109,7 +102,6 @@ def serve(
     choice: RecipeChoice,
     store: str | None,
     demo: bool,
-    speed: float,
     shadow: bool,
     allow_import: bool,
     robot: str | None,
@@ -170,7 +162,7 @@ def serve(
                 )
             data = load_dataset("insertion", samples=trace_options.get("samples"))
             trace = data.spec
-            beside = [partial(playing, data=data, speed=speed, seed=seed or 0)]
+            beside = [partial(playing, data=data, seed=seed or 0)]
             settings["deadline"] = max(settings["deadline"], DEMO_DEADLINE)
             recipe = recipe or Recipe.load("conv").with_policy(**POLICY)
             if store is None:

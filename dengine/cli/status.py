@@ -1,6 +1,6 @@
 """The subcommand `dengine status`: how an engine is doing, as far as its store tells."""
 
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -11,7 +11,6 @@ from .options import verb
 from .output import (
     certificate_record,
     field_rows,
-    format_duration,
     format_time,
     format_value,
     heading,
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from ..history.status import ErrorEstimate, Span, Status
 
 VERDICTS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
-# In shadow mode every part is verified: those are no audits, though they share the reason.
+# In shadow mode every part is verified: those are no audits.
 TITLES = {"false_accepts": "accepted, and bad", "audits": "certain but checked"}
 # Fields of a status that have lines or tables of their own.
 SHOWN_ELSEWHERE = (
@@ -50,16 +49,13 @@ ONLY_WHILE_RUNNING = ("retraining", "store_lag")
     show_default=True,
     help="How many of the newest decisions have a column of their own.",
 )
-@options.check_option
-def status(store: str, last: int, check_seconds: float) -> None:
+def status(store: str, last: int) -> None:
     """Show how an engine is doing, and what its store holds.
 
     STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`,
     and must exist. If it holds several cells and none is named, they are only listed; cells of one
     product share labels and versions. The interval of bad accepted parts is valid if you look once;
-    the certificate is valid however often you look. If the model was certain of parts that were
-    verified, as in shadow mode, a line says how much time the model would have saved, at
-    `--check-seconds` for each check.
+    the certificate is valid however often you look.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable
@@ -81,15 +77,11 @@ def status(store: str, last: int, check_seconds: float) -> None:
         report = read_status(opened, last, watching=True)
     record = {"store": store} | to_jsonable(report)
     record["certificate"] = certificate_record(report.certificate)
-    parts = [_overview_table(store, report), table_of_rows("What it is", _present_rows(report))]
-    n_certain = report.ever.would_accept.n + report.ever.would_reject.n
-    if n_certain:
-        seconds = format_duration(n_certain * check_seconds)
-        parts.append(
-            f"It would have decided {n_certain:,} of the {report.ever.verified:,} parts that were "
-            f"verified: {seconds} of checks at {format_duration(check_seconds)}."
-        )
-    print_result(record, *parts)
+    print_result(
+        record,
+        _overview_table(store, report),
+        table_of_rows("What it is", _present_rows(report)),
+    )
 
 
 def _overview_table(store: str, report: "Status") -> Any:
@@ -116,18 +108,13 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     engine knows, the recipe, the `TraceSpec`, the certificate on accepted and on rejected parts,
     the last and the slowest retrain, and the newest events, the newest first. An alarm, or a
     retrain, has a row only if there is one. The recipe is left out if the model was handed in by
-    the user, because the recipe has no effect on it. Without audits, the counts with the name
-    "audit" are called "certain but checked": they come from shadow mode.
+    the user, because the recipe has no effect on it.
     """
     rows = []
     if report.alarm:
         rows.append(("look at", report.alarm))
     rows.append(("cell", report.cell))
-    shown = report
-    if not report.recipe.policy.audit_rate:
-        reasons = _without_audits(report.reasons)
-        shown = replace(report, reasons=reasons, sources=_without_audits(report.sources))
-    rows += field_rows(shown, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
+    rows += field_rows(report, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
     if report.model is None:
         # The recipe has no effect on a model that was handed in.
         rows += field_rows(report.recipe)
@@ -150,58 +137,35 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     return rows
 
 
-def _without_audits(counts: dict[str, int]) -> dict[str, int]:
-    """Return counts with the key "audit" renamed to "certain but checked".
-
-    For a policy without audits: what has that reason was verified in shadow mode.
-    """
-    return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
-
-
 def _span_cell(name: str, span: "Span") -> str:
     """Return the text of a field of a `Span`: a time, a number, or a share of wrong decisions with
     its verdict.
 
     A `Span` has the counts over the newest decisions, or over all, and `name` names its field. A
-    few words replace the share if there is none, because no part was accepted, or if the row of bad
-    accepted parts shows the same share.
+    few words replace the share if there is none, because no part was accepted.
     """
     value = getattr(span, name)
     if name in ("first", "last"):
         return format_time(value)
     if name == "bad_accepts" and not span.accepted:
         return "none was accepted"
-    if name == "would_accept" and value.n_known and span.bad_accepts.basis == value.basis:
-        return "as bad accepts, below"  # the same parts
-    if not hasattr(value, "verdict"):
-        return format_value(name, value)
-    return _error_cell(value, span.false_accepts if name == "bad_accepts" else 0)
+    return _error_cell(value) if hasattr(value, "verdict") else format_value(name, value)
 
 
-def _error_cell(estimate: "ErrorEstimate", n_stops: int) -> str:
+def _error_cell(estimate: "ErrorEstimate") -> str:
     """Return a text on a share of wrong decisions: counts, interval, verdict.
 
     The verdict says whether the share keeps to the tolerance, is beyond it, or may be beyond it
-    (open). Without known outcomes the counts are left out. If the verdict is open as well, the
-    interval is left out, too, and the text only says that nothing is known, or nothing beside the
-    line stops. The interval is rounded outward to 0.1 %.
-
-    Parameters
-    ----------
-    estimate : ErrorEstimate
-        The interval of the share, and the outcomes that it is computed from.
-    n_stops : int
-        Number of line stops. The text begins with it, unless it is 0 or the share includes them.
+    (open). Without known outcomes the counts are left out. If the verdict is open as well, the text
+    only says that nothing is known. The interval is rounded outward to 0.1 %. `estimate` has the
+    interval, and the outcomes that it is computed from.
     """
-    stops = ""
-    if n_stops and estimate.basis != "every outcome":
-        stops = f"{n_stops:,} stop{'s' * (n_stops > 1)}; "
     if not estimate.n_known and estimate.verdict == "open":
-        return stops + ("else unknown" if n_stops else "none is known")
+        return "none is known"
     basis = ""
     if estimate.n_known:
         basis = f"{estimate.n_wrong:,} of {estimate.n_known:,} by {estimate.basis}: "
     ends = outward(100 * estimate.lower, 100 * estimate.upper, 1)
     interval = "{:.1f} to {:.1f} %".format(*ends)
     verdict = f"{VERDICTS[estimate.verdict]} {percent(estimate.tolerance, 'g')}"
-    return f"{stops}{basis}{interval}, {verdict}"
+    return f"{basis}{interval}, {verdict}"

@@ -39,8 +39,8 @@ def _login_name() -> str:
 
 shadow_option = click.option(
     "--shadow",
-    type=click.Choice(["on", "off"]),
-    callback=lambda context, option, state: None if state is None else state == "on",
+    type=bool,
+    metavar="on|off",
     help=(
         "on: verify every part, and only record what the model would have done. off: let it decide."
     ),
@@ -53,6 +53,10 @@ author_option = click.option(
     default=_login_name,
     help="Who makes the change, for the record.  [default: the login name]",
 )
+
+
+part_argument = click.argument("part", metavar="PART|ID")
+label_argument = click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
 
 
 def store_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -93,8 +97,8 @@ def _change_and_print(
 
 @verb("dengine report engine.db import-d684ff7e4dbab839-0 bad")
 @store_options
-@click.argument("part", metavar="PART|ID")
-@click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
+@part_argument
+@label_argument
 def report(part: str, label: str, **changing: Any) -> None:
     """Report whether a part was good or bad.
 
@@ -131,8 +135,8 @@ def report(part: str, label: str, **changing: Any) -> None:
 
 @verb("dengine correct engine.db import-d684ff7e4dbab839-0 bad")
 @store_options
-@click.argument("part", metavar="PART|ID")
-@click.argument("label", metavar="good|bad", type=click.Choice(list(LABELS)))
+@part_argument
+@label_argument
 def correct(part: str, label: str, **changing: Any) -> None:
     """Correct a wrong label: the part was good, or bad.
 

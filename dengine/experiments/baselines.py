@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..decision.policy import Policy
 from ..errors import SettingError, expect
 from ..imports import import_class
-from ..records import ACTIONS, Floats, Ints, is_whole
+from ..records import Action, Floats, Ints, is_whole
 from ..traces import as_traces
 
 Labels = NDArray[np.bool_]
@@ -138,16 +138,13 @@ class Baseline(ABC):
         attribute `thresholds` has both; if it is None, they are LB and 1 - LB. Raises TraceError
         like `predict`.
         """
-        from ..decision.rule import action_of
-
         default = (self.policy.lower_bound, 1.0 - self.policy.lower_bound)
         accept_threshold, reject_threshold = self.thresholds or default
-        lower, upper, *_ = self.predict(X)
-        numbers = (
-            action_of(float(low), float(high), accept_threshold, reject_threshold)
-            for low, high in zip(lower, upper, strict=True)
-        )
-        return np.array([ACTIONS[number] for number in numbers], dtype=object)
+        lower, upper = self.predict_interval(X)
+        actions = np.full(len(lower), Action.VERIFY, dtype=object)
+        actions[upper <= reject_threshold] = Action.REJECT
+        actions[lower >= accept_threshold] = Action.ACCEPT
+        return actions
 
     def predict(self, X: ArrayLike) -> BaselinePrediction:
         """Return bounds of the success probability, and counts of labels, for traces X (n, C, T).

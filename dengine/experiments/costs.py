@@ -106,6 +106,13 @@ class PolicyCost:
         """Share of all parts that were accepted and bad."""
         return self.accepted * self.bad.rate if self.bad.decided else 0.0
 
+    @property
+    def screening_key(self) -> tuple[bool, float]:
+        """Whether every part was verified, so that such policies are sorted last, and the expected
+        cost.
+        """
+        return self.accepted + self.rejected == 0.0, self.expected_cost
+
 
 @dataclass(frozen=True, slots=True)
 class Missing:
@@ -481,31 +488,19 @@ def cost_curve(
         f"this is what they lack: {'; '.join(out_of_reach)}",
     )
     play = play or partial(play_tasks, data, n_jobs=n_jobs, keep=keep)
-    screened: dict[Policy, list[Replay]] = {policy: [] for policy in policies}
-
-    def screening_key(policy: Policy) -> tuple[bool, float]:
-        """Return whether every part was verified, so that such policies come last, and the expected
-        cost.
-        """
-        row = _policy_cost(policy, screened[policy], costs)
-        return row.accepted + row.rejected == 0.0, row.expected_cost
-
+    screened: list[Replay] = []
+    rows: dict[Policy, PolicyCost] = {}
     while len(policies) > N_LAST:
         seeds = range(seed, seed + N_SCREENING)
-        for replay in _screen(play, contender, policies, seeds, n_cycles):
-            screened[replay.recipe.policy].append(replay)
-        policies.sort(key=screening_key)
+        screened += _screen(play, contender, policies, seeds, n_cycles)
+        groups = _by_policy(screened)
+        rows = {policy: _policy_cost(policy, group, costs) for policy, group in groups.items()}
+        policies.sort(key=lambda policy: rows[policy].screening_key)
         del policies[max(N_LAST, len(policies) // 2) :]
         seed += N_SCREENING
-    fresh: dict[Policy, list[Replay]] = {policy: [] for policy in policies}
     seeds = range(seed, seed + repeats)
-    for replay in play(_tasks(contender, policies, seeds, n_cycles)):
-        fresh[replay.recipe.policy].append(replay)
-    left_behind = tuple(
-        _policy_cost(policy, replays, costs)
-        for policy, replays in screened.items()
-        if policy not in fresh
-    )
+    fresh = _by_policy(play(_tasks(contender, policies, seeds, n_cycles)))
+    left_behind = tuple(row for policy, row in rows.items() if policy not in fresh)
     return curve_of(fresh, costs, left_behind, tuple(out_of_reach))
 
 
@@ -563,6 +558,14 @@ def _within_reach(
         else:
             policies[policy] = None
     return list(policies), out_of_reach
+
+
+def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
+    """Return the replays of each policy, in their order."""
+    groups: dict[Policy, list[Replay]] = {}
+    for replay in replays:
+        groups.setdefault(replay.recipe.policy, []).append(replay)
+    return groups
 
 
 def _tasks(

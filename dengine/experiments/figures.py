@@ -146,8 +146,7 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     The left panel shows which parts were good and bad, the right one what was decided. A point is
     the mean over the embedding spaces of the folds, in its first two dimensions (0 for a second one
     that is missing), as it was at the decision; later retrains do not move it. Parts that no model
-    embedded are left out, on the left also parts of unknown truth. Without any point a text says
-    so.
+    embedded are left out, on the left also parts of unknown truth.
 
     Parameters
     ----------
@@ -174,8 +173,6 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
             axes.scatter(
                 *points.T, label=f"{word} ({len(points)})", alpha=0.7, linewidths=0, **style
             )
-        if not embedded.any():
-            axes.text(0.5, 0.5, "no trace was embedded yet", ha="center", transform=axes.transAxes)
         finish(axes, xlabel="embedding 1")
         axes.set_title(name, pad=24)
     left.set(ylabel="embedding 2")
@@ -291,11 +288,8 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
         for i, level in enumerate(levels):
             axes.axhline(level, label="_" if i else f"{name} = {text} %", **LIMIT)
     finish(certain, 0, ylim=(0, 102), ylabel="certain\n[% of cycles]")
-    finish(precision, ylabel="precision\n[% of accepted]")
-    precision.set_ylim(max(0.0, min(precision.get_ylim()[0], bounds[0] - 1)), 100.5)
-    # At least half as much again above the tolerance: the panel shows whether errors keep to it.
-    highest = max(errors.get_ylim()[1], 1.5 * tolerances[0])
-    finish(errors, ylim=(0, highest), ylabel="bad of accepted, good of\nrejected (dashed) [%]")
+    finish(precision, ylim=(None, 100.5), ylabel="precision\n[% of accepted]")
+    finish(errors, ylim=(0, None), ylabel="bad of accepted, good of\nrejected (dashed) [%]")
     errors.set(
         xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not "
         "drawn)"
@@ -304,7 +298,7 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     return figure
 
 
-def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
+def cost_picture(curve: CostCurve) -> Figure:
     """Draw what a part costs under each policy, with 95 % intervals.
 
     On top are the policies that played the reported shuffles, the cheapest first. Below them,
@@ -316,8 +310,6 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     Parameters
     ----------
     curve : CostCurve
-    unit : str, default "s"
-        Of the costs.
 
     Returns
     -------
@@ -325,9 +317,9 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     """
     costs = curve.costs
     title = (
-        f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape {costs.escape:g} "
-        f"{unit}, false reject {costs.false_reject:g} {unit}\n{counted(curve.shuffles, 'shuffle')} "
-        f"of {curve.cycles} parts, with 95 % intervals"
+        f"{curve.dataset}, {curve.recipe}: check {costs.check:g}, escape {costs.escape:g}, "
+        f"false reject {costs.false_reject:g}\n{counted(curve.shuffles, 'shuffle')} of "
+        f"{curve.cycles} parts, with 95 % intervals"
     )
     rows = [*curve.rows, *curve.left_behind]
     figure = blank(9.0, 2.2 + 0.34 * len(rows), title)
@@ -343,7 +335,7 @@ def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
         axes.errorbar(row.cost, y, xerr=errors, label=label, markerfacecolor=fill, **style)
     axes.set_yticks(range(len(rows)), [policy_name(row.policy) for row in rows])
     axes.invert_yaxis()
-    finish(axes, 4, xlim=(0.0, end), xlabel=f"cost a part [{unit}]")
+    finish(axes, 4, xlim=(0.0, end), xlabel="cost a part")
     return figure
 
 

@@ -406,7 +406,6 @@ def grid_tasks(
     lower_bounds: Sequence[float | None] = (None,),
     intervals: Sequence[str | None] = (None,),
     seeds: Iterable[int] = (0,),
-    guarantees: Sequence[str | None] = (None,),
     cycles: int | None = None,
     shuffle: bool = True,
 ) -> list[Task]:
@@ -416,7 +415,7 @@ def grid_tasks(
     ----------
     recipes : str or sequence
         As `load_contenders` takes them.
-    alphas, lower_bounds, intervals, guarantees : sequence
+    alphas, lower_bounds, intervals : sequence
         Settings of the policy; None leaves one to the recipe.
     seeds : iterable of int
     cycles : int or None, default None
@@ -427,7 +426,7 @@ def grid_tasks(
     Returns
     -------
     tasks : list of Task
-        By contender, interval, alpha, lower bound, guarantee and seed.
+        By contender, interval, alpha, lower bound and seed.
 
     Raises
     ------
@@ -435,8 +434,8 @@ def grid_tasks(
         A recipe cannot be loaded, two have the same name and policy, or a setting is out of range.
     """
     seeds = list(seeds)
-    names = ("interval", "alpha", "lower_bound", "guarantee")
-    combinations = product(load_contenders(recipes), intervals, alphas, lower_bounds, guarantees)
+    names = ("interval", "alpha", "lower_bound")
+    combinations = product(load_contenders(recipes), intervals, alphas, lower_bounds)
     tasks = []
     for contender, *settings in combinations:
         pairs = zip(names, settings, strict=True)

@@ -67,7 +67,7 @@ def frame_of(replays: Sequence[Replay], check_seconds: float = VERIFY_SECONDS) -
     return pd.DataFrame([replay.summary(check_seconds) for replay in replays])
 
 
-def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
+def pool(frame: pd.DataFrame, replays: Sequence[Replay]) -> list[Row]:
     """Pool the replays that have the same settings, and return a row for each of these settings.
 
     The settings are the columns in `CONDITION`, from the recipe to `stops`. There is a row for
@@ -77,9 +77,8 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
     ----------
     frame : DataFrame
         As `frame_of` gives it.
-    replays : sequence of Replay, default ()
+    replays : sequence of Replay
         The replays of the frame's rows, in their order, all of one data set and none of a live run.
-        Without them the error's interval is NaN, and retrains_dropped is 0.
 
     Returns
     -------
@@ -94,7 +93,7 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
         - Times of retrains and decisions, the first certain cycle and savings: median, largest or
           mean, as `AGGREGATED` says.
         - error_lower, error_upper : 95 % interval of the share of bad parts among the accepted
-          parts; NaN also if none was accepted.
+          parts; 0 and 1 if none was accepted.
         - promise_kept : whether the pooled precision is at least LB; None if fewer than 200 parts
           were accepted.
         - retrains_dropped : number of retrains whose version was not put in force.
@@ -110,11 +109,9 @@ def pool(frame: pd.DataFrame, replays: Sequence[Replay] = ()) -> list[Row]:
         row["precision"] = _share_right(totals["false_positive"], totals["accepted"])
         row["npv"] = _share_right(totals["false_negative"], totals["rejected"])
         row |= {name: float(part[name].agg(how)) for name, how in AGGREGATED.items()}
-        group = [replays[i] for i in part.index] if replays else []
-        row["retrains_dropped"] = sum(len(replay.dropped) for replay in group)
-        error = pooled_error(group)
-        row["error_lower"] = error.lower if error.decided else math.nan
-        row["error_upper"] = error.upper if error.decided else math.nan
+        row["retrains_dropped"] = int(part["retrains_dropped"].sum())
+        error = pooled_error([replays[i] for i in part.index])
+        row |= {"error_lower": error.lower, "error_upper": error.upper}
         row["promise_kept"] = None
         if totals["accepted"] >= ENOUGH:
             row["promise_kept"] = bool(row["precision"] >= row["lower_bound"])
@@ -134,7 +131,7 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
     LB is the lower bound of the row's policy. The sentence ends with "kept" or "broken", or says
     that no part, or too few parts, were accepted. It always names the recipe and the guarantee. It
     names the interval and alpha only if the rows differ in it.
-    It has the share of good parts, and the interval of the share of bad parts if the row has one.
+    It has the share of good parts, and the interval of the share of bad parts.
     """
     varying = [name for name in ("interval", "alpha") if len({row[name] for row in rows}) > 1]
     lines = []
@@ -148,10 +145,10 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
         too_few = f"fewer than {ENOUGH} accepted parts, too few to say"
         verdict = {True: "kept", False: "broken", None: too_few}[row["promise_kept"]]
         good = f"{percent(row['precision'])} of {row['total_accepted']} accepted parts were good"
-        if not math.isnan(row["error_lower"]):
-            lower = f"{100 * row['error_lower']:.1f}"
-            good += f"; bad: {lower} to {percent(row['error_upper'])} at 95 %"
-        lines.append(f"{subject}: {good}, LB {100 * row['lower_bound']:g} %: {verdict}.")
+        bad = f"{100 * row['error_lower']:.1f} to {percent(row['error_upper'])} at 95 %"
+        lines.append(
+            f"{subject}: {good}; bad: {bad}, LB {100 * row['lower_bound']:g} %: {verdict}."
+        )
     return lines
 
 

@@ -46,25 +46,29 @@ MANY_RIGHT = replay_of(["accept"] * 300, [1] * 290 + [0] * 10)
 ONE_WRONG = replay_of(["accept"] + ["verify"] * 298 + ["reject"], [0] + [1] * 299, seed=1)
 
 
+def pooled(replays: list[Replay]) -> list[dict[str, Any]]:
+    return pool(frame_of(replays), replays)
+
+
 def test_pooled_precision_weighs_parts_not_replays_and_is_none_where_nothing_was_accepted():
-    (row,) = pool(frame_of([MANY_RIGHT, ONE_WRONG]))
+    (row,) = pooled([MANY_RIGHT, ONE_WRONG])
     assert row["precision"] == pytest.approx(1 - 11 / 301)  # not the mean of the ratios, 0.483
     assert (row["npv"], row["accepted"], row["total_accepted"]) == (0.0, 150.5, 301)
-    (row,) = pool(frame_of([replay_of(["verify"] * 5, [1] * 5)]))
+    (row,) = pooled([replay_of(["verify"] * 5, [1] * 5)])
     assert (math.isnan(row["precision"]), row["promise_kept"]) == (True, None)
     assert promise_lines([row]) == ["pca (local): no part was accepted."]
 
 
 @pytest.mark.parametrize(("bad", "kept"), [(30, True), (31, False)])
 def test_the_promise_is_kept_up_to_the_tolerance(bad, kept):
-    (row,) = pool(frame_of([replay_of(["accept"] * 300, [0] * bad + [1] * (300 - bad))]))
+    (row,) = pooled([replay_of(["accept"] * 300, [0] * bad + [1] * (300 - bad))])
     assert row["promise_kept"] is kept
 
 
 def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own():
     recipe = RECIPE.with_policy(guarantee="pooled", stops="all")
     replays = [MANY_RIGHT, MANY_RIGHT, replay_of(["accept"] * 300, [1] * 300, recipe)]
-    rows = pool(frame_of(replays), replays)
+    rows = pooled(replays)
     shown = [(row["guarantee"], row["stops"], row["retrains_dropped"]) for row in rows]
     assert shown == [("local", "some", 2), ("pooled", "all", 1)]
     assert list(pooled_table(rows).columns[0].cells) == ["pca\nlocal, some", "pca\npooled, all"]
@@ -112,7 +116,6 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "curves": lambda: curves({"pca": [MANY_RIGHT], "conv": [ONE_WRONG]}, "a title"),
     "map": lambda: embedding_map(ONE_WRONG, title="a title"),
     "map of probabilities": lambda: embedding_map(replace(ONE_WRONG, recipe=Recipe("conv"))),
-    "map of nothing": lambda: embedding_map(UNTRAINED),
     "curves of a grid": lambda: curves({f"pca, LB {i} %": [UNTRAINED] for i in range(20)}),
     "run": lambda: curves({"this run": [LOG]}, "a title"),
 }
