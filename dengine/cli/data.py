@@ -90,9 +90,14 @@ def data(
         seen = Seen(recordings=n_found, good=survey.good, bad=survey.bad)
         path = _save(source, replace(description, seen=seen), save, context)
         shown = description.to_toml()
-    is_new = description is not None and not source.path.is_file()
-    do = "Look at the traces (--out FOLDER); if they are right, write the description with --save."
-    last_line = f"Wrote {path}." if path else do if is_new else ""
+    last_line = ""
+    if path is not None:
+        last_line = f"Wrote {path}."
+    elif description is not None and not source.path.is_file():
+        last_line = (
+            "Look at the traces (--out FOLDER); if they are right, write the description with "
+            "--save."
+        )
     print_result(
         {"data": source.data, "description": shown, "survey": survey, "notes": dataset.notes},
         *filter(None, [shown, *_survey_parts(dataset, survey), last_line]),

@@ -111,17 +111,17 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     from ..representation import to_jsonable
     from ..store.opening import open_store
 
+    others: dict[str, list[Any]] = {}
     with open_store(store, must_exist=True) as opened:
         decisions = list(read_history(opened, **criteria))
-        since = criteria["since"]
-        if since is None and decisions:
-            since = decisions[0].time
-        others: dict[str, list[Any]] = {}
         if events:
             others["retrains"] = opened.versions.all(cell_only=True)
             others["events"] = opened.events.newest()
+    since = criteria["since"]
+    if since is None:
+        since = decisions[0].time if decisions else 0.0
     for name, items in others.items():
-        others[name] = [item for item in items if item.time >= (since or 0.0)]
+        others[name] = [item for item in items if item.time >= since]
     rows = [to_jsonable(decision) | {"label": decision.label} for decision in decisions]
     record = {"store": store, "decisions": rows} | others
     in_order = merge(*others.values(), decisions, key=lambda item: item.time)

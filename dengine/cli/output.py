@@ -262,9 +262,9 @@ def format_value(name: str, value: Any) -> str:
     """
     if isinstance(value, str) or value is None:
         return without_password(value) if value else "-"
-    if is_dataclass(value) and "__str__" in vars(type(value)):
-        return str(value)
     if is_dataclass(value):
+        if "__str__" in vars(type(value)):
+            return str(value)
         return ", ".join(f"{title} {text}" for title, text in field_rows(value))
     if isinstance(value, Mapping):
         counts = [f"{key} {format_value(key, item)}" for key, item in value.items() if item != 0]

@@ -7,7 +7,7 @@ two show the replays that were finished.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -36,7 +36,7 @@ from .output import (
     Record,
     exit_interrupted,
     explain_option,
-    format_value,
+    format_duration,
     legend_or_hint,
     print_result,
     progress_bar,
@@ -310,11 +310,8 @@ def _replay_and_print(
         error = interruption
     played.sort(key=lambda item: item.position)
     replays = [item.replay for item in played]
-    costs = {
-        "seconds": time.perf_counter() - begin,
-        "core_seconds": sum(replay.seconds for replay in replays),
-        "kept": sum(item.kept for item in played),
-    }
+    seconds = time.perf_counter() - begin
+    n_kept = sum(item.kept for item in played)
     frame = tables.frame_of(replays, check_seconds)
     rows = tables.pool(frame, replays)
     by_name = _group_replays(replays, lambda replay: replay.name)
@@ -325,14 +322,15 @@ def _replay_and_print(
         "faults": dataset.faults,
         "rows": rows,
         "interrupted": error is not None,
-        "costs": costs,
+        "costs": {"seconds": seconds, "kept": n_kept},
     }
     legend = legend_or_hint(tables.LEGEND)
     parts = [tables.pooled_table(rows, title, legend), *tables.promise_lines(rows)]
     for name, group in by_name.items():
         retrains = [retrain for replay in group for retrain in replay.retrains]
         parts.append(f"{name}: {tables.retrain_line(retrains)}")
-    parts.append(_duration_line(len(replays), costs))
+    kept = f"; {n_kept} of them were kept from before" if n_kept else ""
+    parts.append(f"{counted(len(replays), 'replay')} in {format_duration(seconds)}{kept}.")
     print_result(
         record, *parts, out=out, make_files=lambda: dict(_replay_files(frame, replays, title))
     )
@@ -344,18 +342,6 @@ def _replay_and_print(
         exit_interrupted(text)
     click.echo(text, err=True)
     raise error
-
-
-def _duration_line(n_replays: int, costs: Mapping[str, float]) -> str:
-    """Return a sentence: how many replays there are, the wall time and the time of one core that
-    they took, and how many of them an earlier run had kept, if any.
-
-    `costs` has these numbers: seconds, core_seconds and kept.
-    """
-    seconds = format_value("seconds", costs["seconds"])
-    core_seconds = format_value("core_seconds", costs["core_seconds"])
-    kept = f"; {costs['kept']} of them were kept from before" if costs["kept"] else ""
-    return f"{counted(n_replays, 'replay')} in {seconds}, {core_seconds} of one core{kept}."
 
 
 def _group_replays(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
 import click
@@ -41,24 +41,6 @@ if TYPE_CHECKING:
     CellToDrive = tuple[TraceSpec, Callable[[DataEngine], tuple[Cell, str]]]
 
 STRETCHES = 6  # rows of the table
-
-
-class DrivenRun(NamedTuple):
-    """What was done in a run.
-
-    Attributes
-    ----------
-    replay : Replay
-        The finished cycles.
-    safe_mode_changes : list of dict
-        `cycle` after which safe mode began or ended, and its `reason`, "" if it ended.
-    failure : CellError or None
-        What ended the run, if the cell failed.
-    """
-
-    replay: Replay
-    safe_mode_changes: list[Record]
-    failure: CellError | None
 
 
 @verb("dengine run --cell replay --cycles 100 --store engine.db --alpha 0.1 --lower-bound 0.9")
@@ -138,14 +120,14 @@ def run(
             engine.set_shadow(True)
         cell, name = make_cell(engine)
         stack.callback(getattr(cell, "close", lambda: None))
-        driven = _drive(engine, cell, cycles, name)
+        replay, changes, failure = _drive(engine, cell, cycles, name)
         record: Record = {
             "check_seconds": check_seconds,
             "safe_mode": engine.safe_mode,
-            "safe_mode_changes": driven.safe_mode_changes,
+            "safe_mode_changes": changes,
             "certificate": certificate_record(engine.certificate()),
         }
-    n_done = len(driven.replay)
+    n_done = len(replay)
     if n_done:
         resumed = ", resumed" if engine.resumed else ""
         record |= {
@@ -153,7 +135,7 @@ def run(
             "simulated": kind == "simulated",
             "interrupted": n_done < cycles,
         }
-        _print_run(driven.replay, record, cell, out)
+        _print_run(replay, record, cell, out)
     n_left = cycles - n_done
     kept = "Nothing was stored: --store FILE keeps a run, so that it can be continued."
     if store is not None:
@@ -163,17 +145,20 @@ def run(
             f"Everything up to cycle {n_done} is in {store}; the same command with --cycles "
             f"{n_left}{new_folder} continues there."
         )
-    if driven.failure is not None:
-        raise CellError(
-            f"{driven.failure} {n_done} of {cycles} cycles were done. {kept}"
-        ) from driven.failure
+    if failure is not None:
+        raise CellError(f"{failure} {n_done} of {cycles} cycles were done. {kept}") from failure
     if n_left:
         shown = "the table shows those" if n_done else "there is nothing to show"
         exit_interrupted(f"Interrupted: {n_done} of {cycles} cycles were done; {shown}.", kept)
 
 
-def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
-    """Let the engine drive the cell with a progress bar named `name`, and return what was done.
+def _drive(
+    engine: DataEngine, cell: Cell, cycles: int, name: str
+) -> tuple[Replay, list[Record], CellError | None]:
+    """Let the engine drive the cell with a progress bar named `name`; return the finished cycles,
+    the changes of safe mode, and what ended the run if the cell failed.
+
+    A change has the `cycle` after which safe mode began or ended, and its `reason`, "" if it ended.
 
     It ends after `cycles` parts, or after the current one at Ctrl-C or SIGTERM; a second Ctrl-C
     ends it at once, without its last cycle, and a second SIGTERM ends the process. If the cell
@@ -202,7 +187,7 @@ def _drive(engine: DataEngine, cell: Cell, cycles: int, name: str) -> DrivenRun:
                 count(1)  # may end the run here, between two cycles
     except CellError as error:
         failure = error
-    return DrivenRun(to_replay(observed, engine.recipe), changes, failure)
+    return to_replay(observed, engine.recipe), changes, failure
 
 
 def _safe_mode_line(change: Record) -> str:

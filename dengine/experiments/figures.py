@@ -50,11 +50,6 @@ RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first the colours that mean n
 LIMIT: Style = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound that is given
 SMALL = 9  # points: legends and notes
 WINDOW = 300  # cycles of a sliding window, and parts of a map: the paper's
-# Wrong decisions, what they are counted among, their name in the legend, and their line.
-ERRORS = (
-    ("false_positive", "accepted", "bad", "-"),
-    ("false_negative", "rejected", "good", "--"),
-)
 # Label, name, colour, line and marker of parts.
 LABEL_STYLES = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
 FEWEST = 20  # a share of fewer parts jumps by more than 5 % with each part, and is not drawn
@@ -238,9 +233,8 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the policy's
     lower bound LB; bad parts among the accepted parts (solid), good parts among the rejected parts
-    (dashed), and the tolerance 100 - LB, all in percent. The legend below has the counts of wrong
-    decisions. Shares of fewer than 20 parts are not drawn. The window is 300 cycles, or a third of
-    the longest replay if that is less.
+    (dashed), and the tolerance 100 - LB, all in percent. Shares of fewer than 20 parts are not
+    drawn. The window is 300 cycles, or a third of the longest replay if that is less.
 
     Parameters
     ----------
@@ -269,15 +263,9 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
         certain.fill_between(x, low, shares["certain_high"], color=colour, alpha=0.15, linewidth=0)
         certain.plot(x, shares["certain"], color=colour)
         precision.plot(x, shares["precision"], color=colour)
-        wrong = []
-        for kind, decided, word, line in ERRORS:
-            errors.plot(x, shares[kind], line, color=colour)
-            n_wrong, n_decided = (
-                sum(int(getattr(replay, field).sum()) for replay in replays)
-                for field in (kind, decided)
-            )
-            wrong.append(f"{n_wrong} {word} of {n_decided} {decided}")
-        handles += certain.plot([], color=colour, label=f"{name}: {', '.join(wrong)}")
+        errors.plot(x, shares["false_positive"], "-", color=colour)
+        errors.plot(x, shares["false_negative"], "--", color=colour)
+        handles += certain.plot([], color=colour, label=name)
     bounds = sorted({100 * replay.recipe.policy.lower_bound for replay in all_replays})
     tolerances = [100 - bound for bound in bounds]
     for axes, levels, name in (

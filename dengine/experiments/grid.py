@@ -12,7 +12,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.metadata import distributions
 from inspect import getsourcefile, isfunction
@@ -41,6 +41,7 @@ PAPER_GRID: dict[str, tuple[Any, ...]] = {  # of the paper's experiments
     "lower_bounds": (0.8, 0.9, 0.95),
     "intervals": ("wilson", "binomial"),
 }
+KEPT_VALUES = ("dataset", "seed", "confirm", "seconds")  # of a kept replay, beside its arrays
 LIBRARIES = ("numpy", "scipy", "torch", "scikit-learn", "umap-learn", "numba", "aeon")
 
 
@@ -159,15 +160,11 @@ class KeptReplays:
         written, since `get` takes them from the task. Raises OutputError if the file cannot be
         written, and SettingError as `path` does.
         """
-        arrays: dict[str, Any] = {}
-        values: dict[str, Any] = {}
-        for field in fields(replay):
-            value = getattr(replay, field.name)
-            if isinstance(value, np.ndarray):
-                arrays[field.name] = value
-            elif field.name not in ("name", "recipe"):
-                values[field.name] = value
+        values: dict[str, Any] = {name: getattr(replay, name) for name in KEPT_VALUES}
         values["retrains"] = [asdict(report) for report in replay.retrains]
+        arrays: dict[str, Any] = {
+            name: value for name, value in vars(replay).items() if isinstance(value, np.ndarray)
+        }
         buffer = BytesIO()
         np.savez_compressed(buffer, about=np.array(json.dumps(values)), **arrays)
         write_output(self.path(task), buffer.getvalue(), force=True)

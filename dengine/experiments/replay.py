@@ -11,7 +11,7 @@ prototype online environment does. A `Contender` says who plays: a recipe or a b
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -276,12 +276,12 @@ class Replay:
         """
         import pandas as pd
 
-        columns = {}
-        for item in fields(self):
-            value = getattr(self, item.name)
-            # The shape leaves out the index of a live run, which is empty.
-            if isinstance(value, np.ndarray) and value.shape == (len(self),):
-                columns[item.name] = value
+        # The shape leaves out the index of a live run, which is empty.
+        columns = {
+            name: value
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray) and value.shape == (len(self),)
+        }
         for d in range(self.position.shape[1]):
             columns[f"embedding_{d + 1}"] = self.position[:, d]
         return pd.DataFrame(columns, index=pd.RangeIndex(1, len(self) + 1, name="cycle"))
