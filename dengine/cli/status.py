@@ -11,6 +11,7 @@ from .options import verb
 from .output import (
     certificate_record,
     field_rows,
+    format_duration,
     format_time,
     format_value,
     heading,
@@ -49,13 +50,16 @@ ONLY_WHILE_RUNNING = ("retraining", "store_lag")
     show_default=True,
     help="How many of the newest decisions have a column of their own.",
 )
-def status(store: str, last: int) -> None:
+@options.check_option
+def status(store: str, last: int, check_seconds: float) -> None:
     """Show how an engine is doing, and what its store holds.
 
     STORE is the file or URL of the engine's store, as given to `dengine train` or `dengine run`,
     and must exist. If it holds several cells and none is named, they are only listed; cells of one
     product share labels and versions. The interval of bad accepted parts is valid if you look once;
-    the certificate is valid however often you look.
+    the certificate is valid however often you look. If the model was certain of parts that were
+    verified, as in shadow mode, a line says how much time the model would have saved, at
+    `--check-seconds` for each check.
     """
     from ..history.status import status as read_status
     from ..representation import to_jsonable
@@ -77,11 +81,15 @@ def status(store: str, last: int) -> None:
         report = read_status(opened, last, watching=True)
     record = {"store": store} | to_jsonable(report)
     record["certificate"] = certificate_record(report.certificate)
-    print_result(
-        record,
-        _overview_table(store, report),
-        table_of_rows("What it is", _present_rows(report)),
-    )
+    parts = [_overview_table(store, report), table_of_rows("What it is", _present_rows(report))]
+    n_certain = report.ever.would_accept.n + report.ever.would_reject.n
+    if n_certain:
+        seconds = format_duration(n_certain * check_seconds)
+        parts.append(
+            f"It would have decided {n_certain:,} of the {report.ever.verified:,} parts that were "
+            f"verified: {seconds} of checks at {format_duration(check_seconds)}."
+        )
+    print_result(record, *parts)
 
 
 def _overview_table(store: str, report: "Status") -> Any:

@@ -84,7 +84,6 @@ class PolicyCost:
         Bad parts among the accepted ones, good parts among the rejected ones.
     luck : float
         Of the order: half the width of the 95 % interval of the mean over the shuffles.
-    shuffles : int
     """
 
     policy: Policy
@@ -99,7 +98,6 @@ class PolicyCost:
     bad: ErrorRate
     good: ErrorRate
     luck: float
-    shuffles: int
 
     @property
     def escaped(self) -> float:
@@ -108,9 +106,7 @@ class PolicyCost:
 
     @property
     def screening_key(self) -> tuple[bool, float]:
-        """Whether every part was verified, so that such policies are sorted last, and the expected
-        cost.
-        """
+        """Whether nothing was decided, so that such policies are sorted last; the expected cost."""
         return self.accepted + self.rejected == 0.0, self.expected_cost
 
 
@@ -538,7 +534,7 @@ def _within_reach(
     if its settings are refused, or if it needs more good parts before it can accept one
     (`needed_parts`) than `n_good`, the number of good parts that a shuffle plays.
     """
-    policies: dict[Policy, None] = {}
+    policies = []
     out_of_reach = []
     for settings in changes:
         try:
@@ -556,8 +552,8 @@ def _within_reach(
                 "played"
             )
         else:
-            policies[policy] = None
-    return list(policies), out_of_reach
+            policies.append(policy)
+    return list(dict.fromkeys(policies)), out_of_reach
 
 
 def _by_policy(replays: Iterable[Replay]) -> dict[Policy, list[Replay]]:
@@ -696,7 +692,6 @@ def _policy_cost(policy: Policy, replays: Sequence[Replay], costs: Costs) -> Pol
         bad=bad,
         good=good,
         luck=luck,
-        shuffles=n,
     )
 
 

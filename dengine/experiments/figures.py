@@ -387,11 +387,11 @@ def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: i
             for neighbour in explanation.neighbours
             if neighbour.trace is not None and neighbour.success is success
         ]
-        style: Style = {"color": colour, "linewidth": 0.7, "alpha": 0.55}
-        for i, trace in enumerate(traces):
-            # matplotlib leaves labels that begin with _ out of the legend.
-            label = "_" if i else f"neighbours that were {name} ({len(traces)})"
-            axes.plot(x, trace, line, label=label, **style)
+        if traces:
+            lines = axes.plot(
+                x, np.transpose(traces), line, color=colour, linewidth=0.7, alpha=0.55
+            )
+            lines[0].set_label(f"neighbours that were {name} ({len(traces)})")
 
 
 def _draw_band(
@@ -407,21 +407,20 @@ def _draw_band(
     axes.plot(x, median, line, color=colour, linewidth=1.2, label=label)
 
 
-def data_picture(data: Dataset, title: str = "") -> Figure:
+def data_picture(data: Dataset) -> Figure:
     """Draw a data set's traces, and how they change in their order; return the figure.
 
     Above, a panel for each of the first three channels shows the median trace of good and of bad
     parts, and where the middle 80 % lie. Below are the share of good parts in a sliding tenth of
     the set, and among all, and the mean of each trace's first channel, in the order of the set.
-    Traces with a sample that is not finite are not drawn; their labels count in the share. `title`
-    begins the title.
+    Traces with a sample that is not finite are not drawn; their labels count in the share.
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     labels = _axis_labels(data.spec)
-    above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
+    above.suptitle(f"{data.name}: median trace, and where 10 to 90 % of them lie")
     x, x_label = _times(data.spec, X.shape[2])
     for i, axes in enumerate(above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]):
         for success, name, colour, line, _ in LABEL_STYLES:

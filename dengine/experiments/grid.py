@@ -89,7 +89,6 @@ class KeptReplays:
 
         self.folder = Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._digest = digest
         self._data_digest = digest((data.name, data.X, data.y, data.part, data.rate_hz))
 
     def path(self, task: Task) -> Path:
@@ -104,6 +103,8 @@ class KeptReplays:
             The reducer holds an object that cannot be hashed, such as a lambda, or is a
             module:Class that cannot be imported.
         """
+        from joblib import hash as digest
+
         contender = task.contender
         reducer = contender.recipe.reducer
         if isinstance(reducer, str):
@@ -121,7 +122,7 @@ class KeptReplays:
             reducer,
         )
         try:
-            name = self._digest((self._data_digest, _digest_of_source(), sources, settings))
+            name = digest((self._data_digest, _digest_of_source(), sources, settings))
         except (PicklingError, TypeError, AttributeError) as error:
             raise SettingError(
                 "Expected a reducer that can be told apart from others, to keep its replays; "

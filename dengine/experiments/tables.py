@@ -3,7 +3,7 @@ the screen, and sentences about them. `dengine replay` and `dengine compare` pri
 
     frame = frame_of(replays)
     rows = pool(frame, replays)
-    Console().print(pooled_table(rows), *promise_lines(rows))
+    Console().print(pooled_table(rows, "Replays", LEGEND), *promise_lines(rows))
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import percent
+from ..errors import counted, percent
 from ..files import write_output
 from ..records import RetrainReport
 from .metrics import CYCLE_SECONDS, STOP_SECONDS, VERIFY_SECONDS, pooled_error
@@ -152,7 +152,7 @@ def promise_lines(rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def pooled_table(rows: Sequence[Row], title: str = "Replays", legend: str = LEGEND) -> Table:
+def pooled_table(rows: Sequence[Row], title: str, legend: str) -> Table:
     """Return the rows that `pool` returned as a rich Table for the screen, with a legend below.
 
     There must be at least one row. The first column has the recipe, the guarantee, the policy's
@@ -251,8 +251,7 @@ def retrain_line(retrains: Sequence[RetrainReport]) -> str:
     if reasons:
         last_reason = reasons[-1].removeprefix("dropped: ")
         dropped = f"; {len(reasons)} dropped, the last for: {last_reason}"
-    plural = "s" * (len(retrains) > 1)
-    return f"{len(retrains)} retrain{plural}, the worst in {slowest:.3f} s{dropped}."
+    return f"{counted(len(retrains), 'retrain')}, the worst in {slowest:.3f} s{dropped}."
 
 
 def write_csv(frame: pd.DataFrame, path: str | Path, force: bool = False) -> Path:

@@ -141,6 +141,9 @@ def test_status_counts_what_the_shadow_mode_would_have_done_against_what_was_tru
     assert (ever["would_accept"]["n"] > 50, ever["would_accept"]["verdict"]) == (True, "kept")
     assert result["shadow"] is certified["shadowed"] is True
     assert ever["bad_accepts"]["n_known"] == 0  # nothing was accepted
+    words = line_of("status", store, "--check-seconds", "60")
+    assert f"decided {len(certain)} of the {ever['verified']} parts" in words
+    assert f": {60 * len(certain)} s of" in words
 
 
 # Who tells of stops; parts that were accepted, bad ones among them, confirmed good ones, and audited ones; what is known.

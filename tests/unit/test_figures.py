@@ -71,7 +71,10 @@ def test_guarantees_and_what_is_known_of_stops_are_rows_of_their_own():
     rows = pooled(replays)
     shown = [(row["guarantee"], row["stops"], row["retrains_dropped"]) for row in rows]
     assert shown == [("local", "some", 2), ("pooled", "all", 1)]
-    assert list(pooled_table(rows).columns[0].cells) == ["pca\nlocal, some", "pca\npooled, all"]
+    assert list(pooled_table(rows, "", "").columns[0].cells) == [
+        "pca\nlocal, some",
+        "pca\npooled, all",
+    ]
 
 
 def test_window_curves_are_shares_of_what_was_decided_in_all_replays():
@@ -139,6 +142,6 @@ def test_every_channel_is_drawn_in_its_own_unit_over_time_or_samples(data, rate_
     named = Dataset(both, data.y, rate_hz=rate_hz, unit="kN, mm", channels=("FZ", "SZ"))
     with DataEngine(recipe=RECIPE, trace=named.spec) as engine:
         explained = explained_picture(engine.explain(engine.decide(both[0]).id))
-    for figure in (data_picture(named, "x"), explained):
+    for figure in (data_picture(named), explained):
         assert {"FZ [kN]", "SZ [mm]"} <= {axes.get_ylabel() for axes in figure.axes}
         assert figure.axes[0].lines[0].get_xdata()[-1] == end
