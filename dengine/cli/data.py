@@ -181,7 +181,7 @@ def _trace_line(dataset: "Dataset", i: int) -> str:
 
     Of several channels, these are the samples of the first.
     """
-    trace = dataset.X[i] if dataset.X.ndim == 2 else dataset.X[i, 0]
+    trace = dataset.cube[i, 0]
     samples = [f"{value:.4g}" for value in (*trace[:3], *trace[-2:])]
     source = "" if dataset.source is None else f"{dataset.source[i]}, "
     label = "good" if dataset.y[i] else "bad"

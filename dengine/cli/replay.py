@@ -304,7 +304,8 @@ def _replay_and_print(
     error: BaseException | None = None
     try:
         played.extend(_play(dataset, tasks, stream))
-    except (KeyboardInterrupt, Exception) as interruption:  # what was finished is shown first
+    # What was finished before, which `extend` keeps, is shown first.
+    except (KeyboardInterrupt, Exception) as interruption:
         if not played:
             raise
         error = interruption

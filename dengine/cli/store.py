@@ -39,8 +39,8 @@ def _login_name() -> str:
 
 shadow_option = click.option(
     "--shadow",
-    type=bool,
-    metavar="on|off",
+    type=click.Choice(["on", "off"]),
+    callback=lambda context, option, state: None if state is None else state == "on",
     help=(
         "on: verify every part, and only record what the model would have done. off: let it decide."
     ),

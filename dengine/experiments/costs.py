@@ -345,10 +345,10 @@ def candidates(
     has stops="some" and no audits, these two get an audit rate of 5 %, because they need outcomes
     of accepted parts.
 
-    If `alphas` is empty, it is 0.1 alone. LBs come the lowest first. If `lower_bounds` is empty,
-    they are taken around break-even, at which 1 - LB is check / escape: 1 - LB is that ratio times
-    0.5, 1, 2, 4, 8 and 16 for "local" (or the user's own rule), times 1, 2 and 4 for "pooled", each
-    rounded to two digits. None is below 80 %; if all would be below it, 80 % is the only one.
+    LBs come the lowest first. If `lower_bounds` is empty, they are taken around break-even, at
+    which 1 - LB is check / escape: 1 - LB is that ratio times 0.5, 1, 2, 4, 8 and 16 for "local"
+    (or the user's own rule), times 1, 2 and 4 for "pooled", each rounded to two digits. None is
+    below 80 %; if all would be below it, 80 % is the only one.
     """
     policy = contender.recipe.policy
 
@@ -362,7 +362,7 @@ def candidates(
 
     is_own = policy.guarantee not in RULES
     first = policy.guarantee if is_own else "local"
-    for alpha in alphas or (ALPHA,):
+    for alpha in alphas:
         for bound in levels(FACTORS):
             yield {"guarantee": first, "alpha": alpha, "lower_bound": bound}
     if is_own or contender.baseline is not None:
@@ -402,7 +402,7 @@ def cost_curve(
     escape: float,
     false_reject: float,
     recipe: Any = "conv",
-    alphas: Sequence[float] = (),
+    alphas: Sequence[float] = (ALPHA,),
     lower_bounds: Sequence[float] = (),
     repeats: int = REPEATS,
     seed: int = 0,
@@ -431,9 +431,11 @@ def cost_curve(
         lower_bound and prices of its policy are replaced. If its policy has no audits (checks of
         parts that the model is certain of) and stops="some", the guarantees "pooled" and "cost" get
         an audit rate of 5 %, because they need outcomes of accepted parts.
-    alphas, lower_bounds : sequence of float
-        Values to try; by default 0.1, and values around 1 - check / escape that the number of
-        recordings allows.
+    alphas : sequence of float, default (0.1,)
+        Values to try under the guarantee "local", or under a rule of the user's own.
+    lower_bounds : sequence of float
+        Values to try; by default values around 1 - check / escape that the number of recordings
+        allows.
     repeats : int, default 4
         Fresh shuffles that the last policies play, at least 2.
     seed : int, default 0

@@ -323,7 +323,7 @@ def cost_picture(curve: CostCurve) -> Figure:
         axes.errorbar(row.cost, y, xerr=errors, label=label, markerfacecolor=fill, **style)
     axes.set_yticks(range(len(rows)), [policy_name(row.policy) for row in rows])
     axes.invert_yaxis()
-    finish(axes, 4, xlim=(0.0, end), xlabel="cost a part")
+    finish(axes, xlim=(0.0, end), xlabel="cost a part")
     return figure
 
 

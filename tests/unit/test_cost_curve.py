@@ -160,7 +160,7 @@ def test_needed_neighbours_are_those_of_the_interval_and_needed_members_those_of
 
 
 def test_candidates_lie_around_break_even_and_have_the_audits_that_they_need():
-    changes = list(candidates(Contender.load("pca"), Costs(0.5, 200, 5), (), ()))
+    changes = list(candidates(Contender.load("pca"), Costs(0.5, 200, 5), (0.1,), ()))
     levels = [change["lower_bound"] for change in changes if change["guarantee"] == "local"]
     assert levels == [0.96, 0.98, 0.99, 0.995, 0.9975, 0.9987]  # break-even is 99.75 %
     assert {change.get("audit_rate", 0.05) for change in changes} == {0.05}
