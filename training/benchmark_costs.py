@@ -16,7 +16,7 @@ of the check, and of the runs with the verdict "pays" how many are below checkin
 import argparse
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from dengine import Dataset, Policy, Replay, replay
-from dengine.experiments.costs import cost_curve, policy_name
+from dengine.experiments.costs import find_policy, policy_name
 from dengine.experiments.grid import play_tasks
 from dengine.experiments.metrics import Costs
 from dengine.experiments.replay import Contender, replay_policy
@@ -104,7 +104,8 @@ def run_one(name: str, run: int, n_later: int, names: Sequence[str]) -> list[dic
     for prices in names:
         costs = Costs(*PRICES[prices])
         player = contender.with_policy(stops="all")
-        curve = cost_curve(recordings, **asdict(costs), recipe=player, play=play)
+        curve = find_policy(recordings, player, costs, play)
+        assert curve is not None  # all was played
         policies = [row.policy for row in (*curve.rows, *curve.left_behind)]
         by_name = {"check everything": costs.check}
         for policy in policies:

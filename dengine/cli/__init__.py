@@ -104,7 +104,7 @@ def main() -> None:
     """Let a robot cell start with a slow check, and need it less as it learns.
 
     Exit codes: 0 success; 1 failure, with one line that says why; 2 wrong usage; 130 interrupted by
-    Ctrl-C, and what was done until then is kept and shown (by costs only kept, with --keep).
+    Ctrl-C, and what was done until then is kept and shown.
     """
 
 

@@ -103,7 +103,7 @@ def data(
         *filter(None, [shown, *_survey_parts(dataset, survey), last_line]),
         *fault_lines(dataset, MOST_FAULTS),
         out=out,
-        make_files=lambda: {"data.png": data_picture(dataset)},
+        make_files=lambda: {"data.png": data_picture(dataset, survey.name)},
     )
     if check and dataset.faults:
         context.exit(1)

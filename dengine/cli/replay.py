@@ -1,7 +1,7 @@
 """The subcommands `dengine replay`, `compare` and `costs`: recorded streams through fresh engines.
 
-All three take the options of `stream_options` for how streams are played. After Ctrl-C the first
-two show the replays that were finished.
+All three take the options of `stream_options` for how streams are played. After Ctrl-C or an error
+they show what was finished.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from ..datasets import Dataset
-    from ..experiments.costs import PolicyCost
+    from ..experiments.costs import CostCurve, PolicyCost
     from ..experiments.grid import PlayedReplay, Task
     from ..experiments.metrics import ErrorRate
     from ..experiments.replay import Contender, Replay
@@ -77,23 +77,47 @@ class Stream:
     keep: Path | None = None
 
 
-def _play(dataset: Dataset, tasks: Sequence[Task], stream: Stream) -> Iterator[PlayedReplay]:
-    """Play tasks, each a replay to be played, with a progress bar, and yield each as it ends.
+def _play(
+    dataset: Dataset, tasks: Sequence[Task], stream: Stream
+) -> tuple[list[PlayedReplay], BaseException | None]:
+    """Play tasks, each a replay to be played, with a progress bar; return what was finished.
 
-    Of `stream` the cycles, the number of processes and the folder of kept replays are used. Raises
-    what `iterate_replays` raises.
+    That is the finished replays in the order of their tasks, and the error or Ctrl-C that ended the
+    work early, which is not raised: the caller must pass it to `_end`. Of `stream` the cycles, the
+    number of processes and the folder of kept replays are used.
     """
     from ..experiments.grid import iterate_replays
 
+    played: list[PlayedReplay] = []
+    error: BaseException | None = None
     n_cycles = len(tasks) * (stream.cycles or len(dataset))
     with progress_bar(f"replaying {dataset.name}", n_cycles) as advance:
         # A callback cannot travel to other processes: there the bar moves by whole replays.
         on_cycle = (lambda cycle: advance(1)) if stream.n_jobs == 1 else None
-        for item in iterate_replays(
-            dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
-        ):
-            advance(len(item.replay) if on_cycle is None or item.kept else 0)
-            yield item
+        try:
+            for item in iterate_replays(
+                dataset, tasks, n_jobs=stream.n_jobs, keep=stream.keep, on_cycle=on_cycle
+            ):
+                played.append(item)
+                advance(len(item.replay) if on_cycle is None or item.kept else 0)
+        except (KeyboardInterrupt, Exception) as interruption:  # what was finished is shown first
+            error = interruption
+    return sorted(played, key=lambda item: item.position), error
+
+
+def _end(error: BaseException | None, text: str, is_shown: bool = True) -> None:
+    """End the subcommand if an error or Ctrl-C interrupted its replays; do nothing if `error` is
+    None.
+
+    `text` says which replays are shown. After Ctrl-C it is printed to stderr, and the exit code is
+    130. Any other error is raised; before, `text` is printed to stderr if `is_shown`.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        exit_interrupted(f"Interrupted: {text}")
+    if error is not None:
+        if is_shown:
+            click.echo(f"Interrupted: {text}", err=True)
+        raise error
 
 
 _SHUFFLES = "Number of shuffled replays of each recipe."
@@ -299,17 +323,11 @@ def _replay_and_print(
     tasks = grid_tasks(
         contenders, seeds=stream.seeds, cycles=stream.cycles, shuffle=stream.shuffle, **grid
     )
-    played: list[PlayedReplay] = []
     begin = time.perf_counter()
-    error: BaseException | None = None
-    try:
-        played.extend(_play(dataset, tasks, stream))
-    # What was finished before, which `extend` keeps, is shown first.
-    except (KeyboardInterrupt, Exception) as interruption:
-        if not played:
-            raise
-        error = interruption
-    played.sort(key=lambda item: item.position)
+    played, error = _play(dataset, tasks, stream)
+    finished = f"{len(played)} of {len(tasks)} replays were finished"
+    if not played:
+        _end(error, f"{finished}; there is nothing to show.", False)
     replays = [item.replay for item in played]
     seconds = time.perf_counter() - begin
     n_kept = sum(item.kept for item in played)
@@ -335,14 +353,7 @@ def _replay_and_print(
     print_result(
         record, *parts, out=out, make_files=lambda: dict(_replay_files(frame, replays, title))
     )
-    if error is None:
-        return
-    n_done = f"{len(played)} of {len(tasks)}"
-    text = f"Interrupted: {n_done} replays were finished; the table shows those."
-    if isinstance(error, KeyboardInterrupt):
-        exit_interrupted(text)
-    click.echo(text, err=True)
-    raise error
+    _end(error, f"{finished}; the table shows those.")
 
 
 def _group_replays(
@@ -425,6 +436,7 @@ CURVE_FIELDS = (
     "costs",
     "cycles",
     "shuffles",
+    "fresh",
 )
 
 
@@ -450,6 +462,9 @@ PRICES = {
 )
 @options.data_options()
 @options.bundle_options("part_prices", dict, PRICES)
+@click.option(
+    "--cost-unit", default="s", show_default=True, help="Unit of these costs: s, EUR, ..."
+)
 @options.recipe_options
 @options.bundle_options("lists", options.drop_none, GRID_LISTS)
 @stream_options(
@@ -463,6 +478,7 @@ PRICES = {
 def costs(
     choice: RecipeChoice,
     part_prices: dict[str, Any],
+    cost_unit: str,
     lists: Options,
     source: DataChoice,
     stream: Stream,
@@ -477,39 +493,50 @@ def costs(
     --lower-bound, around break-even, where accepting costs as much as verifying (or those of
     --lower-bounds); a baseline or a rule of your own is tried without pooled and cost. One value
     (--alpha) where a list is tried (--alphas) is a usage error. All costs are in one unit, such as
-    seconds of production or money. --out writes costs.csv and costs.png. After Ctrl-C, or an error
-    in a replay, nothing is shown; with --keep the same command continues there.
+    seconds of production or money. --out writes costs.csv and costs.png. Ctrl-C, or an error in a
+    replay, ends it and shows what was finished, if at least two shuffles are finished by every
+    policy that is left.
     """
     _refuse_value_beside_list(choice.settings, ("alphas", "lower_bounds"))
-    from ..experiments.costs import cost_curve, settings_of
+    from ..experiments.costs import find_policy, settings_of
     from ..experiments.figures import cost_picture
+    from ..experiments.metrics import Costs
     from ..experiments.tables import table_of_numbers
 
     dataset = source.load()
+    error: BaseException | None = None
 
     def play(tasks: Sequence[Task]) -> list[Replay]:
-        """Play tasks with a progress bar, and return their replays in the order of the tasks."""
-        played = sorted(_play(dataset, tasks, stream), key=lambda item: item.position)
+        """Play tasks with a progress bar; return the finished replays in the order of the tasks,
+        and keep what interrupted them in `error`.
+        """
+        nonlocal error
+        played, error = _play(dataset, tasks, stream)
         return [item.replay for item in played]
 
-    curve = cost_curve(
+    curve = find_policy(
         dataset,
-        recipe=choice.make_contender(),
+        choice.make_contender(),
+        Costs(**part_prices),
+        play,
         repeats=len(stream.seeds),
         seed=stream.seeds[0],
         cycles=stream.cycles,
-        play=play,
-        **part_prices,
         **lists,
     )
+    if curve is None:
+        _end(error, "too little was finished; there is nothing to show.", False)
+        return
     check = amount(curve.costs.check)
     verify_all = ("" if curve.policy else ">", "check all", "-", check, check, "100 %", "-", "-")
     rows = [verify_all, *(_cost_cells(row, row.policy == curve.policy) for row in curve.rows)]
-    title = f"{curve.recipe} on {curve.dataset}: what a part costs"
-    lines = [curve.sentence, curve.price_sentence]
-    if curve.out_of_reach:
-        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
-    record: Record = {"data": curve.dataset}
+    title = f"{curve.recipe} on {curve.dataset}: what a part costs, in {cost_unit}"
+    lines = _curve_lines(curve, dataset)
+    record: Record = {
+        "data": curve.dataset,
+        "unit": cost_unit,
+        "interrupted": error is not None,
+    }
     record |= {name: getattr(curve, name) for name in CURVE_FIELDS}
     if curve.policy is not None:
         settings = settings_of(curve.policy)
@@ -531,9 +558,33 @@ def costs(
         out=out,
         make_files=lambda: {
             "costs.csv": frame,
-            "costs.png": cost_picture(curve),
+            "costs.png": cost_picture(curve, unit=cost_unit),
         },
     )
+    _end(error, "what was finished is shown.")
+
+
+def _curve_lines(curve: CostCurve, dataset: Dataset) -> list[str]:
+    """Return the sentences below the table of a cost curve: what a part costs under each policy.
+
+    They say which policy was chosen, and how the choice depends on the prices. If there are any,
+    they also say how many recordings of the data set equal an earlier one (by `content_hash`),
+    which policies were left behind because they were dearer in the first shuffles, and which were
+    not tried.
+    """
+    from ..experiments.costs import policy_name
+    from ..experiments.survey import survey_dataset
+
+    lines = [curve.sentence, curve.price_sentence]
+    repeats = survey_dataset(dataset).duplicates
+    if repeats:
+        lines.append(f"Of the recordings {repeats:,} repeat another: the interval is too narrow.")
+    by_shuffles = [f"{policy_name(row.policy)} {amount(row.cost)}" for row in curve.left_behind]
+    if by_shuffles:
+        lines.append(f"Left behind by the first shuffles: {', '.join(by_shuffles)}.")
+    if curve.out_of_reach:
+        lines.append(f"Not tried: {'; '.join(curve.out_of_reach)}.")
+    return lines
 
 
 def _as_flags(settings: Options) -> str:

@@ -159,6 +159,9 @@ class CostCurve:
         Their names.
     cycles, shuffles : int
         Parts of each shuffle, and number of shuffles that are reported.
+    fresh : bool
+        Whether the reported shuffles are fresh: no policy was chosen by them. False if the search
+        was interrupted before it could play fresh ones.
     """
 
     costs: Costs
@@ -172,6 +175,7 @@ class CostCurve:
     recipe: str
     cycles: int
     shuffles: int
+    fresh: bool
 
     @property
     def policy(self) -> Policy | None:
@@ -237,7 +241,7 @@ class CostCurve:
         pay, how many more parts would show that it pays.
 
         They begin with "Nothing pays" if no policy pays or may pay. They also say if another policy
-        is cheaper, but not significantly.
+        is cheaper, but not significantly, and if the search was interrupted.
         """
         row = self.marked
         cheapest = self.rows[0]
@@ -274,6 +278,8 @@ class CostCurve:
                 f"count as {missing.seen:,}: {missing.recordings:,} more recordings, or "
                 f"{missing.production:,} parts of production {how}."
             )
+        if not self.fresh:
+            text += " The search was not finished: these shuffles also chose the policy."
         return text[0].upper() + text[1:]
 
     @property
@@ -409,7 +415,6 @@ def cost_curve(
     cycles: int | None = None,
     n_jobs: int = 1,
     keep: FilePath | None = None,
-    play: Play | None = None,
 ) -> CostCurve:
     """Find the policy that pays by three prices, and what a part costs under it.
 
@@ -448,9 +453,6 @@ def cost_curve(
     keep : path or None, default None
         Folder of finished replays, made if it is missing: those in it are not played again, unless
         their file is damaged, and others are added.
-    play : callable or None, default None
-        Returns the replays of a list of tasks; `n_jobs` and `keep` are then without effect. None
-        plays them by `play_tasks`.
 
     Returns
     -------
@@ -473,8 +475,41 @@ def cost_curve(
         If the folder `keep` cannot be made.
     """
     data = load_dataset(dataset)
-    contender = Contender.load(recipe)
-    costs = Costs(check, escape, false_reject)
+    curve = find_policy(
+        data,
+        Contender.load(recipe),
+        Costs(check, escape, false_reject),
+        partial(play_tasks, data, n_jobs=n_jobs, keep=keep),
+        alphas=alphas,
+        lower_bounds=lower_bounds,
+        repeats=repeats,
+        seed=seed,
+        cycles=cycles,
+    )
+    assert curve is not None  # all was played
+    return curve
+
+
+def find_policy(
+    data: Dataset,
+    contender: Contender,
+    costs: Costs,
+    play: Play,
+    *,
+    alphas: Sequence[float] = (ALPHA,),
+    lower_bounds: Sequence[float] = (),
+    repeats: int = REPEATS,
+    seed: int = 0,
+    cycles: int | None = None,
+) -> CostCurve | None:
+    """Do what `cost_curve` does, with replays that the caller plays.
+
+    `play` returns the replays of a list of tasks, in this order. If it returns fewer, as after
+    Ctrl-C, nothing more is played. The result is then computed from the fresh shuffles that every
+    policy has finished, if there are two or more. Otherwise it is computed from the earlier ones,
+    with its field `fresh` False; without two of these it is None. The other parameters are those of
+    `cost_curve`. Raises SettingError like that, and what `play` raises.
+    """
     _check_search(data, costs, repeats)
     n_cycles = len(data) if cycles is None else cycles
     changes = candidates(contender, costs, alphas, lower_bounds)
@@ -485,21 +520,44 @@ def cost_curve(
         len(data),
         f"this is what they lack: {'; '.join(out_of_reach)}",
     )
-    play = play or partial(play_tasks, data, n_jobs=n_jobs, keep=keep)
     screened: list[Replay] = []
     rows: dict[Policy, PolicyCost] = {}
-    while len(policies) > N_LAST:
+    is_whole = True
+    while is_whole and len(policies) > N_LAST:
         seeds = range(seed, seed + N_SCREENING)
-        screened += _screen(play, contender, policies, seeds, n_cycles)
-        groups = _by_policy(screened)
-        rows = {policy: _policy_cost(policy, group, costs) for policy, group in groups.items()}
-        policies.sort(key=lambda policy: rows[policy].screening_key)
-        del policies[max(N_LAST, len(policies) // 2) :]
-        seed += N_SCREENING
+        played = list(_screen(play, contender, policies, seeds, n_cycles))
+        screened += played
+        is_whole = len(played) == N_SCREENING * len(policies)
+        if is_whole:
+            groups = _by_policy(screened)
+            rows = {policy: _policy_cost(policy, group, costs) for policy, group in groups.items()}
+            policies.sort(key=lambda policy: rows[policy].screening_key)
+            del policies[max(N_LAST, len(policies) // 2) :]
+            seed += N_SCREENING
     seeds = range(seed, seed + repeats)
-    fresh = _by_policy(play(_tasks(contender, policies, seeds, n_cycles)))
-    left_behind = tuple(row for policy, row in rows.items() if policy not in fresh)
-    return curve_of(fresh, costs, left_behind, tuple(out_of_reach))
+    fresh = play(_tasks(contender, policies, seeds, n_cycles)) if is_whole else []
+    finished = [_finished(replays, policies) for replays in (fresh, screened)]
+    chosen = finished[0] or finished[1]
+    if not chosen:
+        return None
+    left_behind = tuple(row for policy, row in rows.items() if policy not in policies)
+    return curve_of(chosen, costs, left_behind, tuple(out_of_reach), fresh=bool(finished[0]))
+
+
+def _finished(replays: Iterable[Replay], policies: Sequence[Policy]) -> Groups:
+    """Return each policy's replays of the shuffles that all these policies have finished.
+
+    Empty if there are fewer than two such shuffles.
+    """
+    groups = _by_policy(replays)
+    seeds = [{replay.seed for replay in groups.get(policy, ())} for policy in policies]
+    common = set.intersection(*seeds)
+    if len(common) < 2:
+        return {}
+    return {
+        policy: [replay for replay in groups[policy] if replay.seed in common]
+        for policy in policies
+    }
 
 
 def _check_search(data: Dataset, costs: Costs, repeats: int) -> None:
@@ -598,14 +656,15 @@ def curve_of(
     costs: Costs,
     left_behind: tuple[PolicyCost, ...] = (),
     out_of_reach: tuple[str, ...] = (),
+    fresh: bool = True,
 ) -> CostCurve:
     """Return what a part costs under some policies at these prices, and which policy to choose.
 
     `groups` has each policy with its replays, all of the same shuffles in the same order. The
     choice is repeated with each price halved and doubled; what changes then is in the field
-    `price_changes` of the result. Two arguments become fields of the result: `left_behind`, the
-    policies that were dearer in earlier shuffles; and `out_of_reach`, policies that were not
-    played, each with the reason.
+    `price_changes` of the result. Three arguments become fields of the result: `left_behind`, the
+    policies that were dearer in earlier shuffles; `out_of_reach`, policies that were not played,
+    each with the reason; and `fresh`, whether no policy was chosen by these shuffles.
     """
     rows, marked, verdict = _choose(groups, costs)
     chosen = _chosen_name(marked, verdict)
@@ -629,6 +688,7 @@ def curve_of(
         recipe=replays[0].name,
         cycles=len(replays[0]),
         shuffles=len(replays),
+        fresh=fresh,
     )
 
 

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..datasets import Dataset
-from ..errors import OutputError, counted, instead
+from ..errors import OutputError, amount, counted, instead
 from ..files import write_output
 from ..history.explain import Explanation
 from ..records import Action, Floats, TraceSpec
+from ..reducers import has_own_unit
 from .costs import CostCurve, policy_name
 from .replay import Replay
 
@@ -50,8 +51,14 @@ RECIPES = (GREEN, PINK, ORANGE, SKY, BLUE, RED)  # first the colours that mean n
 LIMIT: Style = {"color": BLACK, "linestyle": ":", "linewidth": 1.2}  # a bound that is given
 SMALL = 9  # points: legends and notes
 WINDOW = 300  # cycles of a sliding window, and parts of a map: the paper's
+# Wrong decisions, what they are counted among, their name in the legend, and their line.
+ERRORS = (
+    ("false_positive", "accepted", "bad", "-"),
+    ("false_negative", "rejected", "good", "--"),
+)
 # Label, name, colour, line and marker of parts.
 LABEL_STYLES = ((True, "good", GOOD, "-", "o"), (False, "bad", BAD, "--", "X"))
+CLEAR = 0.1  # band widths below which leaving the band is not marked
 FEWEST = 20  # a share of fewer parts jumps by more than 5 % with each part, and is not drawn
 # Drawn in this order, so that the few certain ones lie on top.
 ACTION_MARKS: dict[Any, tuple[str, Style]] = {
@@ -141,7 +148,10 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     The left panel shows which parts were good and bad, the right one what was decided. A point is
     the mean over the embedding spaces of the folds, in its first two dimensions (0 for a second one
     that is missing), as it was at the decision; later retrains do not move it. Parts that no model
-    embedded are left out, on the left also parts of unknown truth.
+    embedded are left out, on the left also parts of unknown truth. A circle with the recipe's
+    radius is the neighbourhood of the newest point. Without any point a text says so. If the first
+    dimension is a probability, the second says little: the vertical axis is then the cycle, and two
+    vertical lines bound the neighbourhood.
 
     Parameters
     ----------
@@ -158,6 +168,13 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
     # Zeros where a reducer has but one dimension.
     z = np.hstack([positions, np.zeros_like(positions[:, :1])])[:, :2]
     embedded = np.isfinite(z).all(axis=1)
+    is_probability = has_own_unit(replay.recipe.reducer)
+    x_label = "embedding 1 [root mean square radius = 1]"
+    y_label = "embedding 2 [root mean square radius = 1]"
+    if is_probability:
+        z[:, 1] = np.arange(len(z)) + len(replay) - len(z) + 1
+        x_label = "predicted probability of success"
+        y_label = "cycle"
     panels = (
         (left, "what the parts were", replay.truth, TRUTH_MARKS),
         (right, "what was decided", replay.action, ACTION_MARKS),
@@ -168,10 +185,46 @@ def embedding_map(replay: Replay, title: str = "") -> Figure:
             axes.scatter(
                 *points.T, label=f"{word} ({len(points)})", alpha=0.7, linewidths=0, **style
             )
-        finish(axes, xlabel="embedding 1")
+        if not embedded.any():
+            axes.text(0.5, 0.5, "no trace was embedded yet", ha="center", transform=axes.transAxes)
+        finish(axes, xlabel=x_label)
         axes.set_title(name, pad=24)
-    left.set(ylabel="embedding 2")
+    left.set(ylabel=y_label)
+    if is_probability:
+        left.set_xlim(-0.06, 1.06)
+    elif embedded.any():
+        low = z[embedded].min(axis=0)
+        high = z[embedded].max(axis=0)
+        half = 0.56 * (high - low).max() + 1e-9  # the panel is a square in data units
+        x, y = (low + high) / 2
+        left.set(xlim=(x - half, x + half), ylim=(y - half, y + half))
+    if embedded.any():
+        _draw_neighbourhood(figure, z[embedded][-1], replay.recipe.radius, is_probability)
+    if not is_probability:
+        left.set_aspect("equal")
+        right.set_aspect("equal")
     return figure
+
+
+def _draw_neighbourhood(figure: Figure, centre: Floats, radius: float, is_strip: bool) -> None:
+    """Draw a point as a cross, with its neighbourhood, into all axes of a figure; add a legend.
+
+    `centre` (2,) is the point, and `radius` the radius of its neighbourhood, which is a circle, or
+    a strip between two vertical lines if `is_strip`.
+    """
+    from matplotlib.patches import Circle
+
+    style: Style = {"edgecolor": BLACK, "linewidth": 1.4}
+    x, y = centre
+    for axes in figure.axes:
+        if is_strip:
+            for end in (x - radius, x + radius):
+                axes.axvline(end, color=BLACK, linewidth=1.4)
+        else:
+            axes.add_patch(Circle((x, y), radius, fill=False, **style))
+        label = f"newest part; its neighbourhood ends at the black line, radius {radius:g}"
+        (mark,) = axes.plot(x, y, "+", color=BLACK, markersize=9, label=label)
+    figure.legend(handles=[mark], loc="outside lower center", frameon=False, fontsize=SMALL)
 
 
 def window_curves(replays: Sequence[Replay], window: int = WINDOW, fewest: int = 1) -> pd.DataFrame:
@@ -233,8 +286,9 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     The panels show, from the top: the share of certain decisions, those without a check, and its
     spread over the replays; the share of good parts among the accepted parts, and the policy's
     lower bound LB; bad parts among the accepted parts (solid), good parts among the rejected parts
-    (dashed), and the tolerance 100 - LB, all in percent. Shares of fewer than 20 parts are not
-    drawn. The window is 300 cycles, or a third of the longest replay if that is less.
+    (dashed), and the tolerance 100 - LB, all in percent. The legend below has the counts of wrong
+    decisions. Shares of fewer than 20 parts are not drawn. The window is 300 cycles, or a third of
+    the longest replay if that is less.
 
     Parameters
     ----------
@@ -263,9 +317,15 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
         certain.fill_between(x, low, shares["certain_high"], color=colour, alpha=0.15, linewidth=0)
         certain.plot(x, shares["certain"], color=colour)
         precision.plot(x, shares["precision"], color=colour)
-        errors.plot(x, shares["false_positive"], "-", color=colour)
-        errors.plot(x, shares["false_negative"], "--", color=colour)
-        handles += certain.plot([], color=colour, label=name)
+        wrong = []
+        for kind, decided, word, line in ERRORS:
+            errors.plot(x, shares[kind], line, color=colour)
+            n_wrong, n_decided = (
+                sum(int(getattr(replay, field).sum()) for replay in replays)
+                for field in (kind, decided)
+            )
+            wrong.append(f"{n_wrong} {word} of {n_decided} {decided}")
+        handles += certain.plot([], color=colour, label=f"{name}: {', '.join(wrong)}")
     bounds = sorted({100 * replay.recipe.policy.lower_bound for replay in all_replays})
     tolerances = [100 - bound for bound in bounds]
     for axes, levels, name in (
@@ -276,8 +336,11 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
         for i, level in enumerate(levels):
             axes.axhline(level, label="_" if i else f"{name} = {text} %", **LIMIT)
     finish(certain, 0, ylim=(0, 102), ylabel="certain\n[% of cycles]")
-    finish(precision, ylim=(None, 100.5), ylabel="precision\n[% of accepted]")
-    finish(errors, ylim=(0, None), ylabel="bad of accepted, good of\nrejected (dashed) [%]")
+    finish(precision, ylabel="precision\n[% of accepted]")
+    precision.set_ylim(max(0.0, min(precision.get_ylim()[0], bounds[0] - 1)), 100.5)
+    # At least half as much again above the tolerance: the panel shows whether errors keep to it.
+    highest = max(errors.get_ylim()[1], 1.5 * tolerances[0])
+    finish(errors, ylim=(0, highest), ylabel="bad of accepted, good of\nrejected (dashed) [%]")
     errors.set(
         xlabel=f"cycle (end of a window of {window}; a share of fewer than {FEWEST} parts is not "
         "drawn)"
@@ -286,18 +349,21 @@ def curves(by_recipe: Mapping[str, Sequence[Replay]], title: str = "") -> Figure
     return figure
 
 
-def cost_picture(curve: CostCurve) -> Figure:
+def cost_picture(curve: CostCurve, unit: str = "s") -> Figure:
     """Draw what a part costs under each policy, with 95 % intervals.
 
     On top are the policies that played the reported shuffles, the cheapest first. Below them,
     hollow, are those that were left behind: their costs are of earlier shuffles, and cannot be
-    compared with the others. A line marks the cost of checking everything. The axis begins at 0 and
-    ends at 1.3 times the largest of these costs and the price of a check, where longer intervals
-    are cut off.
+    compared with the others. A line marks the cost of checking everything, and a ring the chosen
+    policy, if one pays or may pay. The axis begins at 0 and ends at 1.3 times the largest of these
+    costs and the price of a check; an interval that goes beyond its end ends in an arrow with its
+    value. The right panel shows the share of parts that were decided without a check.
 
     Parameters
     ----------
     curve : CostCurve
+    unit : str, default "s"
+        Of the costs.
 
     Returns
     -------
@@ -305,25 +371,35 @@ def cost_picture(curve: CostCurve) -> Figure:
     """
     costs = curve.costs
     title = (
-        f"{curve.dataset}, {curve.recipe}: check {costs.check:g}, escape {costs.escape:g}, "
-        f"false reject {costs.false_reject:g}\n{counted(curve.shuffles, 'shuffle')} of "
-        f"{curve.cycles} parts, with 95 % intervals"
+        f"{curve.dataset}, {curve.recipe}: check {costs.check:g} {unit}, escape {costs.escape:g} "
+        f"{unit}, false reject {costs.false_reject:g} {unit}\n{counted(curve.shuffles, 'shuffle')} "
+        f"of {curve.cycles} parts, with 95 % intervals"
     )
+    n_last = len(curve.rows)
     rows = [*curve.rows, *curve.left_behind]
+    labels = {0: "played last", n_last: "left behind"}  # of the first row of each kind
     figure = blank(9.0, 2.2 + 0.34 * len(rows), title)
-    axes = figure.subplots()
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(3, 1))
     end = 1.3 * max(costs.check, *(row.cost for row in rows))
-    axes.axvline(costs.check, label="check everything", **LIMIT)
+    left.axvline(costs.check, label="check everything", **LIMIT)
     style: Style = {"color": BLUE, "capsize": 3, "fmt": "o"}
-    labels = {0: "played last", len(curve.rows): "left behind"}  # of the first row of each kind
     for y, row in enumerate(rows):
-        errors = [[row.cost - row.lower], [row.upper - row.cost]]
-        fill = BLUE if y < len(curve.rows) else "none"
+        is_last = y < n_last
+        errors = [[row.cost - max(row.lower, 0.0)], [min(row.upper, end) - row.cost]]
         label = labels.get(y, "_")
-        axes.errorbar(row.cost, y, xerr=errors, label=label, markerfacecolor=fill, **style)
-    axes.set_yticks(range(len(rows)), [policy_name(row.policy) for row in rows])
-    axes.invert_yaxis()
-    finish(axes, xlim=(0.0, end), xlabel="cost a part")
+        fill = BLUE if is_last else "none"
+        left.errorbar(row.cost, y, xerr=errors, label=label, markerfacecolor=fill, **style)
+        if row.upper > end:
+            left.text(end, y, f"to {amount(row.upper)} \u2192", ha="right", va="bottom", size=SMALL)
+        right.barh(y, 100 * (row.accepted + row.rejected), color=BLUE, fill=is_last)
+    if curve.policy is not None:
+        ring: Style = {"facecolors": "none", "edgecolors": BLACK, "linewidths": 1.6, "zorder": 5}
+        where = curve.rows.index(curve.marked)
+        left.scatter(curve.marked.cost, where, s=200, label=f"choice: {curve.verdict}", **ring)
+    left.set_yticks(range(len(rows)), [policy_name(row.policy) for row in rows])
+    left.invert_yaxis()
+    finish(left, 4, xlim=(0.0, end), xlabel=f"cost a part [{unit}]")
+    finish(right, 0, xlim=(0, 100), xlabel="decided without\na check [% of parts]")
     return figure
 
 
@@ -348,30 +424,42 @@ def _times(spec: TraceSpec, samples: int) -> tuple[Floats, str]:
 def explained_picture(explanation: Explanation) -> Figure:
     """Draw the trace of a decision with its neighbours and the envelope; return the figure.
 
-    It has a panel for each channel. The envelope is the band in which 95 % of the successes lie at
-    each sample; without one only the traces are drawn. The title has the decision, its reason, the
-    version and the label.
+    It has a panel for each of at most four channels, in their order: those that are outside the
+    envelope in most samples, of equal ones the first. The envelope is the band in which 95 % of the
+    successes lie at each sample. Samples that are outside by more than a tenth of its width are
+    shaded. Without an envelope only the traces are drawn, of the first four channels. The title has
+    the decision, its reason, the version and the label.
     """
     stored = explanation.decision
     decision = stored.decision
     envelope = explanation.envelope
     trace = explanation.trace
+    is_outside = np.zeros(trace.shape, dtype=bool)
+    if envelope is not None:
+        margin = CLEAR * (envelope.high - envelope.low)
+        is_outside = (trace < envelope.low - margin) | (trace > envelope.high + margin)
+    channels = sorted(np.argsort(-is_outside.sum(axis=1), kind="stable")[:4].tolist())
     version = f"version {decision.model_version}" if decision.model_version else "no model yet"
     title = (
         f"{decision.id}: {decision.action.value}, {decision.reason.value} ({version}); label: "
         f"{stored.label}"
     )
-    figure = blank(10.0, 1.5 + 2.3 * len(trace), title)
-    panels = figure.subplots(len(trace), 1, sharex=True, squeeze=False)[:, 0]
+    figure = blank(10.0, 1.5 + 2.3 * len(channels), title)
+    panels = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     labels = _axis_labels(explanation.spec)
     x, x_label = _times(explanation.spec, trace.shape[1])
-    for i, axes in enumerate(panels):
+    for i, (axes, channel) in enumerate(zip(panels, channels, strict=True)):
         if envelope is not None:
-            band = (envelope.low[i], envelope.median[i], envelope.high[i])
+            band = (envelope.low[channel], envelope.median[channel], envelope.high[channel])
             _draw_band(axes, x, band, GREEN, "-", f"95 % of {envelope.n:,} successes, median")
-        _draw_neighbours(axes, x, explanation, i)
-        axes.plot(x, trace[i], color=BLACK, linewidth=1.6, label="this trace")
-        finish(axes, legend=0 if i else 3, ylabel=labels[i])
+        _draw_neighbours(axes, x, explanation, channel)
+        axes.plot(x, trace[channel], color=BLACK, linewidth=1.6, label="this trace")
+        if is_outside[channel].any():
+            height = axes.get_xaxis_transform()
+            where = is_outside[channel]
+            shade: Style = {"color": ORANGE, "alpha": 0.3, "label": "outside the band"}
+            axes.fill_between(x, 0.0, 1.0, where=where, transform=height, zorder=0, **shade)
+        finish(axes, legend=0 if i else 3, ylabel=labels[channel])
     panels[-1].set(xlabel=x_label)
     return figure
 
@@ -387,11 +475,11 @@ def _draw_neighbours(axes: Axes, x: Floats, explanation: Explanation, channel: i
             for neighbour in explanation.neighbours
             if neighbour.trace is not None and neighbour.success is success
         ]
-        if traces:
-            lines = axes.plot(
-                x, np.transpose(traces), line, color=colour, linewidth=0.7, alpha=0.55
-            )
-            lines[0].set_label(f"neighbours that were {name} ({len(traces)})")
+        style: Style = {"color": colour, "linewidth": 0.7, "alpha": 0.55}
+        for i, trace in enumerate(traces):
+            # matplotlib leaves labels that begin with _ out of the legend.
+            label = "_" if i else f"neighbours that were {name} ({len(traces)})"
+            axes.plot(x, trace, line, label=label, **style)
 
 
 def _draw_band(
@@ -407,20 +495,21 @@ def _draw_band(
     axes.plot(x, median, line, color=colour, linewidth=1.2, label=label)
 
 
-def data_picture(data: Dataset) -> Figure:
+def data_picture(data: Dataset, title: str = "") -> Figure:
     """Draw a data set's traces, and how they change in their order; return the figure.
 
     Above, a panel for each of the first three channels shows the median trace of good and of bad
     parts, and where the middle 80 % lie. Below are the share of good parts in a sliding tenth of
     the set, and among all, and the mean of each trace's first channel, in the order of the set.
-    Traces with a sample that is not finite are not drawn; their labels count in the share.
+    Traces with a sample that is not finite are not drawn; their labels count in the share. `title`
+    begins the title.
     """
     X = data.cube
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(X).all(axis=(1, 2)))
     figure = blank(9.0, 7.6)
     above, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.1))[:, 0]
     labels = _axis_labels(data.spec)
-    above.suptitle(f"{data.name}: median trace, and where 10 to 90 % of them lie")
+    above.suptitle(f"{title}: median trace, and where 10 to 90 % of them lie")
     x, x_label = _times(data.spec, X.shape[2])
     for i, axes in enumerate(above.subplots(1, min(X.shape[1], 3), squeeze=False)[0]):
         for success, name, colour, line, _ in LABEL_STYLES:

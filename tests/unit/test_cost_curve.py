@@ -17,6 +17,7 @@ from dengine.experiments.costs import (
     candidates,
     cost_curve,
     curve_of,
+    find_policy,
     needed_parts,
     part_costs,
     policy_name,
@@ -208,16 +209,9 @@ def test_the_cheaper_half_plays_on_and_the_last_two_report_on_shuffles_that_chos
         seeds.append([task.seed for task in tasks])
         return cheaper_by_level(tasks)
 
-    result = cost_curve(
-        data,
-        recipe="knn",
-        lower_bounds=BOUNDS,
-        alphas=(0.2,),
-        repeats=3,
-        seed=7,
-        play=play,
-        **PRICES,
-    )
+    contender = Contender.load("knn")
+    settings = {"lower_bounds": BOUNDS, "alphas": (0.2,), "repeats": 3, "seed": 7}
+    result = find_policy(data, contender, COSTS, play, **settings)
     assert [(len(item), {*item}) for item in seeds] == [
         (12, {7, 8}),
         (6, {9, 10}),
@@ -225,8 +219,22 @@ def test_the_cheaper_half_plays_on_and_the_last_two_report_on_shuffles_that_chos
     ]
     assert [row.policy.lower_bound for row in result.rows] == [0.6, 0.7]
     assert len(result.left_behind) == 4
-    assert result.shuffles == 3
+    assert (result.shuffles, result.fresh) == (3, True)
     assert result.to_frame()["reported"].sum() == 2
+
+
+@pytest.mark.parametrize(("n_rounds", "fresh"), [(0, None), (1, False), (2, False)])
+def test_a_search_that_is_interrupted_shows_what_was_finished(n_rounds, fresh, data):
+    rounds = []
+
+    def play(tasks: Sequence[Task]) -> list[Replay]:
+        rounds.append(tasks)
+        return cheaper_by_level(tasks if len(rounds) <= n_rounds else tasks[:1])
+
+    contender = Contender.load("knn")
+    result = find_policy(data, contender, COSTS, play, lower_bounds=BOUNDS)
+    assert (result and result.fresh) is fresh
+    assert not result or "these shuffles also chose the policy" in result.sentence
 
 
 @pytest.mark.parametrize(

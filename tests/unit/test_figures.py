@@ -118,6 +118,7 @@ UNTRAINED = replay_of(["verify"] * 5, [1] * 5, position=np.full((5, 2), np.nan))
 PICTURES: dict[str, Callable[[], Figure]] = {
     "curves": lambda: curves({"pca": [MANY_RIGHT], "conv": [ONE_WRONG]}, "a title"),
     "map": lambda: embedding_map(ONE_WRONG, title="a title"),
+    "map of nothing": lambda: embedding_map(UNTRAINED),
     "map of probabilities": lambda: embedding_map(replace(ONE_WRONG, recipe=Recipe("conv"))),
     "curves of a grid": lambda: curves({f"pca, LB {i} %": [UNTRAINED] for i in range(20)}),
     "run": lambda: curves({"this run": [LOG]}, "a title"),
@@ -142,6 +143,6 @@ def test_every_channel_is_drawn_in_its_own_unit_over_time_or_samples(data, rate_
     named = Dataset(both, data.y, rate_hz=rate_hz, unit="kN, mm", channels=("FZ", "SZ"))
     with DataEngine(recipe=RECIPE, trace=named.spec) as engine:
         explained = explained_picture(engine.explain(engine.decide(both[0]).id))
-    for figure in (data_picture(named), explained):
+    for figure in (data_picture(named, "x"), explained):
         assert {"FZ [kN]", "SZ [mm]"} <= {axes.get_ylabel() for axes in figure.axes}
         assert figure.axes[0].lines[0].get_xdata()[-1] == end
