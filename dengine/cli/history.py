@@ -96,13 +96,14 @@ class Moment(click.ParamType):  # type: ignore[type-arg]  # click made it generi
     type=Moment(),
     help="Only decisions since then: 30m, 12h, 7d ago, or 2026-03-01T14:30, in UTC.",
 )
+@click.option("--until", type=Moment(), help="Only decisions before then, given as for --since.")
 @click.option("--events", is_flag=True, help="Show the retrains and events between them too.")
 def history(store: str, events: bool, **criteria: Any) -> None:
     """Show the decisions of a store, newest last.
 
     STORE is the file or URL of an engine's store, and must exist. The options choose which
     decisions; --events adds the retrains and events since the first of these decisions (if no
-    decision fits, all), or since --since. In the table good and bad are the
+    decision fits, all), or since --since, and before --until. In the table good and bad are the
     labels that were counted, bound is the interval of the success rate that follows from them, v is
     the version of the model, and label is what the part turned out to be. If there is nothing to
     list, a sentence says so. `dengine explain` tells more about one decision.
@@ -120,8 +121,9 @@ def history(store: str, events: bool, **criteria: Any) -> None:
     since = criteria["since"]
     if since is None:
         since = decisions[0].time if decisions else 0.0
+    end = math.inf if criteria["until"] is None else criteria["until"]
     for name, items in others.items():
-        others[name] = [item for item in items if item.time >= since]
+        others[name] = [item for item in items if since <= item.time < end]
     rows = [to_jsonable(decision) | {"label": decision.label} for decision in decisions]
     record = {"store": store, "decisions": rows} | others
     in_order = merge(*others.values(), decisions, key=lambda item: item.time)

@@ -62,7 +62,7 @@ def test_a_historys_filters_are_those_of_the_document(store):
     assert {tuple(item[name] for name in names) for item in found} == {
         ("accept", "certain", "bad", "accept")
     }
-    for words in ("--since 2100-01-01", "--since 2100-01-01T10:00"):
+    for words in ("--since 2100-01-01", "--until 2001-01-01T10:00"):
         assert succeed("history", store, *words.split()) == "No decision of that kind.\n"
 
 
