@@ -1,6 +1,6 @@
 """The subcommand `dengine status`: how an engine is doing, as far as its store tells."""
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ..history.status import ErrorEstimate, Span, Status
 
 VERDICTS = {"kept": "keeps to", "broken": "is beyond", "open": "may be beyond"}
-# In shadow mode every part is verified: those are no audits.
+# In shadow mode every part is verified: those are no audits, though they share the reason.
 TITLES = {"false_accepts": "accepted, and bad", "audits": "certain but checked"}
 # Fields of a status that have lines or tables of their own.
 SHOWN_ELSEWHERE = (
@@ -116,13 +116,18 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     engine knows, the recipe, the `TraceSpec`, the certificate on accepted and on rejected parts,
     the last and the slowest retrain, and the newest events, the newest first. An alarm, or a
     retrain, has a row only if there is one. The recipe is left out if the model was handed in by
-    the user, because the recipe has no effect on it.
+    the user, because the recipe has no effect on it. Without audits, the counts with the name
+    "audit" are called "certain but checked": they come from shadow mode.
     """
     rows = []
     if report.alarm:
         rows.append(("look at", report.alarm))
     rows.append(("cell", report.cell))
-    rows += field_rows(report, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
+    shown = report
+    if not report.recipe.policy.audit_rate:
+        reasons = _without_audits(report.reasons)
+        shown = replace(report, reasons=reasons, sources=_without_audits(report.sources))
+    rows += field_rows(shown, "cell", *SHOWN_ELSEWHERE, *ONLY_WHILE_RUNNING)
     if report.model is None:
         # The recipe has no effect on a model that was handed in.
         rows += field_rows(report.recipe)
@@ -143,6 +148,14 @@ def _present_rows(report: "Status") -> list[tuple[str, str]]:
     for event in reversed(report.events):
         rows.append(("newest events", f"{format_time(event.time)} {event.kind}: {event.text}"))
     return rows
+
+
+def _without_audits(counts: dict[str, int]) -> dict[str, int]:
+    """Return counts with the key "audit" renamed to "certain but checked".
+
+    For a policy without audits: what has that reason was verified in shadow mode.
+    """
+    return {TITLES["audits"] if name == "audit" else name: n for name, n in counts.items()}
 
 
 def _span_cell(name: str, span: "Span") -> str:
