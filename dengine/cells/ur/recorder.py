@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from ...datasets.triggers import Start, StartFinder, Trigger, as_trigger, place
 from ...errors import CellError, expect
 from ...records import TraceArray, TraceSpec
 from .protocol import CHANNELS, PORT
-from .stream import Row, RtdeStream, StreamReport
+from .stream import Row, RtdeClient, RtdeStream, StreamReport
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +114,14 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         self._signals = {name: CHANNELS.get(name, name) for name in self.trigger.signals}
         self.spec = spec_of_recording(samples, self.channels, rate_hz)
         self._before = before
-        self.stream = RtdeStream(
-            host, (*self._columns, *self._signals.values(), *also), inputs, rate_hz, port, timeout
-        )
+        self.where = f"{host}:{port}"
+        values = (*self._columns, *self._signals.values(), *also)
+        connect = partial(RtdeClient, host, port, values, inputs, rate_hz, timeout)
+        self.stream = RtdeStream(connect, rate_hz)
         self._step = self.stream.step
         self._finder = StartFinder(self._step, self.trigger.quiet_s)
         self._rows: list[Row] = []
         self._start: Start | None = None
-        self._armed: int | None = None  # number of connections when `arm` was called
 
     def close(self) -> None:
         """Close the connection and end its thread."""
@@ -132,7 +133,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
     def arm(self) -> None:
         """Discard what was received so far, begun or not; record what begins from now on."""
         self._reset()
-        self._armed = self.stream.clear()
+        self.stream.clear()
 
     def report(self) -> StreamReport:
         """Return the counts of all packages since the connection was opened."""
@@ -171,7 +172,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
             else f"the trigger never went on: {self.trigger}"
         )
         raise CellError(
-            f"Expected an insertion at {self.stream.where} within {timeout:g} s, {why}."
+            f"Expected an insertion at {self.where} within {timeout:g} s, {why}."
         )
 
     def rows(self, seconds: float) -> Iterator[Row]:
@@ -226,16 +227,13 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
 
         Samples that did not come are NaN. All samples are NaN if packages are missing where the
         insertion began, so that its start is unknown, or if no insertion has begun. The recorder
-        then looks for the next one, and what `arm` noted is discarded, too.
+        then looks for the next one.
         """
         start = self._start
         first = self._first_time()
         rows = self._rows
-        armed = self._armed
         self._reset()
-        reconnects = (
-            0 if start is None else rows[-1].session - (rows[0].session if armed is None else armed)
-        )
+        reconnects = 0 if start is None else rows[-1].session - rows[0].session
         rows = rows if start is not None and start.seen else []
         values = np.array(
             [[row.values[c] for c in self._columns] for row in rows], dtype=np.float64
@@ -255,11 +253,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         return float("nan") if self._start is None else self._start.time - self._before * self._step
 
     def _reset(self) -> None:
-        """Discard the packages and the start of an insertion that has begun, and look for the next.
-
-        The number of connections that `arm` noted is discarded, too.
-        """
+        """Discard the packages and the start of an insertion that has begun; look for the next."""
         self._finder.forget()
         self._rows = []
         self._start = None
-        self._armed = None
