@@ -399,16 +399,16 @@ def as_outcome(value: Any, owner: str = "") -> Outcome:
         return Outcome(value)
 
 
-def source_of(action: Action, audit: bool, success: bool) -> Source:
-    """Return the source of a label, from the action of its decision and the label itself.
+def source_of(decision: Decision, success: bool) -> Source:
+    """Return the source of a label, from its decision and the label itself.
 
-    INSPECTION after a reject. After a verification it is AUDIT if the part was audited (`audit`),
-    else VERIFICATION; after an accept CONFIRMED if the part is good (`success`), else STOP.
+    INSPECTION after a reject. After a verification it is AUDIT if the part was audited, else
+    VERIFICATION; after an accept CONFIRMED if the part is good (`success`), else STOP.
     """
-    if action is Action.REJECT:
+    if decision.action is Action.REJECT:
         return Source.INSPECTION
-    if action is Action.VERIFY:
-        return Source.AUDIT if audit else Source.VERIFICATION
+    if decision.action is Action.VERIFY:
+        return Source.AUDIT if decision.audit else Source.VERIFICATION
     return Source.CONFIRMED if success else Source.STOP
 
 

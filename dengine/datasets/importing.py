@@ -268,7 +268,7 @@ def import_parts(
             if label is not None:
                 n_since = n_unreported * (not stored.quarantined)
                 n_unreported -= n_since
-                source = source_of(decision.action, decision.audit, label)
+                source = source_of(decision, label)
                 about = (store.clock(), stored.content_hash, stored.time)
                 labels[decision.id] = NewLabel(decision.id, label, source, 0, None, n_since, *about)
                 counts["quarantined" if stored.quarantined else "imported"] += 1
