@@ -13,13 +13,13 @@ and of examples.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone
 
 from .cells.replay import ReplayCell
@@ -30,6 +30,7 @@ from .engine.engine import DataEngine
 from .folds import content_fold
 from .model import ModelPrediction
 from .recipe import Recipe
+from .records import Decision
 from .reducers.base import Floats, Ints, Reducer, StopRule, as_reducer, uses_labels
 
 N_TRACES = 100
@@ -254,30 +255,14 @@ def a_version_answers_as_it_was_trained(reducer: Any) -> None:
         assert not defect, defect
 
 
-def its_state_restores_it_bit_for_bit(reducer: Any) -> None:
-    """Assert that a trained clone can be restored from its state, and embeds the same, bit for bit.
-
-    `get_state()` must return NumPy arrays without Python objects, by name, from which `set_state`
-    of another clone restores it. If it returns None, the check passes. The clone is trained on test
-    traces; `reducer` may be unfitted and stays unchanged.
-    """
-    trained = _train_clone(reducer)
-    state = trained.get_state()
-    if state is not None:
-        for name, value in state.items():
-            assert isinstance(value, np.ndarray), f"{name} is no array"
-            assert not value.dtype.hasobject, f"{name} holds Python objects"
-        restored = as_reducer(clone(reducer), FOLDS).set_state(state)
-        np.testing.assert_array_equal(restored.embed(QUERIES), trained.embed(QUERIES))
-
-
 def an_engine_resumes_with_identical_decisions(reducer: Any) -> None:
     """Assert that an engine that is closed and opened again decides the same, bit for bit.
 
     It runs 90 cycles on test traces, with a clone of `reducer` and a store in a temporary folder.
     Its first retrain must be accepted. Its decisions on 20 further traces, made before the closing
-    and again after it, must have the same action, bound, counts, embedding and version. `reducer`
-    may be unfitted and stays unchanged. The engine limits this thread to one torch thread.
+    and again after it, must be equal but for their ids. So a reducer whose `get_state` returns
+    arrays must be restored from them exactly. `reducer` may be unfitted and stays unchanged. The
+    engine limits this thread to one torch thread.
     """
     X, y = toy_traces(110)
     recipe = Recipe(clone(reducer), policy=Policy(0.2, 0.8), retrain_every=70, folds=FOLDS)
@@ -302,7 +287,6 @@ REDUCER_CHECKS: tuple[Callable[[Any], None], ...] = (
     a_trace_with_a_nan_is_refused,
     its_module_compiles_and_embeds_as_it_does,
     a_version_answers_as_it_was_trained,
-    its_state_restores_it_bit_for_bit,
     an_engine_resumes_with_identical_decisions,
 )
 
@@ -352,12 +336,9 @@ def _train_clone(reducer: Any, times: int = 1, labels: Ints | None = None) -> Re
     return trained
 
 
-def _decide_all(engine: DataEngine, X: NDArray[np.float32]) -> list[tuple[Any, ...]]:
-    """Let an engine decide on each trace of X; return a part of what was decided.
+def _decide_all(engine: DataEngine, X: Floats) -> list[Decision]:
+    """Let an engine decide on each trace of X, (n, C, T); return the decisions without their ids.
 
-    X has the shape (n, C, T). For each trace there is a tuple of the decision's action, lower,
-    upper, n_success, n_failure, embedding and model_version. The engine records the decisions.
+    The engine records the decisions.
     """
-    names = ("action", "lower", "upper", "n_success", "n_failure", "embedding", "model_version")
-    decisions = [engine.decide(x) for x in X]
-    return [tuple(getattr(decision, name) for name in names) for decision in decisions]
+    return [replace(engine.decide(x), id="") for x in X]
