@@ -14,6 +14,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,7 @@ LARGEST = 2**20  # bytes of a recipe's file
 # better than one at each retrain.
 INTEGER_RANGES = {
     "folds": (2, 1000),
+    "retrain_every": (1, 10**9),
     "max_steps": (0, 10**9),
     "window": (10, 10**8),
 }
@@ -46,19 +48,16 @@ OBJECT_PREFIX = "object "  # before the class name of a reducer that TOML cannot
 class ReducerDefault:
     """Descriptor of a field of `Recipe` whose default is an attribute of the reducer's class.
 
-    Where the field is None, reading it gives the class's value. The class is imported only then,
-    so that naming a reducer imports nothing.
+    Where the field `radius` is None, reading it gives the `default_radius` of the class, see
+    `Reducer`. The class is imported only then, so that naming a reducer imports nothing.
 
     Parameters
     ----------
-    name : str
-        Attribute of the reducer's class, such as `default_radius`; see `Reducer`.
     check : callable
         Raises SettingError for a value out of range.
     """
 
-    def __init__(self, name: str, check: Callable[[Any], None]) -> None:
-        self.name = name
+    def __init__(self, check: Callable[[Any], None]) -> None:
         self.check = check
 
     def __set_name__(self, owner: type, field_name: str) -> None:
@@ -69,7 +68,7 @@ class ReducerDefault:
             return None  # the default, as `dataclass` reads it
         value = vars(recipe)[self.field_name]
         if value is None:
-            value = class_default(recipe.reducer, self.name)
+            value = class_default(recipe.reducer, f"default_{self.field_name}")
             self.check(value)
         return value
 
@@ -79,14 +78,11 @@ class ReducerDefault:
         vars(recipe)[self.field_name] = value
 
 
-def _check_retrain_every(value: Any) -> None:
-    """Raise SettingError for a `retrain_every` that is no integer from 1 to 1,000,000,000."""
-    expect(
-        is_whole(value, 1, 10**9),
-        "retrain_every to be an integer of at least 1",
-        value,
-        "at most 1,000,000,000",
-    )
+def _check_integer(name: str, value: Any) -> None:
+    """Raise SettingError for a value that the integer setting `name` of a recipe cannot have."""
+    least, most = INTEGER_RANGES[name]
+    is_valid = is_whole(value, least, most)
+    expect(is_valid, f"{name} to be an integer of at least {least}", value, f"at most {most:,}")
 
 
 @dataclass(frozen=True)
@@ -131,10 +127,10 @@ class Recipe:
     params: Params = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
     # The descriptor gives a value of this type when it is read.
-    radius: float = ReducerDefault("default_radius", check_radius)  # type: ignore[assignment]
+    radius: float = ReducerDefault(check_radius)  # type: ignore[assignment]
     folds: int = 5
     retrain_every: int = ReducerDefault(  # type: ignore[assignment]
-        "default_retrain_every", _check_retrain_every
+        partial(_check_integer, "retrain_every")
     )
     budget: float = 0.45
     max_steps: int | None = None
@@ -142,12 +138,10 @@ class Recipe:
     novelty: float = NOVELTY
 
     def __post_init__(self) -> None:
-        for name, (least, most) in INTEGER_RANGES.items():
-            value = getattr(self, name)
-            valid = is_whole(value, least, most) or (name == "max_steps" and value is None)
-            expect(
-                valid, f"{name} to be an integer of at least {least}", value, f"at most {most:,}"
-            )
+        _check_integer("folds", self.folds)
+        _check_integer("window", self.window)
+        if self.max_steps is not None:
+            _check_integer("max_steps", self.max_steps)
         expect(is_number(self.budget) and self.budget > 0.0, "budget > 0 seconds", self.budget)
         valid = is_number(self.novelty) and 0.0 <= self.novelty < float("inf")
         expect(valid, "a finite novelty of 0 or more", self.novelty, "0 turns it off")
@@ -230,11 +224,7 @@ class Recipe:
         with instead(SettingError, f"{where} is not TOML", ValueError, RecursionError):
             table = tomllib.loads(text)
         _check_keys(table, cls, where)
-        reducer = table.get("reducer", "conv")
         policy = table.pop("policy", {})
-        expect(
-            isinstance(reducer, str), f"in {where} reducer to be a name, or module:Class", reducer
-        )
         expect(isinstance(policy, Mapping), f"in {where} policy to be a table, [policy]", policy)
         policy = {"force_limits" if name == OLD_NAME else name: policy[name] for name in policy}
         _check_keys(policy, Policy, f"{where}, policy,")

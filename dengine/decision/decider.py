@@ -163,7 +163,7 @@ class Decider(nn.Module):
 
         The fault is a position in `Reason`, 0 if the trace has none.
         """
-        return self.gate.check(x, float(self.sensor_limit.item()))
+        return self.gate(x, float(self.sensor_limit.item()))
 
     def is_audited(self, content: int, rate: float) -> bool:
         """Return whether a trace with this content hash is audited: verified although certain.
@@ -222,4 +222,4 @@ def trace_gate(channels: int, samples: int) -> TraceGate:
 
     It is cached: it has no state, so all deciders share it.
     """
-    return TraceGate(TraceSpec(channels=channels, samples=samples))
+    return TraceGate(channels * samples)
