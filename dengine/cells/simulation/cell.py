@@ -193,16 +193,14 @@ def _find_cause(conditions: Conditions, pushed: Push) -> str:
     return "stuck" if tip_mm <= STUCK_MM else "wedging"
 
 
-def _make_generators(
-    seed: int, cycle: int
-) -> tuple[np.random.Generator, np.random.Generator, np.random.Generator]:
+def _make_generators(seed: int, cycle: int) -> list[np.random.Generator]:
     """Return three independent random generators of one cycle: for the physical conditions, for the
     sensor, and for what becomes known of a part that was passed on.
 
     They depend on seed and cycle alone.
     """
-    world, sensor, line = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
-    return np.random.default_rng(world), np.random.default_rng(sensor), np.random.default_rng(line)
+    seeds = np.random.SeedSequence(entropy=seed, spawn_key=(cycle,)).spawn(3)
+    return [np.random.default_rng(part) for part in seeds]
 
 
 class SimulatedCell:
