@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import SettingError, expect, shortened
+from .errors import SettingError, expect, instead, shortened
 from .records import MOST, is_name, is_number, is_whole
 
 
@@ -92,20 +92,19 @@ class ForceLimits:
         """
         fields = text.split(":")
         options: dict[str, Any] = {}
-        try:
+        with instead(
+            SettingError,
+            "Expected force_limits as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, :along=2, "
+            f":reject behind it, got {shortened(text)}",
+            TypeError,
+            ValueError,
+        ):
             start, end, low, high = fields[:4]
             for field in fields[4:]:
                 name, _, value = field.partition("=")
                 options[name] = int(value) if value.isdecimal() else value or True
             limits = float(low or "-inf"), float(high or "inf")
             return cls(float(start), float(end), *limits, **options)
-        except SettingError:
-            raise
-        except (TypeError, ValueError) as error:
-            raise SettingError(
-                "Expected force_limits as START:END:LOW:HIGH, 0.2:0.4::60, with :channel=1, "
-                f":along=2, :reject behind it, got {shortened(text)}."
-            ) from error
 
 
 def _is_channel(value: Any) -> bool:

@@ -15,7 +15,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import islice
+from itertools import islice, takewhile
 from typing import TYPE_CHECKING, Any
 
 from ..decision.certificate import Certificate
@@ -285,12 +285,8 @@ class Status:
         tolerance = self.recipe.policy.tolerances[1]
         rejects = _estimate_error(newest.rejected, newest.false_rejects, tolerance)
         reports = [retrain.report for retrain in self.retrains]
-        newest_accepted = max(
-            (i for i, report in enumerate(reports, 1) if report.accepted), default=0
-        )
-        failing = retrain_fault(
-            [report.reason for report in reports[newest_accepted:]], self.version
-        )
+        dropped = takewhile(lambda report: not report.accepted, reversed(reports))
+        failing = retrain_fault([report.reason for report in dropped][::-1], self.version)
         trained = [report.reason for report in reports if report.reason.startswith(TRAINED)]
         repeats = re.search(rf"[^;:]* {REPEATS}", "".join(trained[-1:]))
         alarms = (

@@ -244,7 +244,6 @@ class SimulatedCell:
     ) -> None:
         expect(cycles >= 1, "cycles of at least 1", cycles, "give the length of the run")
         self.parameters = parameters or CellParameters()
-        self.scenario = scenario
         self.seed = seed
         self.cycles = cycles
         self.clock = 0.0

@@ -240,22 +240,16 @@ class UrCell(AbstractContextManager["UrCell"]):
         result.
         """
         number, code = divmod(int(row.values[ANSWER]), 10)
-        state = int(row.values[RUNTIME])
-        order = f"order {self._number} ({verb.name.lower()})"
         if number == self._number:
             if code in SUCCESSES.get(verb, (ResultCode.DONE,)):
                 return ResultCode(code)
-            failure = FAILURES.get(code, f"it answered {code}")
-            raise CellError(
-                f"Expected the robot to carry out {order}, {failure}; "
-                "look at the part, then begin again."
-            )
-        if state in (Runtime.STOPPING, Runtime.STOPPED):
-            raise CellError(
-                f"Expected the robot to carry out {order}, its program has stopped; "
-                "start it and begin again."
-            )
-        return None
+            failure = f"{FAILURES.get(code, f'it answered {code}')}; look at the part, then"
+        elif int(row.values[RUNTIME]) in (Runtime.STOPPING, Runtime.STOPPED):
+            failure = "its program has stopped; start it and"
+        else:
+            return None
+        order = f"order {self._number} ({verb.name.lower()})"
+        raise CellError(f"Expected the robot to carry out {order}, {failure} begin again.")
 
     def _wait_until_ready(self) -> Row:
         """Wait until the robot's program runs and has answered its last order; return the package
