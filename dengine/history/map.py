@@ -155,5 +155,4 @@ def _known_marks(
 
 def _first_two(point: np.ndarray) -> tuple[float, float]:
     """Return the first two dimensions of a point (d,); 0.0 for a second that it does not have."""
-    x, y = np.append(point, 0.0)[:2].tolist()
-    return x, y
+    return float(point[0]), float(point[1]) if len(point) > 1 else 0.0

@@ -574,7 +574,7 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     others = outcomes.accepted - outcomes.false_accepts
     by_stops = 1.0 - wilson_interval(others, outcomes.false_accepts, policy.alpha)[1]
     lower = max(audited.lower, by_stops)
-    upper = max(audited.upper, outcomes.false_accepts / max(1, outcomes.accepted))
+    upper = max(audited.upper, outcomes.false_accepts / outcomes.accepted)
     return replace(audited, lower=lower, upper=upper, verdict=_verdict(lower, upper, tolerance))
 
 
@@ -623,7 +623,7 @@ def read_watch(store: SqlStore, recipe: Recipe, mode: Event | None) -> Watch | N
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """The course of a store over time, from which its picture is drawn.
+    """The course of a store over time, from which the web page draws its picture.
 
     Attributes
     ----------
@@ -631,38 +631,24 @@ class Course:
         Counts over consecutive decisions, oldest first.
     retrains : list of StoredVersion
         Of this cell.
-    modes : list of Event
-        Those that began or ended safe mode, oldest first.
-    tolerance : float
-        Share of accepted parts that may be bad (`Policy.tolerances`).
-    last : int
-        Number of newest decisions that are marked.
     """
 
     stretches: list[Stretch]
     retrains: list[StoredVersion]
-    modes: list[Event]
-    tolerance: float
-    last: int
 
 
 MAX_STRETCHES = 120  # of a picture
 MIN_STRETCH = 20  # decisions of a stretch: a share of fewer jumps
 
 
-def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course:
-    """Read the course of a store: counts over time, retrains, safe modes.
+def read_course(store: SqlStore, **by: float) -> Course:
+    """Read the course of a store: counts over time, and retrains.
 
     A stretch is a number of consecutive decisions that are counted together.
 
     Parameters
     ----------
     store : SqlStore
-    recipe : Recipe
-        With the policy's tolerance.
-    last : int
-        Number of newest decisions that the picture marks. It is copied to `Course.last` and has no
-        other effect.
     **by
         `seconds` and `start`, for stretches that are periods of time (see `stretches_query`); only
         the newest 120 with decisions are returned. Without them all decisions of the cell are split
@@ -671,13 +657,11 @@ def read_course(store: SqlStore, recipe: Recipe, last: int, **by: Any) -> Course
     Returns
     -------
     Course
-        It has all retrains and safe modes of this cell, also those before the first stretch.
+        It has all retrains of this cell, also those before the first stretch.
     """
-    modes = [event for event in store.events.newest() if event.kind in MODES]
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
     stretches = store.decisions.stretches(n, **by)[-MAX_STRETCHES:]
-    retrains = store.versions.all(cell_only=True)
-    return Course(stretches, retrains, modes, recipe.policy.tolerances[0], last)
+    return Course(stretches, store.versions.all(cell_only=True))
 
 
 def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:
