@@ -13,7 +13,7 @@ import torch
 
 from ..decision.intervals import SORTING_GUARANTEES, interval_error_level
 from ..decision.members import CLOSED
-from ..decision.policy import RULES, Policy
+from ..decision.policy import RULES
 from ..errors import outward
 from ..recipe import Recipe
 from ..records import Action, Decision, Reason, TraceArray, TraceSpec
@@ -131,15 +131,6 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
     return accept_threshold, reject_threshold, origin
 
 
-def _is_score(policy: Policy, decision: Decision) -> bool:
-    """Return whether a decision's `lower` and `upper` are one score, and no interval.
-
-    True under the guarantees "pooled" and "cost" if lower equals upper. The score is then the mean
-    success probability that the reducer's classifier heads give.
-    """
-    return policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper
-
-
 def explain_in_words(
     item: StoredDecision, bound: Bound | None, circumstances: Circumstances
 ) -> Iterator[str]:
@@ -238,7 +229,7 @@ def _bound_sentences(
     counts = (
         f"{decision.n_success} of {n} labels {within} are successes" if n else f"No label {within}"
     )
-    if _is_score(policy, decision):
+    if policy.guarantee in SORTING_GUARANTEES and decision.lower == decision.upper:
         yield (
             f"{counts}; the heads give it {decision.lower:.6g}, the mean of what each says "
             "of its success."

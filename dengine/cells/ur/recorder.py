@@ -171,9 +171,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
             if trouble
             else f"the trigger never went on: {self.trigger}"
         )
-        raise CellError(
-            f"Expected an insertion at {self.where} within {timeout:g} s, {why}."
-        )
+        raise CellError(f"Expected an insertion at {self.where} within {timeout:g} s, {why}.")
 
     def rows(self, seconds: float) -> Iterator[Row]:
         """Yield the packages of the robot, each removed from the buffer, for this many seconds.
