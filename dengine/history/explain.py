@@ -24,7 +24,7 @@ import torch
 from ..decision.policy import Policy
 from ..errors import ReportConflictError, StoreError, UnknownDecisionError, shortened
 from ..recipe import Recipe
-from ..records import Action, Floats, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
+from ..records import Action, Reason, Source, TraceArray, TraceSpec, stored_trace_spec
 from ..store.records import POLICY_KINDS, SAFE_MODE_BEGAN, StoredDecision, unknown_decision
 from ..store.views import HistoryFilter
 from .envelope import Envelope, envelope_of
@@ -213,18 +213,18 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         novelty=None if version is None else version.novelty,
         safe_mode=_find_safe_mode(store, item),
     )
-    distances = _measure_distances(item, version)
+    is_placed = version is not None and decision.embedding is not None
     bound = bound_of(decision, circumstances)
     return Explanation(
         decision=item,
         trace=item.trace,
         spec=circumstances.spec,
         sentences=tuple(explain_in_words(item, bound, circumstances)),
-        notes=(_note_of(item, distances is not None),),
+        notes=(_note_of(item, version is not None),),
         bound=bound,
         novelty=circumstances.novelty,
-        neighbours=tuple(_find_neighbours(store, version, distances, recipe.radius, neighbours)),
-        radius=None if distances is None else recipe.radius,
+        neighbours=tuple(_find_neighbours(store, version, item, recipe.radius, neighbours)),
+        radius=recipe.radius if is_placed else None,
         envelope=_find_envelope(store, item, version),
         policy=recipe.policy,
     )
@@ -259,41 +259,26 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     return next(began, "")
 
 
-def _measure_distances(item: StoredDecision, version: PastVersion | None) -> Floats | None:
-    """Return the distances from a decision's embedding to the references of a version, shape (n,).
-
-    Each is measured in the embedding space of the reference, in which one radius means the same for
-    every reducer. They are in the order of the version's index of references. The distance to
-    references of the decision's own part (without a number, of a trace equal to its trace) is
-    infinite. None if the trace was not embedded or there is no version.
-    """
-    embedding = item.decision.embedding  # (K, d)
-    if version is None or embedding is None:
-        return None
-    query = torch.tensor(embedding, dtype=torch.float32)
-    squared = version.index.squared_distances(query, item.content_hash)
-    distances: Floats = np.sqrt(squared.double().numpy())
-    return distances
-
-
 def _find_neighbours(
-    store: SqlStore,
-    version: PastVersion | None,
-    distances: Floats | None,
-    radius: float,
-    n: int,
+    store: SqlStore, version: PastVersion | None, item: StoredDecision, radius: float, n: int
 ) -> Iterator[Neighbour]:
     """Yield the nearest references of other parts, at most `n`, with their traces, nearest first.
 
-    `distances` are those of `_measure_distances`, one for each reference. Nothing is yielded if
-    `version` or `distances` is None. A neighbour may lie outside of the radius, which only says
-    what its field `inside` is. If the decision behind a reference is unknown (another cell made it,
-    or its label is damaged), its id, part, source and trace are None. Label and source are those
-    that the version had, without later corrections. Raises StoreError for a damaged trace.
+    Each distance is measured in the embedding space of the reference, in which one radius means the
+    same for every reducer. References of the decision's own part (without a number, of a trace
+    equal to its trace) are left out. Nothing is yielded if `version` is None, or if the trace of
+    the decision was not embedded. A neighbour may lie outside of the radius, which only says what
+    its field `inside` is. If the decision behind a reference is unknown (another cell made it, or
+    its label is damaged), its id, part, source and trace are None. Label and source are those that
+    the version had, without later corrections. Raises StoreError for a damaged trace.
     """
-    if distances is None or version is None:
+    embedding = item.decision.embedding  # (K, d)
+    if version is None or embedding is None:
         return
     index = version.index
+    query = torch.tensor(embedding, dtype=torch.float32)
+    # Infinite to references of the decision's own part.
+    distances = np.sqrt(index.squared_distances(query, item.content_hash).double().numpy())
     for slot in np.argsort(distances, kind="stable")[:n]:
         if not np.isfinite(distances[slot]):
             return
@@ -333,16 +318,14 @@ def _find_envelope(
     return None
 
 
-def _note_of(item: StoredDecision, has_neighbours: bool) -> str:
+def _note_of(item: StoredDecision, is_kept: bool) -> str:
     """Return a sentence that says which version's references the neighbours are.
 
     Without neighbours it says why, and names the first of these: the trace is quarantined, was not
-    embedded, or the version is not kept, which stands for all other reasons.
+    embedded, or the version that decided is not kept (unless `is_kept`).
     """
     decision = item.decision
     version = f"version {decision.model_version}, which answered,"
-    if has_neighbours:
-        return f"Neighbours: the references of {version} as they stood then."
     if item.quarantined:
         return (
             "The trace is quarantined: it was not embedded, is never trained on, and has no "
@@ -350,4 +333,6 @@ def _note_of(item: StoredDecision, has_neighbours: bool) -> str:
         )
     if decision.embedding is None:
         return "No neighbours are shown: the trace was not embedded."
-    return f"No neighbours are shown: {version} is not kept any more."
+    if not is_kept:
+        return f"No neighbours are shown: {version} is not kept any more."
+    return f"Neighbours: the references of {version} as they stood then."

@@ -109,7 +109,11 @@ def load_past_version(
     last = min([*later_retrains[:1], stored.last_seq + MAX_LABELS])
     later = store.labels.past(stored.last_seq, last)
     if item is not None:
-        later = [label for label in later if _was_known(label, item)]
+        later = [
+            label
+            for label in later
+            if label.time <= item.time and label.decision_id != item.decision.id
+        ]
     before = store.labels.past(int(stored.state["trained_on"][0]) - 1, stored.last_seq)
     by_number = {label.seq: label for label in (*before, *later) if not label.quarantined}
     added = [label for label in later if label.model_version == version]
@@ -121,11 +125,6 @@ def load_past_version(
         last_seq=max(by_number, default=stored.last_seq),
         novelty=_score_novelty(stored, item),
     )
-
-
-def _was_known(label: PastLabel, item: StoredDecision) -> bool:
-    """Return whether the engine knew a label when it made the decision `item`; never its own."""
-    return label.time <= item.time and label.decision_id != item.decision.id
 
 
 def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe) -> RadiusIndex:
