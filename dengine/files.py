@@ -3,11 +3,9 @@ sets, exports, backups, tables and figures are read and written by them.
 
 `output_file` and `write_output` replace a file only with `force`, and never a database;
 `new_folder` refuses a folder that is not empty. `read_archive` unpacks no Python objects, and no
-more bytes than the machine can hold. `write_manifest` lists the checksums of files, and `read_key`
-reads the secret that signs exports.
+more bytes than the machine can hold. `read_key` reads the secret that signs exports.
 """
 
-import hashlib
 import io
 import json
 import os
@@ -16,7 +14,7 @@ import stat
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,7 +37,6 @@ DATABASES = (b"SQLite format 3\0", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
 SPECIAL_FILES = {stat.S_IFLNK: "link", stat.S_IFDIR: "folder", stat.S_IFIFO: "pipe"}
 ZIP = b"PK"
 NUMPY = b"\x93NUMPY"
-MANIFEST = "manifest.json"
 MIN_KEY_BYTES = 16
 
 
@@ -296,25 +293,6 @@ def new_folder(path: FilePath) -> Iterator[Path]:
             raise OutputError(f"{wanted}, {target} holds something; name another folder.")
         target.mkdir(parents=True, exist_ok=True)
         yield target
-
-
-def write_manifest(folder: Path, files: Iterable[Path], force: bool = False) -> Path:
-    """Add the SHA-256 of files to `manifest.json` in `folder`, and return the path of the manifest.
-
-    `files` are listed by their names without folders. Entries of files with other names stay, and
-    the manifest is created if there is none. Call it after the files are complete. A manifest is
-    replaced in any case; a `manifest.json` that is none only with `force`, without it OutputError
-    is raised. OutputError is also raised if the manifest cannot be written, or is a link; an
-    OSError of reading `files` passes unchanged.
-    """
-    target = folder / MANIFEST
-    sums: dict[str, str] = {}
-    with suppress(OSError, ValueError, TypeError, KeyError):  # no file, or no manifest
-        sums = dict(json.loads(target.read_bytes())["sha256"])
-        force = True
-    sums |= {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-    content = json.dumps({"sha256": sums}, indent=2) + "\n"
-    return write_output(target, content.encode(), force)
 
 
 def _write_errors(target: Path, *also: type[Exception]) -> AbstractContextManager[None]:

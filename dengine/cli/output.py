@@ -89,10 +89,7 @@ class Out:
     force: bool = False
 
     def write(self, contents: Mapping[str, Any]) -> list[Path]:
-        """Write files into the folder `path`, and a manifest that lists them; return their paths.
-
-        The folder is created if it is missing. If one of the files is `path` itself, there is no
-        manifest.
+        """Write files into the folder `path`, which is made if it is missing; return their paths.
 
         Parameters
         ----------
@@ -102,21 +99,18 @@ class Out:
         Returns
         -------
         paths : list of Path
-            Of the files that were written, the manifest last.
+            Of the files that were written.
 
         Raises
         ------
         OutputError
             A file exists and `force` is not set, it cannot be written, or no format of figures has
             its suffix. The files before it in `contents` are written already.
-        OSError
-            A file cannot be read again for its checksum in the manifest.
         """
         from matplotlib.figure import Figure
 
         from ..experiments.figures import save
         from ..experiments.tables import write_csv
-        from ..files import write_manifest
 
         paths = []
         for name, content in contents.items():
@@ -125,8 +119,6 @@ class Out:
                 paths.append(save(content, path, force=self.force))
             else:
                 paths.append(write_csv(content, path, self.force))
-        if "" not in contents:
-            paths.append(write_manifest(self.path, paths, self.force))
         return paths
 
 
