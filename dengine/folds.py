@@ -10,6 +10,8 @@ C++. `traces.TraceGate` computes the content hash and `decision.decider.Decider`
 of audits in TorchScript.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,7 +63,7 @@ def content_hash(X: NDArray[np.floating]) -> FoldArray:
     array of int64, shape (n,)
     """
     X = np.asarray(X, dtype=np.float32)
-    flat = X.reshape(len(X), int(np.prod(X.shape[1:])))
+    flat = X.reshape(len(X), math.prod(X.shape[1:]))
     weights = hash_weights(flat.shape[1])
     hashes = np.empty(len(flat), dtype=np.int64)
     for start in range(0, len(flat), BLOCK_SIZE):

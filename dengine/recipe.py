@@ -148,8 +148,8 @@ class Recipe:
         is_table = isinstance(self.params, Mapping)
         expect(is_table, "params to be a table of the reducer's settings", self.params)
         for name, value in self.params.items():
-            valid = value is None or isinstance(value, PLAIN)
-            valid = valid and BARE_KEY.fullmatch(str(name)) is not None
+            is_plain = value is None or isinstance(value, PLAIN)
+            valid = is_plain and BARE_KEY.fullmatch(str(name)) is not None
             expect(valid, "params of plain names and values", {name: value}, "hand an object in")
         methods = ("fit", "get_params")
         valid = isinstance(self.reducer, str) or all(hasattr(self.reducer, m) for m in methods)

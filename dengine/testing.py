@@ -105,9 +105,8 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
         _train_clone(reducer).embed(Q), Z, err_msg="two fits differ: give it a random_state"
     )
     np.testing.assert_array_equal(trained.embed_references(Q, fold), Z[np.arange(20), fold])
-    assert Z.ndim == 3, f"expected (n, K, d), got {Z.shape}"
-    expected = f"expected 20 traces in {trained.n_spaces} spaces"
-    assert Z.shape[:2] == (20, trained.n_spaces), f"{expected}, got {Z.shape}"
+    is_shaped = Z.ndim == 3 and Z.shape[:2] == (20, trained.n_spaces)
+    assert is_shaped, f"expected (n, K, d), 20 traces in {trained.n_spaces} spaces, got {Z.shape}"
     assert Z.dtype == np.float32, f"expected float32, got {Z.dtype}"
     assert np.isfinite(Z).all(), "a point is not finite"
     shape = np.asarray(trained.transform(Q)).shape

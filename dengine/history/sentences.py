@@ -141,8 +141,7 @@ def explain_in_words(
     if item.success is None:
         yield "Nothing was reported of the part."
     else:
-        source = "" if item.source is None else f" ({item.source.value})"
-        yield f"The part turned out {item.label}{source}."
+        yield f"The part turned out {item.label} ({item.source})."
 
 
 def _explain_outside(decision: Decision, trace: TraceArray, circumstances: Circumstances) -> str:

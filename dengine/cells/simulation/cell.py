@@ -290,17 +290,15 @@ class SimulatedCell:
         """Pass the part on without a check; return what became known of it.
 
         A bad part stops the line: the result is STOPPED, and `clock` goes on by `stop_s` seconds.
-        But with the probability `unreported_share` nothing becomes known of a bad part (UNKNOWN). A
-        good part is CONFIRMED with the probability `confirm_share`, else UNKNOWN. All three are
-        fields of `CellParameters`. The same seed and cycle have the same result. Afterwards no part
-        waits. Raise DengineError if no part waits for a decision.
+        But with the probability `unreported_share` nothing becomes known of a bad part (UNKNOWN).
+        Both are fields of `CellParameters`. Nothing becomes known of a good part. The same seed and
+        cycle have the same result. Afterwards no part waits. Raise DengineError if no part waits
+        for a decision.
         """
         success = self._take_waiting("proceed").success
         # It depends on the part alone.
         chance = float(_make_generators(self.seed, self._done - 1)[2].random())
-        if success:
-            return Outcome.CONFIRMED if chance < self.parameters.confirm_share else Outcome.UNKNOWN
-        if chance < self.parameters.unreported_share:
+        if success or chance < self.parameters.unreported_share:
             return Outcome.UNKNOWN
         self.clock += self.parameters.stop_s
         return Outcome.STOPPED

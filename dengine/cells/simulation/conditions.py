@@ -32,8 +32,6 @@ class CellParameters:
         included.
     unreported_share : float
         Probability that a bad part which was passed on does not stop the line.
-    confirm_share : float
-        Probability that a good part which was passed on is confirmed as good later.
     height_tolerance_mm : float
         A part is good if the height of its top differs from the nominal one by at most this.
     offset_sd_mm, tilt_sd_deg, yaw_sd_deg : float
@@ -83,7 +81,6 @@ class CellParameters:
     stop_s: float = 120.0
 
     unreported_share: float = 0.1
-    confirm_share: float = 0.0
 
     height_tolerance_mm: float = 0.5
 

@@ -163,19 +163,16 @@ class RtdeClient:
         """
         packages = PackageReader()
         while True:
+            piece = b""
+            reason = "it hung up"
             try:
                 piece = self._socket.recv(RECEIVE_BYTES)
+            except TimeoutError:
+                reason = f"it was silent for {self._socket.gettimeout():g} s"
             except OSError as error:
                 reason = f"the connection is lost: {error}"
-                if isinstance(error, TimeoutError):
-                    reason = f"it was silent for {self._socket.gettimeout():g} s"
-                raise CellError(
-                    f"Expected packages from {self.where}, {reason}{self._last_text}."
-                ) from error
             if not piece:
-                raise CellError(
-                    f"Expected packages from {self.where}, it hung up{self._last_text}."
-                )
+                raise CellError(f"Expected packages from {self.where}, {reason}{self._last_text}.")
             for package in packages.feed(piece):
                 if package.type is PackageType.TEXT:
                     text = package.payload[1 : 1 + package.payload[0]].decode("utf-8", "replace")
