@@ -271,7 +271,7 @@ class Recipe:
         plain["reducer"], params = _name_and_params(self.reducer, self.params)
         del plain["params"], plain["policy"]
         policy = {f.name: getattr(self.policy, f.name) for f in fields(self.policy)}
-        tables = {"": plain, "policy": policy, "params": dict(params)}
+        tables = {"": plain, "policy": policy, "params": params}
         # An empty [params] is written too: left out, it would mean those of the reducer's recipe.
         return "\n".join(_table_text(name, values) for name, values in tables.items())
 

@@ -203,7 +203,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         self.recorder.stream.write(order)
         repeat_until = time.monotonic() + REPEAT_S
         result: ResultCode | None = None
-        for row in self.recorder.rows(self.order_timeout):
+        for row in self.recorder.stream.rows(self.order_timeout):
             if row.timestamp < self._newest.timestamp:  # restarted: the order was meant for before
                 repeat_until = 0.0
             elif row.session > self._newest.session and time.monotonic() < repeat_until:
@@ -260,7 +260,7 @@ class UrCell(AbstractContextManager["UrCell"]):
         whether the robot sent nothing, its program does not run, or it has not answered.
         """
         problem = ""
-        for row in self.recorder.rows(self.start_timeout):
+        for row in self.recorder.stream.rows(self.start_timeout):
             ordered, answered, state = (int(row.values[name]) for name in (ORDER, ANSWER, RUNTIME))
             problem = f"it owes an answer to order {ordered // 10}"
             if state != Runtime.PLAYING:

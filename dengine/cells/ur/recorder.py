@@ -8,8 +8,7 @@ with RtdeRecorder("192.168.1.10", trigger="bit=0") as recorder:
         decision = engine.decide(insertion.trace)
 """
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
@@ -160,7 +159,7 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
         CellError
             If no insertion begins within `timeout`.
         """
-        for row in self.rows(timeout):
+        for row in self.stream.rows(timeout):
             if (record := self.feed(row)) is not None:
                 return record
         if self.begun:
@@ -172,20 +171,6 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
             else f"the trigger never went on: {self.trigger}"
         )
         raise CellError(f"Expected an insertion at {self.where} within {timeout:g} s, {why}.")
-
-    def rows(self, seconds: float) -> Iterator[Row]:
-        """Yield the packages of the robot, each removed from the buffer, for this many seconds.
-
-        Packages that are buffered already come first. The time runs from the first call of `next`
-        on the iterator. If the stream is closed, the iteration ends when the buffer is empty or the
-        time is over.
-        """
-        end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0:
-            row = self.stream.take(left)
-            if row is None:  # the time is over, or the stream closed
-                return
-            yield row
 
     @property
     def begun(self) -> bool:

@@ -228,7 +228,7 @@ class StreamReport:
 
 
 class RtdeStream:
-    """Receives packages in a thread and buffers them for `take`.
+    """Receives packages in a thread and buffers them for `rows`.
 
     If the first connection fails, CellError is raised, or SettingError for an unknown column; if
     another client still writes an input, only after further attempts for 2 s. If a connection is
@@ -277,15 +277,21 @@ class RtdeStream:
         with self._news:
             return StreamReport(**self._counts)
 
-    def take(self, timeout: float) -> Row | None:
-        """Remove and return the oldest buffered package.
+    def rows(self, seconds: float) -> Iterator[Row]:
+        """Yield the packages of the robot, each removed from the buffer, for this many seconds.
 
-        If the buffer is empty, it waits up to `timeout` seconds for a package, and no longer once
-        the stream is closed. It returns None if no package came.
+        Packages that are buffered already come first. The time runs from the first call of `next`
+        on the iterator. If the stream is closed, the iteration ends when the buffer is empty or the
+        time is over.
         """
-        with self._news:
-            self._news.wait_for(lambda: self._rows or self._closing.is_set(), timeout)
-            return self._rows.popleft() if self._rows else None
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            with self._news:
+                self._news.wait_for(lambda: self._rows or self._closing.is_set(), left)
+                if not self._rows:  # the time is over, or the stream closed
+                    return
+                row = self._rows.popleft()
+            yield row
 
     def clear(self) -> None:
         """Discard the buffered packages."""
@@ -333,8 +339,8 @@ class RtdeStream:
                         new_client.close()
 
     def _count_and_buffer(self, row: Row) -> None:
-        """Count a package and the packages missing before it, buffer it, and wake callers of
-        `take`.
+        """Count a package and the packages missing before it, buffer it, and wake who waits in
+        `rows`.
 
         `row` is the package. Times are compared in whole steps of 1 / rate, rounded. One with the
         same time as the package before is counted as repeated; one with an earlier time shows that
