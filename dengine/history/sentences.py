@@ -94,9 +94,16 @@ def bound_of(decision: Decision, circumstances: Circumstances) -> Bound | None:
     """
     if decision.reason not in BOUNDED:
         return None
-    thresholds_and_origin = _find_thresholds(circumstances)
-    counts = (decision.n_success, decision.n_failure)
-    return Bound(*counts, decision.lower, decision.upper, *thresholds_and_origin)
+    accept_threshold, reject_threshold, origin = _find_thresholds(circumstances)
+    return Bound(
+        n_success=decision.n_success,
+        n_failure=decision.n_failure,
+        lower=decision.lower,
+        upper=decision.upper,
+        accept_threshold=accept_threshold,
+        reject_threshold=reject_threshold,
+        origin=origin,
+    )
 
 
 def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float | None, str]:

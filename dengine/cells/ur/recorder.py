@@ -32,15 +32,12 @@ class InsertionRecord:
         NaN for samples that were lost.
     missing : int
         Number of lost samples; all of them if the start was lost, since no time is known then.
-    repeated : int
-        Samples that came twice, of which the first counts.
     reconnects : int
         Reconnections during the insertion.
     """
 
     trace: TraceArray
     missing: int
-    repeated: int
     reconnects: int
 
 
@@ -222,11 +219,10 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
             [[row.values[c] for c in self._columns] for row in rows], dtype=np.float64
         )
         values = values.reshape(len(rows), len(self._columns))
-        placed = place(
-            [row.timestamp for row in rows], values, first, self.spec.samples, self._step
-        )
-        trace = placed.trace[0] if len(self._columns) == 1 else placed.trace
-        return InsertionRecord(trace, len(placed.missing), placed.repeated, reconnects)
+        times = [row.timestamp for row in rows]
+        trace, n_missing = place(times, values, first, self.spec.samples, self._step)
+        trace = trace[0] if len(self._columns) == 1 else trace
+        return InsertionRecord(trace, n_missing, reconnects)
 
     def _first_time(self) -> float:
         """Return the time of the trace's first sample, in seconds of the controller's clock.
