@@ -92,8 +92,8 @@ def trace_hash(content: int, part: str | None) -> int:
     return content if part is None else part_hash(part)
 
 
-def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:
-    """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64 of shape (n,).
+def toss(hashes: FoldArray | int, salt: int = 0) -> FoldArray:
+    """Return a pseudo-random integer from 0 to 2**30 - 1 for each hash, int64, in their shape.
 
     It is a fixed function of the hash and the salt, an integer that makes another sequence: the
     same arguments give the same integers.
@@ -105,8 +105,8 @@ def toss(hashes: FoldArray, salt: int = 0) -> FoldArray:
         return (h >> (63 - COIN_BITS)) & np.int64(2**COIN_BITS - 1)
 
 
-def fold_of(hashes: FoldArray, folds: int) -> FoldArray:
-    """Return the fold of each hash, 0 .. folds - 1, shape (n,)."""
+def fold_of(hashes: FoldArray | int, folds: int) -> FoldArray:
+    """Return the fold of each hash, 0 .. folds - 1, in the shape of the hashes."""
     return toss(hashes) % folds
 
 

@@ -8,7 +8,6 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
 from ..decision.member_rules import MemberRule
@@ -142,7 +141,7 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
     index = RadiusIndex.from_state(stored.state, n if is_full else max(n, recipe.window))
     for label in added:
         if label.point is not None:
-            fold = int(fold_of(np.array([label.content_hash], dtype=np.int64), spaces)[0])
+            fold = int(fold_of(label.content_hash, spaces))
             point = torch.from_numpy(label.point)
             index.add_one(point, float(label.success), fold, label.content_hash, label.seq)
     return index

@@ -136,7 +136,7 @@ class RtdeRecipe:
         ValueError for NaN, and OverflowError for an infinity.
         """
         numbers = [
-            values.get(name, 0) if letter == "d" else int(values.get(name, 0))
+            (float if letter == "d" else int)(values.get(name, 0))
             for name, letter in zip(self.columns, self.layout.format[2:], strict=True)
         ]
         return Package(PackageType.DATA, self.layout.pack(self.number, *numbers)).to_bytes()
