@@ -52,9 +52,13 @@ def read_key(path: FilePath, error: type[DengineError]) -> bytes:
         do="dengine export --make-key writes one",
     ):
         secret = Path(path).read_bytes().rstrip(b"\r\n")
-    wanted = f"a key of {MIN_KEY_BYTES} bytes or more in {path}"
-    is_long = len(secret) >= MIN_KEY_BYTES
-    expect(is_long, wanted, len(secret), "use dengine export --make-key", error)
+    expect(
+        len(secret) >= MIN_KEY_BYTES,
+        f"a key of {MIN_KEY_BYTES} bytes or more in {path}",
+        len(secret),
+        "use dengine export --make-key",
+        error,
+    )
     return secret
 
 
@@ -288,10 +292,10 @@ def new_folder(path: FilePath) -> Iterator[Path]:
     """
     target = Path(path)
     with _write_errors(target):
-        if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        target.mkdir(parents=True, exist_ok=True)
+        if any(target.iterdir()):
             wanted = "Expected a new or an empty folder"
             raise OutputError(f"{wanted}, {target} holds something; name another folder.")
-        target.mkdir(parents=True, exist_ok=True)
         yield target
 
 

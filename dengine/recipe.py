@@ -143,18 +143,28 @@ class Recipe:
         if self.max_steps is not None:
             _check_integer("max_steps", self.max_steps)
         expect(is_number(self.budget) and self.budget > 0.0, "budget > 0 seconds", self.budget)
-        valid = is_number(self.novelty) and 0.0 <= self.novelty < float("inf")
-        expect(valid, "a finite novelty of 0 or more", self.novelty, "0 turns it off")
-        is_table = isinstance(self.params, Mapping)
-        expect(is_table, "params to be a table of the reducer's settings", self.params)
+        expect(
+            is_number(self.novelty) and 0.0 <= self.novelty < float("inf"),
+            "a finite novelty of 0 or more",
+            self.novelty,
+            "0 turns it off",
+        )
+        expect(
+            isinstance(self.params, Mapping),
+            "params to be a table of the reducer's settings",
+            self.params,
+        )
         for name, value in self.params.items():
             is_plain = value is None or isinstance(value, PLAIN)
-            valid = is_plain and BARE_KEY.fullmatch(str(name)) is not None
-            expect(valid, "params of plain names and values", {name: value}, "hand an object in")
-        methods = ("fit", "get_params")
-        valid = isinstance(self.reducer, str) or all(hasattr(self.reducer, m) for m in methods)
+            expect(
+                is_plain and BARE_KEY.fullmatch(str(name)) is not None,
+                "params of plain names and values",
+                {name: value},
+                "hand an object in",
+            )
         expect(
-            valid,
+            isinstance(self.reducer, str)
+            or (hasattr(self.reducer, "fit") and hasattr(self.reducer, "get_params")),
             "a reducer's name, or a scikit-learn transformer with fit and get_params",
             self.reducer,
         )
@@ -198,16 +208,17 @@ class Recipe:
             fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
             expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
             return cls(recipe)
-        if str(recipe) in RECIPES:
-            return RECIPES[str(recipe)]
-        text = _read_text(Path(recipe))
+        name = str(recipe)
+        if name in RECIPES:
+            return RECIPES[name]
+        text = _read_text(Path(name))
         if text is not None:
-            return cls.from_toml(text, where=str(recipe))
-        if CLASS_PATH.fullmatch(str(recipe)):
-            return cls(str(recipe))
+            return cls.from_toml(text, where=name)
+        if CLASS_PATH.fullmatch(name):
+            return cls(name)
         raise SettingError(
             f"Expected a recipe among {', '.join(RECIPES)}, a TOML file, or module:Class of a "
-            f"reducer; {str(recipe)[:200]} is none."
+            f"reducer; {name[:200]} is none."
         )
 
     @classmethod

@@ -159,25 +159,39 @@ class TraceSpec:
         object.__setattr__(self, "columns", columns)
         rate = self.rate_hz
         rated = rate is None or (is_number(rate) and 0 < rate < float("inf"))
-        valid = is_whole(self.samples, 1, MOST) and is_whole(self.channels, 1, MOST) and rated
-        shape = (self.samples, self.channels, self.rate_hz)
-        expect(valid, "a trace of at least 1 sample and 1 channel at a rate above 0 Hz", shape)
+        expect(
+            is_whole(self.samples, 1, MOST) and is_whole(self.channels, 1, MOST) and rated,
+            "a trace of at least 1 sample and 1 channel at a rate above 0 Hz",
+            (self.samples, self.channels, rate),
+        )
         unit: Any = "" if self.unit is None else self.unit
         several = isinstance(unit, tuple | list)
         units: Any = tuple(unit) if several else (unit,)
-        texts = all(isinstance(text, str) for text in (*units, *self.columns))
-        expect(texts, "unit and columns of text", (self.unit, self.columns))
-        one_each = not several or len(units) == self.channels
-        expect(one_each, f"{self.channels} units, one a channel", self.unit)
+        expect(
+            all(isinstance(text, str) for text in (*units, *columns)),
+            "unit and columns of text",
+            (self.unit, columns),
+        )
+        expect(
+            not several or len(units) == self.channels,
+            f"{self.channels} units, one a channel",
+            self.unit,
+        )
         units = tuple(text.strip() for text in (units if several else units[0].split(",")))
         if len(units) == self.channels or units == ("",):
             unit = units if len(set(units)) > 1 else units[0] or None
             object.__setattr__(self, "unit", unit)
-        limited = self.limit is None or (is_number(self.limit) and self.limit > 0)
-        expect(limited, "a limit above 0 in the trace's unit, or None", self.limit)
+        expect(
+            self.limit is None or (is_number(self.limit) and self.limit > 0),
+            "a limit above 0 in the trace's unit, or None",
+            self.limit,
+        )
         expect(self.fit in FITS, f"fit to be one of {', '.join(FITS)}", self.fit)
-        different = not self.columns or len(set(self.columns)) == self.channels
-        expect(different, f"{self.channels} different columns, one a channel", self.columns)
+        expect(
+            not columns or len(set(columns)) == self.channels,
+            f"{self.channels} different columns, one a channel",
+            columns,
+        )
 
     @property
     def units(self) -> tuple[str, ...]:

@@ -93,8 +93,8 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     None of them may write to the given traces. Too few axes or spaces may raise IndexError instead.
     `reducer` may be unfitted and stays unchanged.
     """
-    is_estimator = isinstance(reducer, BaseEstimator)
-    assert is_estimator, f"{type(reducer).__name__} is no scikit-learn estimator"
+    name = type(reducer).__name__
+    assert isinstance(reducer, BaseEstimator), f"{name} is no scikit-learn estimator"
     trained = _train_clone(reducer)
     Q = QUERIES.copy()
     enough_spaces = trained.n_spaces >= 1 + trained.uses_labels

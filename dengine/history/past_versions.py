@@ -248,9 +248,8 @@ def load_rule(store: SqlStore, policy: Policy) -> DecisionRule | None:
     settings = store.settings.read()
     if stored is None or (rule := _restore_rule(stored, policy)) is None:
         return None
-    since = int(settings.get("evidence_since", 0))
-    began_in = int(settings.get("began_in", 0))
-    policy_since = int(settings.get("policy_since", 0))
+    names = ("evidence_since", "began_in", "policy_since")
+    since, began_in, policy_since = (int(settings.get(name, 0)) for name in names)
     progress = read_rule_progress(store, stored, since, policy.label_within, policy_since)
     if not progress.last_seq:  # rebuilt from all outcomes, as when an engine is opened
         rule = rule.clone()

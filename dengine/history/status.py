@@ -15,7 +15,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import islice, takewhile
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
 from ..decision.certificate import Certificate
@@ -688,9 +688,8 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     TypeError
         For a name that is no field.
     """
-    is_valid = last is None or 1 <= last < MAX_LAST
     expect(
-        is_valid,
+        last is None or 1 <= last < MAX_LAST,
         f"last to be 1 or more, below {MAX_LAST:,}",
         last,
         "leave it out for all decisions",
@@ -698,8 +697,7 @@ def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[
     selection = HistoryFilter(**where)
     if last is None:
         return iterate_decisions(store, selection, newest_first=False)
-    newest = islice(iterate_decisions(store, selection, min(PAGE_SIZE, last)), last)
-    return iter(list(newest)[::-1])
+    return iter(store.decisions.select(selection, last))
 
 
 def iterate_decisions(

@@ -82,9 +82,8 @@ def push(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> Push:
     ):
         import mujoco
     steps = round(1 / RATE_HZ / time_step_s)
-    divides = math.isclose(steps * time_step_s, 1 / RATE_HZ)
     expect(
-        divides,
+        math.isclose(steps * time_step_s, 1 / RATE_HZ),
         "a time step in seconds that divides 2 ms",
         time_step_s,
         "take 0.0005 or half of it",
