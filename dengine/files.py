@@ -294,8 +294,9 @@ def new_folder(path: FilePath) -> Iterator[Path]:
     with _write_errors(target):
         target.mkdir(parents=True, exist_ok=True)
         if any(target.iterdir()):
-            wanted = "Expected a new or an empty folder"
-            raise OutputError(f"{wanted}, {target} holds something; name another folder.")
+            raise OutputError(
+                f"Expected a new or an empty folder, {target} holds something; name another folder."
+            )
         yield target
 
 

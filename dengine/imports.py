@@ -25,6 +25,7 @@ def import_class(path: str) -> type:
     ):
         value = resolve_name(path)
     if not isinstance(value, type):
-        kind = type(value).__name__
-        raise SettingError(f"Expected module:Class, {shortened(path)} is a {kind} and no class.")
+        raise SettingError(
+            f"Expected module:Class, {shortened(path)} is a {type(value).__name__} and no class."
+        )
     return value

@@ -56,17 +56,14 @@ class ForceLimits:
 
     def __post_init__(self) -> None:
         numbers = (self.start, self.end, self.low, self.high)
-        valid = (
+        expect(
             all(map(is_number, numbers))
             and isinstance(self.reject, bool)
             and -math.inf < self.start <= self.end < math.inf
             and self.low <= self.high
             and (self.low, self.high) != (-math.inf, math.inf)
             and _is_channel(self.channel)
-            and (self.along is None or _is_channel(self.along))
-        )
-        expect(
-            valid,
+            and (self.along is None or _is_channel(self.along)),
             "force_limits with start <= end, low <= high, one of these finite, and channels from 0 "
             "on, or names",
             self,

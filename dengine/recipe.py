@@ -81,8 +81,12 @@ class ReducerDefault:
 def _check_integer(name: str, value: Any) -> None:
     """Raise SettingError for a value that the integer setting `name` of a recipe cannot have."""
     least, most = INTEGER_RANGES[name]
-    is_valid = is_whole(value, least, most)
-    expect(is_valid, f"{name} to be an integer of at least {least}", value, f"at most {most:,}")
+    expect(
+        is_whole(value, least, most),
+        f"{name} to be an integer of at least {least}",
+        value,
+        f"at most {most:,}",
+    )
 
 
 @dataclass(frozen=True)
@@ -205,8 +209,11 @@ class Recipe:
         if isinstance(recipe, Recipe):
             return recipe
         if not isinstance(recipe, str | os.PathLike):
-            fits = callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type)
-            expect(fits, "a recipe, its name, or a scikit-learn transformer", recipe)
+            expect(
+                callable(getattr(recipe, "fit", None)) and not isinstance(recipe, type),
+                "a recipe, its name, or a scikit-learn transformer",
+                recipe,
+            )
             return cls(recipe)
         name = str(recipe)
         if name in RECIPES:
@@ -341,10 +348,11 @@ def _read_text(path: Path) -> str | None:
 
     Raises SettingError if the file is larger than 1 MB, is not UTF-8 or cannot be read.
     """
-    problem = f"{path} is not UTF-8 text"
     with (  # an OSError among them is a name that is too long
         instead(SettingError, f"Cannot read the recipe {str(path)[:200]}", OSError),
-        instead(SettingError, problem, UnicodeDecodeError, do="save it as UTF-8"),
+        instead(
+            SettingError, f"{path} is not UTF-8 text", UnicodeDecodeError, do="save it as UTF-8"
+        ),
     ):
         if not path.is_file():
             return None
@@ -384,12 +392,11 @@ def describe_estimator(estimator: Any) -> str:
     If a value is no boolean, number, text or None, only its class is named, so that the text is the
     same in every process.
     """
-    params = estimator.get_params(deep=True)
     values = (
         f"{name}={value!r}"
         if isinstance(value, PLAIN) or value is None
         else f"{name}: {type(value).__qualname__}"
-        for name, value in sorted(params.items())
+        for name, value in sorted(estimator.get_params(deep=True).items())
     )
     return f"{type(estimator).__qualname__}({', '.join(values)})"
 

@@ -97,8 +97,9 @@ def it_embeds_every_trace_in_every_space(reducer: Any) -> None:
     assert isinstance(reducer, BaseEstimator), f"{name} is no scikit-learn estimator"
     trained = _train_clone(reducer)
     Q = QUERIES.copy()
-    enough_spaces = trained.n_spaces >= 1 + trained.uses_labels
-    assert enough_spaces, "in one space every label would be counted where it was seen"
+    assert trained.n_spaces >= 1 + trained.uses_labels, (
+        "in one space every label would be counted where it was seen"
+    )
     Z = trained.embed(Q)
     fold = np.arange(20) % trained.n_spaces
     np.testing.assert_array_equal(

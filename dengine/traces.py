@@ -368,10 +368,8 @@ class ForceLimitsGate(nn.Module):
         limits = [(item.start, item.end, item.low, item.high) for item in force_limits]
         channels = [(rows[item.channel], rows[item.along]) for item in force_limits]
         action = [ActionCode.REJECT if item.reject else ActionCode.VERIFY for item in force_limits]
-        limits_tensor = torch.tensor(limits, dtype=torch.float32).reshape(-1, 4, 1)
-        self.register_buffer("limits", limits_tensor)
-        channels_tensor = torch.tensor(channels, dtype=torch.int64).reshape(-1, 2)
-        self.register_buffer("channels", channels_tensor)
+        self.register_buffer("limits", torch.tensor(limits, dtype=torch.float32).reshape(-1, 4, 1))
+        self.register_buffer("channels", torch.tensor(channels, dtype=torch.int64).reshape(-1, 2))
         self.register_buffer("action", torch.tensor(action, dtype=torch.int64))
         self.register_buffer("time", time)  # (1, T)
 

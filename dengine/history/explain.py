@@ -136,8 +136,7 @@ def find_decision_id(store: SqlStore, part: str) -> str:
         If several decisions count; the message has their ids.
     """
     decisions = store.decisions.select(HistoryFilter(part=part), 20)
-    not_rejected = [item for item in decisions if item.decision.action is not Action.REJECT]
-    matches = not_rejected or decisions
+    matches = [item for item in decisions if item.decision.action is not Action.REJECT] or decisions
     if not matches and (item := store.decisions.get(part, trace=False)) is not None:
         matches = [item]
     if not matches:
@@ -213,7 +212,6 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         novelty=None if version is None else version.novelty,
         safe_mode=_find_safe_mode(store, item),
     )
-    is_placed = version is not None and decision.embedding is not None
     bound = bound_of(decision, circumstances)
     return Explanation(
         decision=item,
@@ -224,7 +222,7 @@ def explain(store: SqlStore, decision_id: str, neighbours: int = 10) -> Explanat
         bound=bound,
         novelty=circumstances.novelty,
         neighbours=tuple(_find_neighbours(store, version, item, recipe.radius, neighbours)),
-        radius=recipe.radius if is_placed else None,
+        radius=None if version is None or decision.embedding is None else recipe.radius,
         envelope=_find_envelope(store, item, version),
         policy=recipe.policy,
     )

@@ -125,8 +125,12 @@ def part_map(store: "SqlStore", recipe: Recipe, version: int) -> PartMap:
             for _, slot, id_ in references[-N_KNOWN:]
             if id_ not in newest
         ]
-    radius = recipe.radius if newest else None
-    return PartMap(version, (*known, *newest.values()), radius, has_own_unit(recipe.reducer))
+    return PartMap(
+        version=version,
+        marks=(*known, *newest.values()),
+        radius=recipe.radius if newest else None,
+        probability=has_own_unit(recipe.reducer),
+    )
 
 
 def _first_two(point: np.ndarray) -> tuple[float, float]:

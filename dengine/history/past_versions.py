@@ -142,8 +142,13 @@ def _restore_index(stored: ModelVersion, added: list[PastLabel], recipe: Recipe)
     for label in added:
         if label.point is not None:
             fold = int(fold_of(label.content_hash, spaces))
-            point = torch.from_numpy(label.point)
-            index.add_one(point, float(label.success), fold, label.content_hash, label.seq)
+            index.add_one(
+                torch.from_numpy(label.point),
+                float(label.success),
+                fold,
+                label.content_hash,
+                label.seq,
+            )
     return index
 
 

@@ -282,8 +282,9 @@ class Status:
         newest = self.newest
         accepts = newest.bad_accepts
         would_accept = newest.would_accept
-        tolerance = self.recipe.policy.tolerances[1]
-        rejects = _estimate_error(newest.rejected, newest.false_rejects, tolerance)
+        rejects = _estimate_error(
+            newest.rejected, newest.false_rejects, self.recipe.policy.tolerances[1]
+        )
         reports = [retrain.report for retrain in self.retrains]
         dropped = takewhile(lambda report: not report.accepted, reversed(reports))
         failing = retrain_fault([report.reason for report in dropped][::-1], self.version)
@@ -571,9 +572,8 @@ def bad_accepts(outcomes: Outcomes, policy: Policy) -> ErrorEstimate:
     audited = _estimate_error(
         outcomes.audited_accepts, outcomes.audited_accepts_bad, tolerance, policy.alpha, n
     )
-    others = outcomes.accepted - outcomes.false_accepts
-    by_stops = 1.0 - wilson_interval(others, outcomes.false_accepts, policy.alpha)[1]
-    lower = max(audited.lower, by_stops)
+    stops = _estimate_error(outcomes.accepted, outcomes.false_accepts, tolerance, policy.alpha)
+    lower = max(audited.lower, stops.lower)
     upper = max(audited.upper, outcomes.false_accepts / outcomes.accepted)
     return replace(audited, lower=lower, upper=upper, verdict=_verdict(lower, upper, tolerance))
 

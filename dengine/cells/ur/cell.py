@@ -225,12 +225,12 @@ class UrCell(AbstractContextManager["UrCell"]):
         `expected` says what it had to do, like "to send its state". The message ends with why there
         is no connection, or with advice if there is one.
         """
-        stream = self.recorder.stream
         reason = "it did not; does its program do what ur_cell.script does, is it paused?"
-        if stream.trouble:
-            reason = f"there is no connection: {stream.trouble}"
-        where = self.recorder.where
-        return CellError(f"Expected the robot at {where} {expected} in time, {reason}")
+        if trouble := self.recorder.stream.trouble:
+            reason = f"there is no connection: {trouble}"
+        return CellError(
+            f"Expected the robot at {self.recorder.where} {expected} in time, {reason}"
+        )
 
     def _find_result(self, row: Row, verb: Verb) -> ResultCode | None:
         """Return the result of the present order (`verb`) if the package `row` holds it, else None.

@@ -161,12 +161,9 @@ class RtdeRecorder(AbstractContextManager["RtdeRecorder"]):
                 return record
         if self.begun:
             return self.cut()
-        trouble = self.stream.trouble
-        why = (
-            f"there is no connection: {trouble}"
-            if trouble
-            else f"the trigger never went on: {self.trigger}"
-        )
+        why = f"the trigger never went on: {self.trigger}"
+        if self.stream.trouble:
+            why = f"there is no connection: {self.stream.trouble}"
         raise CellError(f"Expected an insertion at {self.where} within {timeout:g} s, {why}.")
 
     @property

@@ -84,9 +84,11 @@ class RtdeClient:
                     f"Expected RTDE protocol version {VERSION} at {self.where}, "
                     "which refuses it; update it."
                 )
-            named = struct.pack(">d", rate_hz) + ",".join(outputs).encode()
+            rate = struct.pack(">d", rate_hz)
             self._outputs = read_recipe(
-                self._request(PackageType.OUTPUTS, named), outputs, "output"
+                self._request(PackageType.OUTPUTS, rate + ",".join(outputs).encode()),
+                outputs,
+                "output",
             )
             if unknown := ", ".join(set(columns) - {*self._outputs.columns}):
                 raise SettingError(
