@@ -106,8 +106,9 @@ def read_errors(
         Extra of dengine that installs the package, for that error: `pip install "dengine[extra]"`.
     """
     if package and find_spec(package) is None:
-        do = f'pip install "dengine[{extra}]"'
-        raise DataError(f"Expected {package} for {kind}, it is not installed: {do}.")
+        raise DataError(
+            f'Expected {package} for {kind}, it is not installed: pip install "dengine[{extra}]".'
+        )
     return instead(DataError, f"Cannot read {source} as {kind}", *UNREADABLE)
 
 

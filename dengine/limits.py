@@ -104,8 +104,9 @@ class ForceLimits:
             for field in fields[4:]:
                 name, _, value = field.partition("=")
                 options[name] = int(value) if value.isdecimal() else value or True
-            limits = float(low or "-inf"), float(high or "inf")
-            return cls(float(start), float(end), *limits, **options)
+            return cls(
+                float(start), float(end), float(low or "-inf"), float(high or "inf"), **options
+            )
 
 
 def _is_channel(value: Any) -> bool:

@@ -185,8 +185,11 @@ class Recipe:
 
         A reducer that is an object is named if `to_toml` writes it as `module:Class`.
         """
-        names = (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
-        return [name for name in names if ":" in name and not name.startswith("dengine.reducers.")]
+        return [
+            name
+            for name in (_name_and_params(self.reducer, self.params)[0], self.policy.guarantee)
+            if ":" in name and not name.startswith("dengine.reducers.")
+        ]
 
     @classmethod
     def load(cls, recipe: Any) -> Recipe:
@@ -336,7 +339,7 @@ def _check_keys(table: Table, record_type: Any, where: str) -> None:
     `record_type` is the dataclass. The message begins with `where` and lists the fields.
     """
     names = sorted(f.name for f in fields(record_type))
-    unknown = sorted(set(table) - set(names))
+    unknown = sorted(table.keys() - names)
     if unknown:
         raise SettingError(
             f"{where} has an unknown key {listed(unknown)}; known are {', '.join(names)}."
@@ -411,9 +414,10 @@ def _table_text(name: str, values: Table) -> str:
 
     None becomes "none".
     """
-    header = f"[{name}]\n" if name else ""
-    texts = {key: toml_value("none" if value is None else value) for key, value in values.items()}
-    return header + "".join(f"{key} = {text}\n" for key, text in texts.items())
+    lines = [f"[{name}]\n"] if name else []
+    for key, value in values.items():
+        lines.append(f"{key} = {toml_value('none' if value is None else value)}\n")
+    return "".join(lines)
 
 
 RECIPES: dict[str, Recipe] = {

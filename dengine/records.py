@@ -28,8 +28,9 @@ Arrays = Mapping[str, NDArray[Any]]  # the same, only read
 
 def is_whole(value: Any, least: int, most: int) -> bool:
     """Return whether a value is an integer, Python's or NumPy's, from `least` to `most`."""
-    is_integer = isinstance(value, Integral) and not isinstance(value, bool)
-    return is_integer and least <= int(value) <= most
+    if not isinstance(value, Integral) or isinstance(value, bool):
+        return False
+    return least <= int(value) <= most
 
 
 def is_number(value: Any) -> bool:
@@ -158,9 +159,10 @@ class TraceSpec:
             columns = (self.columns,) if isinstance(self.columns, str) else tuple(self.columns)
         object.__setattr__(self, "columns", columns)
         rate = self.rate_hz
-        rated = rate is None or (is_number(rate) and 0 < rate < float("inf"))
         expect(
-            is_whole(self.samples, 1, MOST) and is_whole(self.channels, 1, MOST) and rated,
+            is_whole(self.samples, 1, MOST)
+            and is_whole(self.channels, 1, MOST)
+            and (rate is None or (is_number(rate) and 0 < rate < float("inf"))),
             "a trace of at least 1 sample and 1 channel at a rate above 0 Hz",
             (self.samples, self.channels, rate),
         )

@@ -249,12 +249,10 @@ def _find_safe_mode(store: SqlStore, item: StoredDecision) -> str:
     """
     if item.decision.reason is not Reason.SAFE_MODE:
         return ""
-    began = (
-        event.text
-        for event in reversed(store.events.newest())
-        if event.kind == SAFE_MODE_BEGAN and event.time <= item.time
-    )
-    return next(began, "")
+    for event in reversed(store.events.newest()):
+        if event.kind == SAFE_MODE_BEGAN and event.time <= item.time:
+            return event.text
+    return ""
 
 
 def _find_neighbours(

@@ -660,8 +660,10 @@ def read_course(store: SqlStore, **by: float) -> Course:
         It has all retrains of this cell, also those before the first stretch.
     """
     n = max(1, min(MAX_STRETCHES, store.decisions.newest_number() // MIN_STRETCH))
-    stretches = store.decisions.stretches(n, **by)[-MAX_STRETCHES:]
-    return Course(stretches, store.versions.all(cell_only=True))
+    return Course(
+        stretches=store.decisions.stretches(n, **by)[-MAX_STRETCHES:],
+        retrains=store.versions.all(cell_only=True),
+    )
 
 
 def history(store: SqlStore, last: int | None = None, **where: Any) -> Iterator[StoredDecision]:

@@ -190,19 +190,16 @@ def read_recipe(payload: bytes, names: Sequence[str], direction: str) -> RtdeRec
     type_by_name = dict(zip(names, types, strict=True))
     unknown = [name for name, type_ in type_by_name.items() if type_ not in (*TYPES, IN_USE)]
     if unknown:
-        do = (
-            "name others, or update its software "
-            "(registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)"
-        )
         raise CellError(
-            f"Expected {direction} fields that this controller has, "
-            f"it does not know {', '.join(unknown)}; {do}."
+            f"Expected {direction} fields that this controller has, it does not know "
+            f"{', '.join(unknown)}; name others, or update its software "
+            "(registers from 24 on: 3.9 / 5.3, ft_raw_wrench: 5.9)."
         )
     in_use = [name for name, type_ in type_by_name.items() if type_ == IN_USE]
     if in_use:
-        do = "close it, or its fieldbus unit (EtherNet/IP, PROFINET), or choose other registers"
         raise HeldError(
-            f"Expected to write {', '.join(in_use)}, another client of this controller does; {do}."
+            f"Expected to write {', '.join(in_use)}, another client of this controller does; close "
+            "it, or its fieldbus unit (EtherNet/IP, PROFINET), or choose other registers."
         )
     return RtdeRecipe(payload[0], tuple(names), types)
 
