@@ -279,10 +279,9 @@ def _find_neighbours(
         if not np.isfinite(distances[slot]):
             return
         label = version.labels[slot]
-        decision_id = None if label is None else label.decision_id
-        stored = None if decision_id is None else store.decisions.get(decision_id)
+        stored = None if label is None else store.decisions.get(label.decision_id)
         yield Neighbour(
-            decision_id=decision_id,
+            decision_id=None if label is None else label.decision_id,
             part=None if stored is None else stored.decision.part,
             success=bool(index.column("labels")[slot]),
             source=None if label is None else label.source,

@@ -124,8 +124,9 @@ def _find_thresholds(circumstances: Circumstances) -> tuple[float | None, float 
     if circumstances.thresholds is None:
         return None, None, "the thresholds of that time are not kept"
     accept_score, reject_score = circumstances.thresholds
-    sorts = policy.guarantee in SORTING_GUARANTEES
-    origin = "the lowest level that held then" if sorts else "what held in safe mode"
+    origin = "what held in safe mode"
+    if policy.guarantee in SORTING_GUARANTEES:
+        origin = "the lowest level that held then"
     accept_threshold = accept_score if accept_score < CLOSED else None
     reject_threshold = 1.0 - reject_score if reject_score < CLOSED else None
     return accept_threshold, reject_threshold, origin

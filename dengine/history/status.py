@@ -387,21 +387,19 @@ def status(store: SqlStore, last: int = NEWEST, watching: bool = False) -> Statu
         )
     recipe = Recipe.from_store(settings)
     policy = recipe.policy
-    tally = store.decisions.tally(
-        within=policy.label_within
-    )  # seconds, in a store of a million decisions
+    within = policy.label_within
+    tally = store.decisions.tally(within=within)  # seconds, in a store of a million decisions
     counts = store.decisions.counts(tally)
     outcomes = tally.outcomes
     events = store.events.newest()
     losses = [event.text for event in open_losses(events)]
-    mode = next((event for event in reversed(events) if event.kind in MODES), None)
+    modes = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
+    mode = next((event for event in reversed(events) if event.kind in modes), None)
     retrains = store.versions.all(cell_only=True)
     last_seq = retrains[-1].last_seq if retrains else 0
     accepted = [report for report in store.versions.retrains() if report.accepted]
     since = int(settings.get("policy_since", 0))
-    in_force = tally
-    if since:
-        in_force = store.decisions.tally(since_version=since, within=policy.label_within)
+    in_force = store.decisions.tally(since_version=since, within=within) if since else tally
     return Status(
         cell=store.cell_id,
         product=store.product,
@@ -441,7 +439,6 @@ def _read_pinned(store: SqlStore, accepted: list[RetrainReport]) -> int:
     return 0 if version is None else int(version.state.get("pinned", 0))
 
 
-MODES = (SAFE_MODE_BEGAN, SAFE_MODE_ENDED)
 COUNTED = ("actions", "reasons", "labels", "sources", "corrected", "forgotten")
 
 
@@ -731,8 +728,10 @@ def iterate_decisions(
         Without its trace.
     """
     while page := store.decisions.select(where, page_size, start_after, newest_first):
-        yield from reversed(page) if newest_first else page
-        start_after = (page[0] if newest_first else page[-1]).decision.id
+        if newest_first:
+            page.reverse()
+        yield from page
+        start_after = page[-1].decision.id
 
 
 def as_frame(decisions: Iterable[StoredDecision]) -> pd.DataFrame:

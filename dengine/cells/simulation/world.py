@@ -133,14 +133,13 @@ def _drive(mujoco: Any, model: Any, data: Any, conditions: Conditions, steps: in
     return force
 
 
-def cell_xml(conditions: Conditions, time_step_s: float = TIME_STEP_S) -> str:
-    """Return the MuJoCo model of the whole cell under these conditions, as text in MJCF.
+def cell_xml(c: Conditions, time_step_s: float = TIME_STEP_S) -> str:
+    """Return the MuJoCo model of the whole cell under the conditions `c`, as text in MJCF.
 
     It has the fixture, the carriage, which a drive moves up and down, the elastic wrist with the
     force sensor, and the part, unless the grasp missed it. `time_step_s` is the step of the physics
     in seconds.
     """
-    c = conditions
     tool_z = (c.gap_mm + c.protrusion_mm + PROTRUSION_MM) / 1000 + 0.06
     lateral = _spring(1000 * c.lateral_n_mm, 1.0)
     axial = _spring(1000 * c.axial_n_mm, 1.0)

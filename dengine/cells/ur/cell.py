@@ -198,7 +198,9 @@ class UrCell(AbstractContextManager["UrCell"]):
         """
         self.recorder.arm()  # discards what was received between orders
         self._number = self._number % MAX_NUMBER + 1
-        self.last = None if verb is Verb.INSERT else self.last
+        is_insertion = verb is Verb.INSERT
+        if is_insertion:
+            self.last = None
         order = {ORDER: encode_message(self._number, verb)}
         self.recorder.stream.write(order)
         repeat_until = time.monotonic() + REPEAT_S
@@ -209,10 +211,10 @@ class UrCell(AbstractContextManager["UrCell"]):
             elif row.session > self._newest.session and time.monotonic() < repeat_until:
                 self.recorder.stream.write(order)
             self._newest = row
-            if verb is Verb.INSERT and self.last is None:
+            if is_insertion and self.last is None:
                 self.last = self.recorder.feed(row)
             result = result or self._find_result(row, verb)
-            is_recording = verb is Verb.INSERT and self.last is None and self.recorder.begun
+            is_recording = is_insertion and self.last is None and self.recorder.begun
             if result and not is_recording:
                 break
         if result is None:
